@@ -1,0 +1,49 @@
+"""Every error that this project raises on purpose. A leaf: it imports nothing.
+
+A message reads *where: what: expected, got*, with a hint where there is a fix. The command lines print it without a
+traceback and leave with exit code 1; anything else that is raised is a bug and keeps its traceback.
+"""
+
+
+class VfrError(Exception):
+    """Base of every error raised on purpose."""
+
+
+class ShapeError(VfrError, ValueError):
+    """An array does not have the shape that its name promises."""
+
+
+class ConfigError(VfrError, ValueError):
+    """A setting is out of range or contradicts another."""
+
+
+class DataError(VfrError, ValueError):
+    """A data set cannot be used: path, what was expected, what was found."""
+
+
+class FormatError(VfrError, ValueError):
+    """A file breaks its format: path, field, expected, got."""
+
+
+class VersionError(FormatError):
+    """A file needs a newer reader."""
+
+
+class IntegrityError(FormatError):
+    """Bytes do not match their checksum or their stated size."""
+
+
+class ParityError(VfrError):
+    """An export does not reproduce its source: quantity, worst, where, tolerance."""
+
+
+class OutputError(VfrError, OSError):
+    """A result cannot be written: the target exists, is read-only, or the disk is full."""
+
+
+class TrainingError(VfrError, RuntimeError):
+    """Training or baking cannot go on: the reason, and what to change."""
+
+
+class MissingExtraError(VfrError, ImportError):
+    """A feature needs `pip install vfr-bake[extra]`."""
