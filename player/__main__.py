@@ -1,0 +1,8 @@
+"""`python -m player` is `vfr-play`."""
+
+import sys
+
+from player.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,242 @@
+"""An asset on disk: opened and checked, or written as a whole. The format is specified in
+`player.manifest`."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from player.bricks import bricks_per_axis, unpack_vertices
+from player.errors import FormatError, IntegrityError, OutputError
+from player.files import new_folder
+from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
+from player.sparse_grid import SparseGrid, build_grid
+
+_DTYPES = {"brick_coords": "<u2", "brick_masks": "<u8", "density": "|u1", "features": "|i1"}
+
+
+@dataclass(frozen=True, eq=False)
+class GridArrays:
+    """The four arrays of an asset, as `player.manifest` describes them."""
+
+    brick_coords: np.ndarray
+    brick_masks: np.ndarray
+    density: np.ndarray
+    features: np.ndarray
+
+    def check(self, manifest: Manifest, where: str) -> None:
+        """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
+        n_bricks = len(self.brick_coords) if self.brick_coords.ndim else 0
+        n_vertices = (
+            int(np.bitwise_count(self.brick_masks).sum()) if self.brick_masks.dtype.kind == "u" else 0
+        )
+        shapes = {
+            "brick_coords": (n_bricks, 3),
+            "brick_masks": (n_bricks, 8),
+            "density": (n_vertices,),
+            "features": (n_vertices, manifest.n_channels),
+        }
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            dtype = np.dtype(_DTYPES[name])
+            if array.dtype != dtype or array.shape != shape:
+                raise FormatError(
+                    f"{where}{name}.npy: expected {dtype.name} {list(shape)}, "
+                    f"got {array.dtype.name} {list(array.shape)}"
+                )
+        coords = np.asarray(self.brick_coords, np.int64)
+        keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
+        if (np.diff(keys) <= 0).any():
+            raise FormatError(f"{where}brick_coords.npy: expected bricks sorted by x, y, z, each once")
+        n = bricks_per_axis(manifest.resolution)
+        if (coords >= n).any():
+            raise FormatError(f"{where}brick_coords.npy: expected coordinates below {n}, got {coords.max()}")
+        edge = (coords == n - 1).any(axis=1)
+        beyond = unpack_vertices(coords[edge], self.brick_masks[edge]).max(initial=0)
+        if beyond > manifest.resolution:
+            raise FormatError(
+                f"{where}brick_masks.npy: expected vertices up to {manifest.resolution}, got one at {beyond}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """An opened asset; the arrays are mapped into memory, not read. `asset.grid` arranges them for the
+    march."""
+
+    folder: Path
+    manifest: Manifest
+    arrays: GridArrays
+
+    @classmethod
+    def open(cls, folder: str | Path, verify: bool = False) -> Asset:
+        """Open the asset in `folder`.
+
+        Args:
+            folder: the asset's folder.
+            verify: also compare every checksum, which reads every byte.
+
+        Raises:
+            FormatError: not an asset, or one that breaks the format; VersionError if it is a newer one.
+            IntegrityError: a file is cut short or changed.
+        """
+        folder = Path(folder)
+        manifest = _read_manifest(folder)
+        for name, entry in manifest.files.items():
+            _check_size(folder / name, entry)
+        arrays = GridArrays(**{name: _map_array(folder / f"{name}.npy") for name in _DTYPES})
+        arrays.check(manifest, f"{folder}/")
+        asset = cls(folder, manifest, arrays)
+        if verify:
+            asset.verify()
+        return asset
+
+    def path(self, name: str) -> Path:
+        """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
+        if name not in self.manifest.files:
+            raise FormatError(f"{self.folder}: expected one of {sorted(self.manifest.files)}, got {name}")
+        return self.folder / name
+
+    def verify(self) -> None:
+        """Compare every file with its checksum; raises IntegrityError that names the first that differs."""
+        for _, error in checksums(self.folder, self.manifest):
+            if error is not None:
+                raise error
+
+    @cached_property
+    def grid(self) -> SparseGrid:
+        """The arrays arranged for marching; built when first asked for."""
+        m, a = self.manifest, self.arrays
+        low, high = m.density_range
+        return build_grid(
+            (a.brick_coords, a.brick_masks, a.density, a.features),
+            m.resolution,
+            np.array(m.aabb),
+            m.step,
+            (low, high),
+        )
+
+    @cached_property
+    def world_from_model(self) -> np.ndarray:
+        """[4, 4] float64."""
+        return np.array(self.manifest.world_from_model)
+
+    @property
+    def scale(self) -> float:
+        """World units in a model unit."""
+        return math.sqrt(sum(row[0] ** 2 for row in self.manifest.world_from_model[:3]))
+
+
+def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatError | None]]:
+    """Every file's name with what is wrong with it, or None; reads each byte once."""
+    for name, entry in sorted(manifest.files.items()):
+        try:
+            _check_size(folder / name, entry)
+            _check_sum(folder / name, entry)
+        except FormatError as error:
+            yield name, error
+        else:
+            yield name, None
+
+
+def read_manifest(folder: str | Path) -> Manifest:
+    """The manifest alone, for looking at an asset whose other files may be broken."""
+    return _read_manifest(Path(folder))
+
+
+def write_asset(
+    folder: Path,
+    manifest: Manifest,
+    arrays: GridArrays,
+    head: bytes,
+    mesh: bytes,
+    cameras: bytes,
+    force: bool = False,
+) -> None:
+    """Write an asset; it appears under `folder` complete or not at all.
+
+    Args:
+        folder: the new folder.
+        manifest: everything but `files`, which is filled in here.
+        arrays: the four arrays; checked before anything is written.
+        head: bytes of `head.onnx`.
+        mesh: bytes of `mesh.ply`, world frame.
+        cameras: bytes of `cameras.json`, world frame.
+        force: replace a folder that exists.
+
+    Raises:
+        FormatError: the arrays contradict the manifest.
+        OutputError: the folder exists, or the disk is full.
+    """
+    arrays.check(manifest, "")
+    with new_folder(folder, force) as new:
+        for name, dtype in _DTYPES.items():
+            with (new / f"{name}.npy").open("wb") as file:
+                array = np.ascontiguousarray(getattr(arrays, name), dtype)
+                np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
+        for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
+            (new / name).write_bytes(data)
+        files = {path.name: FileEntry(path.stat().st_size, _digest(path)) for path in sorted(new.iterdir())}
+        data = manifest_bytes(replace(manifest, files=files))
+        parse_manifest(data, NAME)
+        (new / NAME).write_bytes(data)
+
+
+def _read_manifest(folder: Path) -> Manifest:
+    path = folder / NAME
+    if not folder.is_dir():
+        raise FormatError(
+            f"{folder}: expected the folder of an asset, got {'a file' if folder.exists() else 'nothing'}"
+        )
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise FormatError(f"{folder}: not an asset: expected {NAME} in it, got none") from None
+    except OSError as error:
+        raise FormatError(f"{path}: cannot read: {error.strerror}") from error
+    return parse_manifest(data, str(path))
+
+
+def _check_size(path: Path, entry: FileEntry) -> None:
+    try:
+        size = path.stat().st_size
+    except OSError:
+        raise FormatError(f"{path}: expected a file of {entry.bytes} bytes, got none") from None
+    if size != entry.bytes:
+        raise IntegrityError(f"{path}: size: expected {entry.bytes} bytes, got {size}")
+
+
+def _check_sum(path: Path, entry: FileEntry) -> None:
+    digest = _digest(path)
+    if digest != entry.sha256:
+        raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot read: {error.strerror}") from error
+    return digest.hexdigest()
+
+
+def _map_array(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError, OSError, SyntaxError, TypeError) as error:
+        raise FormatError(f"{path}: expected a numpy array, got something else: {error}") from error
+    if not isinstance(array, np.memmap) or not array.flags.c_contiguous:
+        raise FormatError(f"{path}: expected one plain array in C order")
+    explained = array.offset + array.nbytes
+    if explained != path.stat().st_size:
+        raise FormatError(f"{path}: expected {explained} bytes as its header says, got {path.stat().st_size}")
+    return array

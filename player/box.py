@@ -1,0 +1,45 @@
+"""Rays meet the box: from origin and direction in the model frame to entry point and direction in grid
+coordinates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from player.sparse_grid import SparseGrid
+
+
+class Entries(NamedTuple):
+    """Rays in grid coordinates, from where they enter the box."""
+
+    t: np.ndarray
+    """[n] float32, t of the entry."""
+    length: np.ndarray
+    """[n] float32, way inside the box; <= 0 for a ray that misses it."""
+    point: np.ndarray
+    """[3, n] float32, entry point in cells."""
+    direction: np.ndarray
+    """[3, n] float32, cells per model unit."""
+
+
+def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entries:
+    """Rays to grid coordinates, each moved to where it enters the box (slabs; t >= 0).
+
+    A ray parallel to a face is inside that slab, faces included, or misses.
+    """
+    size = np.float32(grid.resolution)
+    t_in = np.zeros(len(rays_o), np.float32)
+    t_out = np.full(len(rays_o), np.inf, np.float32)
+    point = np.ascontiguousarray(((rays_o - grid.aabb_min) * grid.cells_per_unit).T)
+    direction = np.ascontiguousarray((rays_d * grid.cells_per_unit).T)
+    for o, d in zip(point, direction, strict=True):
+        parallel = d == 0
+        outside = parallel & ((o < 0) | (o > size))
+        divisor = np.where(parallel, np.float32(1), d)
+        a, b = (0 - o) / divisor, (size - o) / divisor
+        t_in = np.where(parallel, t_in, np.maximum(t_in, np.minimum(a, b)))
+        t_out = np.where(parallel, t_out, np.minimum(t_out, np.maximum(a, b)))
+        t_out[outside] = -np.inf
+    point = np.clip(point + t_in * direction, np.float32(0), size)
+    return Entries(t_in, t_out - t_in, point, direction)

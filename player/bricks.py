@@ -1,0 +1,118 @@
+"""Bricks: how a sparse set of grid vertices is written, and what follows from which of them are stored.
+
+A brick is 8 x 8 x 8 vertices; its coordinate is the vertex index >> 3, and bricks are sorted by (x, y, z).
+A brick's mask is eight 64-bit words: vertex (x, y, z) is bit `b = (x & 7) * 64 + (y & 7) * 8 + (z & 7)`, in
+word `b >> 6` (so the word is x & 7) at bit `b & 63`. Rows of `density` and `features` follow the set bits: by
+brick, then by b.
+
+A cell is named by its lowest vertex and is live when all eight of its corners are stored.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+BRICK = 8
+"""Vertices along each edge of a brick."""
+
+_Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
+_Z_FIRST = np.uint64(0x0101010101010101)  # the bits of a word with z = 0
+
+
+def bricks_per_axis(resolution: int) -> int:
+    """Bricks along each axis of a grid of `resolution` cells, that is `resolution + 1` vertices.
+
+    >>> bricks_per_axis(7), bricks_per_axis(8), bricks_per_axis(512)
+    (1, 2, 65)
+    """
+    return -(-(resolution + 1) // BRICK)
+
+
+def pack_vertices(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices to bricks.
+
+    Args:
+        vertices: [n_vertices, 3] integer grid indices, each at most once, in any order.
+
+    Returns:
+        brick_coords: [n_bricks, 3] uint16, sorted.
+        brick_masks: [n_bricks, 8] uint64.
+        order: [n_vertices] int64; `vertices[order]` is the order of the rows on disk.
+
+    >>> brick_coords, brick_masks, order = pack_vertices(np.array([[9, 0, 0], [0, 0, 1], [0, 0, 0]]))
+    >>> brick_coords.tolist(), brick_masks[:, :2].tolist(), order.tolist()
+    ([[0, 0, 0], [1, 0, 0]], [[3, 0], [0, 1]], [2, 1, 0])
+    """
+    vertices = np.asarray(vertices, np.int64).reshape(-1, 3)
+    high, low = vertices >> 3, vertices & 7
+    bricks = (high[:, 0] << 40) | (high[:, 1] << 20) | high[:, 2]
+    bits = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
+    order = np.lexsort((bits, bricks))
+    names, index = np.unique(bricks, return_inverse=True)
+    coords = np.stack([names >> 40, (names >> 20) & 0xFFFFF, names & 0xFFFFF], axis=-1).astype(np.uint16)
+    stored = np.zeros((len(names), 512), bool)
+    stored[index.reshape(-1), bits] = True
+    masks = np.packbits(stored, axis=1, bitorder="little").view("<u8").astype(np.uint64).reshape(-1, 8)
+    return coords, masks, order
+
+
+def stored_bits(brick_masks: np.ndarray) -> np.ndarray:
+    """[n_bricks, 8] masks to [n_bricks, 512] bool, indexed by b.
+
+    >>> np.flatnonzero(stored_bits(np.array([[5, 1, 0, 0, 0, 0, 0, 0]], np.uint64))).tolist()
+    [0, 2, 64]
+    """
+    octets = np.ascontiguousarray(brick_masks, "<u8").view(np.uint8).reshape(-1, 64)
+    return np.unpackbits(octets, axis=1, bitorder="little").view(bool)
+
+
+def unpack_vertices(brick_coords: np.ndarray, brick_masks: np.ndarray) -> np.ndarray:
+    """The stored vertices [n_vertices, 3] int64 in the order of the rows on disk; undoes `pack_vertices`.
+
+    >>> masks = np.array([[2, 0, 0, 0, 0, 0, 0, 1]], np.uint64)
+    >>> unpack_vertices(np.array([[1, 0, 2]], np.uint16), masks).tolist()
+    [[8, 0, 17], [15, 0, 16]]
+    """
+    brick, bit = np.nonzero(stored_bits(brick_masks))
+    local = np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
+    return np.asarray(brick_coords, np.int64)[brick] * BRICK + local
+
+
+def dense_index(brick_coords: np.ndarray, n_per_axis: int) -> np.ndarray:
+    """[n, n, n] int32: which brick is where, -1 where there is none."""
+    index = np.full((n_per_axis,) * 3, -1, np.int32)
+    index[tuple(np.asarray(brick_coords, np.int64).T)] = np.arange(len(brick_coords), dtype=np.int32)
+    return index
+
+
+def neighbours(brick_coords: np.ndarray, index: np.ndarray, offset: tuple[int, ...]) -> np.ndarray:
+    """[n] int32: the brick at `offset` (components 0 or 1) from each coordinate, -1 where there is none.
+
+    -1 addresses the last row: append a row of zeros to what is gathered.
+    """
+    padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)
+    return padded[tuple((np.asarray(brick_coords, np.int64) + offset).T)]
+
+
+def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[n_bricks, 8] uint64 masks, laid out like `brick_masks`, of the cells with all eight corners stored.
+
+    A corner counts axis by axis: along z, then y, then x, with the first layer of the next brick at the far
+    end.
+
+    >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
+    >>> live = live_cells(coords, masks, dense_index(coords, 2))
+    >>> np.bitwise_count(live).sum(axis=1).tolist()
+    [512, 0, 0, 0, 0, 0, 0, 0]
+    """
+    zeros = np.zeros((1, BRICK), np.uint64)
+
+    def beyond(words: np.ndarray, offset: tuple[int, int, int]) -> np.ndarray:
+        return np.concatenate([words, zeros])[neighbours(brick_coords, index, offset)]
+
+    masks = np.asarray(brick_masks, np.uint64)
+    shift = [np.uint64(n) for n in (1, 7, 8, 56)]
+    along_z = ((masks >> shift[0]) & ~_Z_LAST) | ((beyond(masks, (0, 0, 1)) & _Z_FIRST) << shift[1])
+    live = masks & along_z
+    live = live & ((live >> shift[2]) | (beyond(live, (0, 1, 0)) << shift[3]))
+    return live & np.concatenate([live[:, 1:], beyond(live, (1, 0, 0))[:, :1]], axis=1)

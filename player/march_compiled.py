@@ -1,0 +1,286 @@
+"""The march of `player.march`, compiled by numba: the same semantics, one ray after the other.
+
+Every function has its readable twin in `player.march`, whose docstring states the mathematics; the tests
+compare the two. Arithmetic that decides which cell a sample falls into is float32 in the same order in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from player.few_samples import MIN_TOTAL
+from player.march import MAX_TAU, MIN_OPACITY, SKIP_MARGIN, MarchResult
+from player.sparse_grid import ABSENT, SparseGrid
+
+try:
+    import numba
+except ImportError:  # an extra: without it `player.march` runs
+    numba = None
+
+F32 = np.float32
+
+
+def available() -> bool:
+    """Whether numba is installed."""
+    return numba is not None
+
+
+def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    if numba is None:
+        return function
+    options = {"nogil": True, "fastmath": False, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder to keep the compiled code in: compile again in every process
+        return numba.njit(**options)(function)
+
+
+def march(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    n_samples: int,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> MarchResult:
+    """`player.march.march`, compiled: same arguments, same result to float32 rounding."""
+    n_rays = len(rays_o)
+    near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
+    far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
+    diagonal = float(np.linalg.norm(grid.resolution / grid.cells_per_unit.astype(np.float64)))
+    opacity, depth = np.zeros(n_rays, F32), np.zeros(n_rays, F32)
+    counts, hits = np.zeros(n_rays, np.int32), np.empty(n_rays, np.int64)
+    features = np.zeros((n_rays, grid.n_channels), F32)
+    capacity = int(diagonal / float(grid.step)) + 3
+    origin, scale = tuple(grid.aabb_min), tuple(grid.cells_per_unit)
+    n_hits = _march_rays(
+        (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
+        (grid.table, grid.live, grid.density),
+        (grid.bricks, grid.base, grid.ranks, grid.features),
+        (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
+        n_samples,
+        (np.empty(capacity, F32), np.empty(capacity, F32), np.empty(8, np.int64), np.empty(8, F32)),
+        (opacity, depth, counts, features, hits),
+    )
+    return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits])
+
+
+@_jit
+def _march_rays(settings, lookup, stored, rays, k, scratch, out):
+    """Every ray: its samples into the scratch arrays, then its fetches into the next row of `features`."""
+    resolution, n_per_axis, step, low, slope, origin, scale = settings
+    rays_o, rays_d, near, far = rays
+    scratch_s, scratch_w, corner_rows, corner_shares = scratch
+    opacity, depth, counts, features, hits = out
+    n_hits = 0
+    for ray in range(len(near)):
+        dx, dy, dz = rays_d[ray, 0] * scale[0], rays_d[ray, 1] * scale[1], rays_d[ray, 2] * scale[2]
+        ox = (rays_o[ray, 0] - origin[0]) * scale[0]
+        oy = (rays_o[ray, 1] - origin[1]) * scale[1]
+        oz = (rays_o[ray, 2] - origin[2]) * scale[2]
+        size = F32(resolution)
+        t_in, t_out = _slab(ox, dx, size, F32(0.0), F32(np.inf))
+        t_in, t_out = _slab(oy, dy, size, t_in, t_out)
+        t_in, t_out = _slab(oz, dz, size, t_in, t_out)
+        length = min(t_out - t_in, far[ray] - t_in)
+        if not length > F32(0.0):
+            continue
+        first = math.floor(max(near[ray] - t_in, F32(0.0)) / step - F32(0.5))
+        point = (
+            min(max(ox + t_in * dx, F32(0.0)), size),
+            min(max(oy + t_in * dy, F32(0.0)), size),
+            min(max(oz + t_in * dz, F32(0.0)), size),
+        )
+        n, taken, tau, total, moment = _collect(
+            (resolution, n_per_axis, step, low, slope), lookup, point, (dx, dy, dz), max(first, 0), length,
+            scratch_s, scratch_w,
+        )  # fmt: skip
+        counts[ray] = taken
+        if n == 0:
+            continue
+        mass = F32(_opacity(tau))
+        opacity[ray] = mass
+        depth[ray] = t_in + F32(moment / total)
+        if mass > MIN_OPACITY:
+            _gather(
+                stored, (resolution, n_per_axis), point, (dx, dy, dz), scratch_s, scratch_w, n, total, mass,
+                k, corner_rows, corner_shares, features, n_hits,
+            )  # fmt: skip
+            hits[n_hits] = ray
+            n_hits += 1
+    return n_hits
+
+
+@_jit
+def _slab(o, d, size, t_in, t_out):
+    """Narrow the interval of t to one slab of the box; empty (t_out = -inf) for a parallel ray outside it."""
+    if d == F32(0.0):
+        if o < F32(0.0) or o > size:
+            return t_in, F32(-np.inf)
+        return t_in, t_out
+    a = (F32(0.0) - o) / d
+    b = (size - o) / d
+    return max(t_in, min(a, b)), min(t_out, max(a, b))
+
+
+@_jit
+def _opacity(tau):
+    """1 - exp(-tau) to float32 rounding: the difference in float64, or the series where that would cancel."""
+    if tau < F32(1e-5):
+        return tau - F32(0.5) * tau * tau
+    return F32(1.0 - math.exp(-np.float64(tau)))
+
+
+@_jit
+def _collect(settings, lookup, point, direction, first, length, scratch_s, scratch_w):
+    """March one ray: s and weight of each sample that has weight into the scratch arrays.
+
+    Returns how many, the number of samples taken, tau, and the sums of w and of w s.
+    """
+    resolution, n_per_axis, step, low, slope = settings
+    table, live, density = lookup
+    ex, ey, ez = point
+    dx, dy, dz = direction
+    last = resolution - 1
+    tau = F32(0.0)
+    trans = F32(1.0)
+    total = 0.0
+    moment = 0.0
+    n = 0
+    taken = 0
+    i = first
+    while True:
+        s = (F32(i) + F32(0.5)) * step
+        if s >= length:
+            break
+        gx, gy, gz = ex + s * dx, ey + s * dy, ez + s * dz
+        x, y, z = min(max(int(gx), 0), last), min(max(int(gy), 0), last), min(max(int(gz), 0), last)
+        slot = table[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)]
+        if slot < 0:
+            reach = -1 - slot
+            leave = min(
+                _leave(ex, dx, x >> 3, reach),
+                min(_leave(ey, dy, y >> 3, reach), _leave(ez, dz, z >> 3, reach)),
+            )
+            i = max(i + 1, math.floor(min(leave, length) / step - F32(0.5)) + 1)
+            continue
+        i += 1
+        lx, ly, lz = x & 7, y & 7, z & 7
+        if (live[slot * 64 + lx * 8 + ly] >> lz) & 1 == 0:
+            continue
+        code = _trilinear(density, slot * 729 + lx * 81 + ly * 9 + lz, gx - F32(x), gy - F32(y), gz - F32(z))
+        optical = math.exp(low + slope * code) * step
+        taken += 1
+        tau += optical
+        weight = trans * _opacity(optical)
+        trans = math.exp(-tau)
+        if weight > F32(0.0):
+            scratch_s[n] = s
+            scratch_w[n] = weight
+            n += 1
+            total += weight
+            moment += np.float64(weight) * s
+        if tau > MAX_TAU:
+            break
+    return n, taken, tau, total, moment
+
+
+@_jit
+def _leave(e, d, brick, reach):
+    """s at which a ray leaves the bricks within `reach` of `brick` along one axis, a margin early."""
+    if d > F32(0.0):
+        return (F32((brick + reach + 1) * 8) - SKIP_MARGIN - e) / d
+    if d < F32(0.0):
+        return (F32((brick - reach) * 8) + SKIP_MARGIN - e) / d
+    return F32(np.inf)
+
+
+@_jit
+def _trilinear(density, at, fx, fy, fz):
+    """Codes between the corners of a cell: along z, then y, then x."""
+    c000, c001 = F32(density[at]), F32(density[at + 1])
+    c010, c011 = F32(density[at + 9]), F32(density[at + 10])
+    c100, c101 = F32(density[at + 81]), F32(density[at + 82])
+    c110, c111 = F32(density[at + 90]), F32(density[at + 91])
+    c00, c01 = c000 + (c001 - c000) * fz, c010 + (c011 - c010) * fz
+    c10, c11 = c100 + (c101 - c100) * fz, c110 + (c111 - c110) * fz
+    c0, c1 = c00 + (c01 - c00) * fy, c10 + (c11 - c10) * fy
+    return c0 + (c1 - c0) * fx
+
+
+@_jit
+def _gather(stored, sizes, point, direction, scratch_s, scratch_w, n, total, mass, k, rows, shares, out, row):
+    """Choose the fetches of one ray and add them up in `out[row]`: bins of equal mass, filled in one pass."""
+    if k == 0 or n <= k:
+        for i in range(n):
+            _fetch(stored, sizes, point, direction, scratch_s[i], scratch_w[i], rows, shares, out, row)
+        return
+    share = total / k
+    weight = mass / F32(k)
+    i = 0
+    left = np.float64(scratch_w[0])
+    for _ in range(k):
+        need = share
+        moment = 0.0
+        heaviest = -1.0
+        heaviest_s = scratch_s[i]
+        while True:
+            part = min(left, need)
+            moment += part * scratch_s[i]
+            if part > heaviest:
+                heaviest = part
+                heaviest_s = scratch_s[i]
+            need -= part
+            left -= part
+            if left > 0.0 or i == n - 1:
+                break
+            i += 1
+            left = np.float64(scratch_w[i])
+            if need <= 0.0:
+                break
+        s = F32(moment / share)
+        if not _fetch(stored, sizes, point, direction, s, weight, rows, shares, out, row):
+            _fetch(stored, sizes, point, direction, heaviest_s, weight, rows, shares, out, row)
+
+
+@_jit
+def _fetch(stored, sizes, point, direction, s, weight, rows, shares, out, row):
+    """Add `weight` times the features at s to `out[row]`; False, and nothing added, where too little is
+    stored."""
+    resolution, n_per_axis = sizes
+    bricks, base, ranks, features = stored
+    size = F32(resolution)
+    gx = min(max(point[0] + s * direction[0], F32(0.0)), size)
+    gy = min(max(point[1] + s * direction[1], F32(0.0)), size)
+    gz = min(max(point[2] + s * direction[2], F32(0.0)), size)
+    last = resolution - 1
+    x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
+    fx, fy, fz = gx - F32(x), gy - F32(y), gz - F32(z)
+    total = F32(0.0)
+    for corner in range(8):
+        ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
+        share = (fx if ix else F32(1.0) - fx) * (fy if iy else F32(1.0) - fy) * (fz if iz else F32(1.0) - fz)
+        vx, vy, vz = x + ix, y + iy, z + iz
+        brick = np.int64(bricks[((vx >> 3) * n_per_axis + (vy >> 3)) * n_per_axis + (vz >> 3)])
+        rows[corner] = 0
+        shares[corner] = F32(0.0)
+        if brick >= 0:
+            rank = np.int64(ranks[brick * 512 + ((vx & 7) * 64 + (vy & 7) * 8 + (vz & 7))])
+            if rank != ABSENT:
+                rows[corner] = base[brick] + rank
+                shares[corner] = share
+                total += share
+    if total < MIN_TOTAL:
+        return False
+    scale = weight / total
+    s0, s1, s2, s3 = shares[0] * scale, shares[1] * scale, shares[2] * scale, shares[3] * scale
+    s4, s5, s6, s7 = shares[4] * scale, shares[5] * scale, shares[6] * scale, shares[7] * scale
+    r0, r1, r2, r3, r4, r5, r6, r7 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
+    for c in range(features.shape[1]):
+        front = s0 * features[r0, c] + s1 * features[r1, c] + s2 * features[r2, c] + s3 * features[r3, c]
+        back = s4 * features[r4, c] + s5 * features[r5, c] + s6 * features[r6, c] + s7 * features[r7, c]
+        out[row, c] += front + back
+    return True

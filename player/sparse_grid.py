@@ -1,0 +1,166 @@
+"""The sparse grid as the marches want it: built from the arrays of an asset when it is opened, in numpy.
+
+Letters: R cells per axis, nb bricks per axis, C channels; a slot is the number of a brick that has a live
+cell. Everything is flat, so that one integer addresses it, in numpy as in compiled code:
+
+    table      [nb^3] int32        at (bx * nb + by) * nb + bz: the slot, or minus the Chebyshev distance,
+    in bricks, to
+                                   the nearest brick with a live cell (at most MAX_DISTANCE)
+    live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
+    density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron,
+    so that the
+                                   eight corners of a cell are in one brick
+    bricks     [nb^3] int32        the brick that holds a vertex, -1 where there is none
+    base       [n_bricks] int32    row of the brick's first vertex in `features`
+    ranks      [n_bricks * 512] u16  at brick * 512 + b: row of the vertex counted from the base, ABSENT if
+    not stored features   [n_vertices, C] int8
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.bricks import BRICK, bricks_per_axis, dense_index, live_cells, neighbours, stored_bits
+from player.density import decode_constants
+
+MAX_DISTANCE = 31
+"""Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
+
+ABSENT = 0xFFFF
+"""The rank of a vertex that is not stored."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparseGrid:
+    """What a march reads; the arrays are described at the top of the module."""
+
+    resolution: int
+    n_per_axis: int
+    aabb_min: np.ndarray
+    """[3] float32, model frame."""
+    cells_per_unit: np.ndarray
+    """[3] float32: grid coordinate = (x - aabb_min) * cells_per_unit, 0..R."""
+    step: np.float32
+    """Distance between lattice samples in model units."""
+    density_low: np.float32
+    density_slope: np.float32
+    slot_coords: np.ndarray
+    """[n_slots, 3] int32: brick coordinate of each slot."""
+    table: np.ndarray
+    live: np.ndarray
+    density: np.ndarray
+    bricks: np.ndarray
+    base: np.ndarray
+    ranks: np.ndarray
+    features: np.ndarray
+
+    @property
+    def n_channels(self) -> int:
+        return self.features.shape[1]
+
+
+def build_grid(
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    resolution: int,
+    aabb: np.ndarray,
+    step: float,
+    density_range: tuple[float, float],
+) -> SparseGrid:
+    """Arrange the arrays of an asset for marching.
+
+    Args:
+        arrays: `brick_coords`, `brick_masks`, `density`, `features` as on disk, already checked.
+        resolution: R, cells per axis.
+        aabb: [2, 3] the box, model frame.
+        step: distance between lattice samples, model units.
+        density_range: log sigma at codes 0 and 255.
+
+    >>> from player.bricks import pack_vertices
+    >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((5, 5, 5))))
+    >>> codes, features = np.zeros(125, np.uint8), np.zeros((125, 2), np.int8)
+    >>> grid = build_grid((coords, masks, codes, features), 4, np.array([[-1] * 3, [1] * 3]), 0.1, (0.0, 1.0))
+    >>> grid.table.tolist(), int(np.bitwise_count(grid.live).sum())
+    ([0], 64)
+    """
+    coords, masks, density, features = arrays
+    n_per_axis = bricks_per_axis(resolution)
+    index = dense_index(coords, n_per_axis)
+    cells = live_cells(coords, masks, index)
+    has_cells = np.flatnonzero(cells.any(axis=1))
+    slots = np.full(len(coords), -1, np.int32)
+    slots[has_cells] = np.arange(len(has_cells), dtype=np.int32)
+    slot_coords = np.asarray(coords, np.int32)[has_cells]
+    stored = stored_bits(masks)
+    base, ranks = _ranks(stored)
+    low, slope = decode_constants(density_range)
+    box = np.asarray(aabb, np.float64)
+    return SparseGrid(
+        resolution=resolution,
+        n_per_axis=n_per_axis,
+        aabb_min=box[0].astype(np.float32),
+        cells_per_unit=(resolution / (box[1] - box[0])).astype(np.float32),
+        step=np.float32(step),
+        density_low=low,
+        density_slope=slope,
+        slot_coords=slot_coords,
+        table=_table(slot_coords, n_per_axis),
+        live=np.ascontiguousarray(cells[has_cells], "<u8").view(np.uint8).reshape(-1),
+        density=_with_apron(stored, density, coords, index, has_cells),
+        bricks=index.reshape(-1),
+        base=base,
+        ranks=ranks,
+        features=np.array(features, np.int8, order="C"),
+    )
+
+
+def _ranks(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    counts = np.cumsum(stored, axis=1, dtype=np.uint16)
+    totals = counts[:, -1].astype(np.int64) if len(stored) else np.zeros(0, np.int64)
+    base = (np.cumsum(totals) - totals).astype(np.int32)
+    counts -= np.uint16(1)
+    counts[~stored] = ABSENT
+    return base, counts.reshape(-1)
+
+
+def _with_apron(
+    stored: np.ndarray, density: np.ndarray, coords: np.ndarray, index: np.ndarray, chosen: np.ndarray
+) -> np.ndarray:
+    dense = np.zeros(
+        (len(stored) + 1, 512), np.uint8
+    )  # the last row stands for every brick that is not there
+    dense[:-1][stored] = density
+    dense = dense.reshape(-1, BRICK, BRICK, BRICK)
+    apron = np.zeros((len(chosen), BRICK + 1, BRICK + 1, BRICK + 1), np.uint8)
+    for offset in np.ndindex(2, 2, 2):
+        source = neighbours(coords[chosen], index, offset)
+        into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
+        take = tuple(slice(1) if o else slice(None) for o in offset)
+        apron[(slice(None), *into)] = dense[(slice(None), *take)][source]
+    return apron.reshape(-1)
+
+
+def _table(slot_coords: np.ndarray, n_per_axis: int) -> np.ndarray:
+    """Slots, and elsewhere minus the Chebyshev distance: each round grows the reached set by one brick on
+    every side."""
+    reached = np.zeros((n_per_axis,) * 3, bool)
+    where = tuple(slot_coords.T)
+    reached[where] = True
+    table = np.zeros(reached.shape, np.int32)
+    for distance in range(1, MAX_DISTANCE + 1):
+        table[~reached] = -distance
+        for axis in range(3):
+            reached = _dilate(reached, axis)
+        if reached.all():
+            break
+    table[where] = np.arange(len(slot_coords), dtype=np.int32)
+    return table.reshape(-1)
+
+
+def _dilate(mask: np.ndarray, axis: int) -> np.ndarray:
+    moved = np.moveaxis(mask, axis, 0)
+    grown = moved.copy()
+    grown[1:] |= moved[:-1]
+    grown[:-1] |= moved[1:]
+    return np.moveaxis(grown, 0, axis)
