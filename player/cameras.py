@@ -1,0 +1,487 @@
+"""Pinhole cameras: where they come from (transforms.json, an orbit) and the rays that leave them.
+
+Conventions: `c2w` [4, 4] maps camera to world, OpenGL/Blender axes (x right, y up, the camera looks along
+-z). Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5); `fx fy cx cy` are in pixels. `rays_d` has
+unit length, so `t` is a distance in scene units.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.errors import FormatError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole camera.
+
+    >>> camera = Camera("front", np.eye(4), width=2, height=2, fx=1.0, fy=1.0, cx=1.0, cy=1.0)
+    >>> rays_o, rays_d = camera.rays()
+    >>> rays_d.shape, bool(np.allclose(np.linalg.norm(rays_d, axis=-1), 1))
+    ((4, 3), True)
+    """
+
+    name: str
+    """The picture's path as the data set writes it, for example `./test/r_0`."""
+    c2w: np.ndarray
+    """[4, 4] float64, camera to world, rigid."""
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        check_pose(self.c2w, self.name)
+        if self.width < 1 or self.height < 1:
+            raise FormatError(f"{self.name}: size: expected at least 1x1, got {self.width}x{self.height}")
+        for key in ("fx", "fy"):
+            if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
+                raise FormatError(
+                    f"{self.name}: {key}: expected a positive focal length, got {getattr(self, key)}"
+                )
+        if not np.isfinite([self.cx, self.cy]).all():
+            raise FormatError(f"{self.name}: cx, cy: expected finite numbers, got {self.cx}, {self.cy}")
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on a grid of `width` x `height` pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def transformed(self, matrix: np.ndarray) -> Camera:
+        """The camera in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale,
+        translation).
+        """
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        c2w = matrix @ self.c2w
+        c2w[:3, :3] /= scale
+        return replace(self, c2w=c2w)
+
+    def rays(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Rays through the pixel centres `start:stop` in row-major order.
+
+        Returns `rays_o`, `rays_d` [n_rays, 3] float32, `rays_d` of unit length.
+        """
+        index = np.arange(start, self.width * self.height if stop is None else stop)
+        rows, columns = np.divmod(index, self.width)
+        x = (columns + 0.5 - self.cx) / self.fx
+        y = -(rows + 0.5 - self.cy) / self.fy
+        rays_d = np.stack([x, y, -np.ones_like(x)], axis=-1) @ self.c2w[:3, :3].T
+        rays_d /= np.linalg.norm(rays_d, axis=-1, keepdims=True)
+        rays_o = np.broadcast_to(self.c2w[:3, 3], rays_d.shape)
+        return rays_o.astype(np.float32), rays_d.astype(np.float32)
+
+
+def check_pose(c2w: np.ndarray, where: str) -> None:
+    """Raise FormatError unless `c2w` [4, 4] is finite and rigid (right-handed, orthonormal within 1e-3)."""
+    if c2w.shape != (4, 4):
+        raise FormatError(
+            f"{where}: camera matrix: expected 4 rows of 4 numbers, got shape {list(c2w.shape)}"
+        )
+    rotation = c2w[:3, :3]
+    rigid = (
+        np.isfinite(c2w).all()
+        and np.abs(c2w).max() <= 1e12  # further away float32 rays say nothing, and squares overflow
+        and np.allclose(c2w[3], [0, 0, 0, 1], atol=1e-6)
+        and np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0
+    )
+    if not rigid:
+        raise FormatError(
+            f"{where}: camera matrix: expected a rotation and a translation, got {c2w.tolist()}"
+        )
+
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
+MAX_FILE_BYTES = 64 * 2**20
+MAX_PIXELS_A_SIDE = 65536
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
+
+
+def load_transforms(path: Path) -> dict[str, Any]:
+    """The JSON of a transforms.json, with `frames` checked to be a list of objects that each have a
+    `file_path`.
+
+    Raises FormatError: no such file, over 64 MB, not JSON (NaN and Infinity are not), no frames, not a
+    pinhole model.
+    """
+    try:
+        n_bytes = path.stat().st_size
+        if n_bytes > MAX_FILE_BYTES:
+            raise FormatError(f"{path}: size: expected at most {MAX_FILE_BYTES} bytes, got {n_bytes}")
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: no such file: expected a transforms.json") from error
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+    try:
+        document = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: expected JSON, got {_brief(str(error))}") from error
+    if not isinstance(document, dict):
+        raise FormatError(f"{path}: expected a JSON object with frames, got {_brief(document)}")
+    frames = document.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise FormatError(f"{path}: frames: expected a list of at least one frame, got {_brief(frames)}")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise FormatError(f"{path}: frame {index}: expected an object, got {_brief(frame)}")
+        name = frame.get("file_path")
+        if not isinstance(name, str) or not name or any(_unwritable(c) for c in name):
+            raise FormatError(f"{path}: frame {index}: file_path: expected a path, got {_brief(name)}")
+        where = f"{path}: frame {index} ({name})"
+        model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
+        if model not in PINHOLE_MODELS:
+            expected = ", ".join(PINHOLE_MODELS)
+            raise FormatError(f"{where}: camera_model: expected one of {expected}, got {_brief(model)}")
+        if frame.get("is_fisheye", document.get("is_fisheye", False)):
+            raise FormatError(f"{where}: is_fisheye: expected a pinhole camera, got a fisheye")
+    return document
+
+
+def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
+    """Read the cameras of a transforms.json, in the NeRF-synthetic, the instant-ngp or the nerfstudio form.
+
+    `path`: the file. `size`: (width, height) in pixels for cameras that the file gives no `w`, `h`.
+
+    The focal length is `fl_x`, `fl_y` in pixels, or else `camera_angle_x`, `camera_angle_y`, the whole field
+    of view in radians; a key inside a frame wins over the same key at the top. A matrix of three rows is
+    completed. Lens distortion (`k1`, ...) is not a camera's: pictures are undistorted when they are read, and
+    these are the cameras of the result.
+
+    Raises FormatError in one line: file, frame, expected, got.
+
+    >>> import tempfile
+    >>> camera = Camera("a.png", np.eye(4), width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "transforms.json"
+    ...     _ = path.write_bytes(write_cameras([camera]))
+    ...     [(c.name, c.width, c.fx) for c in read_cameras(path)]
+    [('a.png', 8, 9.0)]
+    """
+    return transforms_cameras(load_transforms(path), path, size)
+
+
+def transforms_cameras(
+    document: dict[str, Any], path: Path, size: tuple[int, int] | None = None
+) -> list[Camera]:
+    """The cameras of what `load_transforms` returned; `path` is for the messages. Raises FormatError."""
+    return [
+        _frame_camera(document, frame, f"{path}: frame {index} ({frame['file_path']})", size)
+        for index, frame in enumerate(document["frames"])
+    ]
+
+
+def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str, where: str) -> float | None:
+    """The finite number called `key` in the frame, else at the top, else None. Raises FormatError."""
+    value = frame.get(key, document.get(key))
+    if value is None:
+        return None
+    number = _as_float(value)
+    if number is None:
+        raise FormatError(f"{where}: {key}: expected a finite number, got {_brief(value)}")
+    return number
+
+
+def write_cameras(cameras: Sequence[Camera]) -> bytes:
+    """The transforms.json of `cameras`, each frame with its own `fl_x fl_y cx cy w h` (instant-ngp form).
+
+    >>> camera = Camera("a.png", np.eye(4), width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
+    >>> json.loads(write_cameras([camera]))["frames"][0]["w"]
+    8
+    """
+    frames = [
+        {
+            "file_path": camera.name,
+            "w": int(camera.width),
+            "h": int(camera.height),
+            "fl_x": float(camera.fx),
+            "fl_y": float(camera.fy),
+            "cx": float(camera.cx),
+            "cy": float(camera.cy),
+            "transform_matrix": np.asarray(camera.c2w, np.float64).tolist(),
+        }
+        for camera in cameras
+    ]
+    return (json.dumps({"frames": frames}, indent=1, allow_nan=False) + "\n").encode()
+
+
+def frame_names(cameras: Sequence[Camera]) -> list[str]:
+    """One file stem a camera, all different on any file system, without separators.
+
+    Cameras that share a stem get their folders joined in with `_`, and a running number if that is not
+    enough.
+
+    >>> pose = np.eye(4)
+    >>> names = ["./test/r_0", "images/0001.jpg", "left/a.png", "right/a.png", "right/a.png"]
+    >>> frame_names([Camera(name, pose, 1, 1, 1.0, 1.0, 0.5, 0.5) for name in names])
+    ['r_0', '0001', 'left_a', 'right_a', 'right_a_1']
+    """
+    parts = [_name_parts(camera.name) for camera in cameras]
+    depth = [1] * len(parts)
+
+    def name_of(i: int) -> str:
+        return "_".join(parts[i][-depth[i] :])
+
+    deeper = True
+    while deeper:
+        deeper = False
+        groups: dict[str, list[int]] = {}
+        for i in range(len(parts)):
+            groups.setdefault(name_of(i).casefold(), []).append(i)
+        for group in groups.values():
+            for i in group if len(group) > 1 else []:
+                if depth[i] < len(parts[i]):
+                    depth[i] += 1
+                    deeper = True
+    names = [name_of(i) for i in range(len(parts))]
+    taken = {name.casefold() for name in names}
+    seen: set[str] = set()
+    for i, name in enumerate(names):
+        number = 0
+        while names[i].casefold() in seen:
+            number += 1
+            candidate = f"{name}_{number}"
+            if candidate.casefold() not in taken:
+                names[i] = candidate
+                taken.add(candidate.casefold())
+        seen.add(names[i].casefold())
+    return names
+
+
+def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
+    """The point [3] that is nearest to all optical axes, in the least-squares sense.
+
+    Where the axes do not tell (parallel, or one camera) or meet behind the cameras, a point ahead of the mean
+    camera, as far as the cameras are spread.
+
+    >>> pose = np.eye(4)
+    >>> pose[:3, 3] = 0, 0, 4
+    >>> side = np.array([[0.0, 0, 1, 4], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    >>> cameras = [Camera(name, m, 1, 1, 1.0, 1.0, 0.5, 0.5) for name, m in [("front", pose), ("side", side)]]
+    >>> bool(np.allclose(focus_point(cameras), 0, atol=1e-4))
+    True
+    """
+    origins, forwards = _axes(cameras)
+    middle = origins.mean(axis=0)
+    spread = float(np.sqrt(((origins - middle) ** 2).sum(axis=-1).mean()))
+    # In units of the cameras' spread around their mean: the solution is then free of the scene's unit and
+    # origin.
+    unit = spread if spread > 0 else 1.0
+    ahead = _unit(forwards.mean(axis=0), np.zeros(3))
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    a = across.mean(axis=0)
+    b = (across @ ((origins - middle) / unit)[:, :, None]).mean(axis=0)[:, 0]
+    # The weight of the point ahead: far below what axes one degree apart know (eigenvalue 1e-4), far above
+    # rounding.
+    weight = 1e-7
+    point = np.linalg.solve(a + weight * np.eye(3), b + weight * ahead)
+    in_front = np.median(((point - (origins - middle) / unit) * forwards).sum(axis=-1)) > -1e-6
+    return middle + unit * (point if in_front else ahead)
+
+
+def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
+    """A turn around what `cameras` look at, at their median distance and elevation, starting beside the first
+    one.
+
+    `n_frames`: views in the turn, equal steps. `size`: (width, height) of the pictures; the first camera's
+    field of view is kept as large as fits, with its pixel shape. Raises FormatError for no cameras or no
+    frames.
+
+    >>> pose = np.eye(4)
+    >>> pose[:3, 3] = 0, 0, 4
+    >>> turn = orbit([Camera("a", pose, 8, 6, 9.0, 9.0, 4.0, 3.0)], 3, size=(4, 3))
+    >>> [(c.name, c.width, c.fx) for c in turn]
+    [('orbit_000', 4, 4.5), ('orbit_001', 4, 4.5), ('orbit_002', 4, 4.5)]
+    """
+    if not cameras:
+        raise FormatError("orbit: cameras: expected at least one, got none")
+    if n_frames < 1:
+        raise FormatError(f"orbit: frames: expected at least 1, got {n_frames}")
+    focus = focus_point(cameras)
+    up = _up(cameras)
+    arms = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
+    radii = np.linalg.norm(arms, axis=-1)
+    radius = float(np.median(radii))
+    sines = arms @ up / np.maximum(radii, 1e-12)
+    limit = np.deg2rad(85)  # straight above, left and right mean nothing
+    elevation = float(np.clip(np.median(np.arcsin(np.clip(sines, -1, 1))), -limit, limit))
+    start = _unit(arms[0] - (arms[0] @ up) * up, np.cross(up, np.eye(3)[np.argmin(np.abs(up))]))
+    left = np.cross(up, start)
+    first = cameras[0] if size is None else _fitted(cameras[0], *size)
+    views = []
+    for index in range(n_frames):
+        azimuth = 2 * np.pi * index / n_frames
+        level = np.cos(azimuth) * start + np.sin(azimuth) * left
+        back = np.cos(elevation) * level + np.sin(elevation) * up
+        right = _unit(np.cross(up, back), left)
+        c2w = np.eye(4)
+        c2w[:3, :4] = np.stack([right, np.cross(back, right), back, focus + radius * back], axis=-1)
+        views.append(replace(first, name=f"orbit_{index:03d}", c2w=c2w))
+    return views
+
+
+def _axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and viewing directions, [n_cameras, 3] each."""
+    c2w = np.stack([camera.c2w for camera in cameras])
+    return c2w[:, :3, 3], -c2w[:, :3, 2] / np.linalg.norm(c2w[:, :3, 2], axis=-1, keepdims=True)
+
+
+def _up(cameras: Sequence[Camera]) -> np.ndarray:
+    """The world's up [3], of unit length.
+
+    Nobody holds a camera crooked for long: up is at right angles to the cameras' right hands as well as it
+    can be, and where these do not tell it is the mean of the cameras' own ups, which leans when all of them
+    stand on one side.
+    """
+    c2w = np.stack([camera.c2w for camera in cameras])
+    rights, ups = c2w[:, :3, 0], c2w[:, :3, 1]
+    mean = _unit(ups.mean(axis=0), ups[0])
+    spread = rights.T @ rights / len(rights)
+    weight = 1e-3  # as much as right hands tell that turn by two degrees
+    return _unit(np.linalg.solve(spread + weight * np.eye(3), weight * mean), mean)
+
+
+def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    if length > 1e-9:
+        return vector / length
+    length = np.linalg.norm(otherwise)
+    return otherwise / length if length > 0 else otherwise
+
+
+def _fitted(camera: Camera, width: int, height: int) -> Camera:
+    scale = min(width / camera.width, height / camera.height)
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=width / 2 + (camera.cx - camera.width / 2) * scale,
+        cy=height / 2 + (camera.cy - camera.height / 2) * scale,
+    )
+
+
+def _frame_camera(
+    document: dict[str, Any], frame: dict[str, Any], where: str, size: tuple[int, int] | None
+) -> Camera:
+    width, height = (_pixels(document, frame, key, where) for key in ("w", "h"))
+    if width is None or height is None:
+        if size is None:
+            raise FormatError(f"{where}: w, h: expected the picture's size, got none: pass a size")
+        width, height = size
+    fx, fy = (
+        _focal(document, frame, axis, n_pixels, where) for axis, n_pixels in (("x", width), ("y", height))
+    )
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    if fx is None or fy is None:
+        raise FormatError(f"{where}: focal length: expected fl_x or camera_angle_x, got neither")
+    cx, cy = (transforms_number(document, frame, key, where) for key in ("cx", "cy"))
+    try:
+        return Camera(
+            name=frame["file_path"],
+            c2w=_matrix(frame.get("transform_matrix")),
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=width / 2 if cx is None else cx,
+            cy=height / 2 if cy is None else cy,
+        )
+    except FormatError as error:
+        message = str(error).removeprefix(f"{frame['file_path']}: ")
+        raise FormatError(f"{where}: {message}") from None
+
+
+def _focal(
+    document: dict[str, Any], frame: dict[str, Any], axis: str, n_pixels: int, where: str
+) -> float | None:
+    """The focal length in pixels along `axis`: the frame's own, as length or angle, before the top's."""
+    for level in (frame, document):
+        focal = transforms_number({}, level, f"fl_{axis}", where)
+        if focal is not None:
+            return focal
+        angle = transforms_number({}, level, f"camera_angle_{axis}", where)
+        if angle is not None:
+            if not 0 < angle < np.pi:
+                raise FormatError(
+                    f"{where}: camera_angle_{axis}: expected radians between 0 and pi, got {angle}"
+                )
+            return float(0.5 * n_pixels / np.tan(0.5 * angle))
+    return None
+
+
+def _pixels(document: dict[str, Any], frame: dict[str, Any], key: str, where: str) -> int | None:
+    number = transforms_number(document, frame, key, where)
+    if number is None:
+        return None
+    if number != int(number) or not 1 <= number <= MAX_PIXELS_A_SIDE:
+        raise FormatError(f"{where}: {key}: expected 1 to {MAX_PIXELS_A_SIDE} whole pixels, got {number}")
+    return int(number)
+
+
+def _matrix(rows: Any) -> np.ndarray:
+    """`transform_matrix` as [4, 4] float64; three rows of four are completed."""
+    expected = "camera matrix: expected 4 rows of 4 numbers"
+    if not isinstance(rows, list):
+        raise FormatError(f"{expected}, got {_brief(rows)}")
+    if len(rows) not in (3, 4):
+        raise FormatError(f"{expected}, got {len(rows)} rows")
+    for index, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != 4 or any(_as_float(value) is None for value in row):
+            raise FormatError(f"{expected}, got row {index}: {_brief(row)}")
+    return np.array([*rows, [0, 0, 0, 1]][:4], np.float64)
+
+
+def _as_float(value: Any) -> float | None:
+    """A finite number as float, None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name}, which is not a number of JSON")
+
+
+def _unwritable(character: str) -> bool:
+    """Whether no file name has it: a control character, a line's end, half a surrogate pair."""
+    return character < " " or character in "\x7f\x85\u2028\u2029" or "\ud800" <= character <= "\udfff"
+
+
+def _brief(value: Any) -> str:
+    """What was found, in one short line of plain characters."""
+    text = ascii(value) if not isinstance(value, str) else value
+    text = text.encode("ascii", "backslashreplace").decode().replace("\n", " ").replace("\r", " ")
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _name_parts(name: str) -> list[str]:
+    """The folders and the stem of a picture's path, made fit for file names on any system."""
+    parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    if parts and parts[-1].lower().endswith(PICTURE_SUFFIXES):
+        parts[-1] = parts[-1].rpartition(".")[0]
+    safe = ["".join(c if c.isprintable() and c not in '<>:"|?*' else "_" for c in part) for part in parts]
+    safe = [part.rstrip(". ").replace("..", "_") for part in safe]
+    return [part for part in safe if part] or ["frame"]

@@ -1,0 +1,333 @@
+"""Folders of pictures: what is read, what is refused, and lenses made straight."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from player.cameras import Camera, read_cameras
+from player.errors import DataError, FormatError, MissingExtraError
+from vfr_bake.data import load_scene
+from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.transforms import read_picture, undistort
+
+
+def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:
+    return np.random.default_rng(seed).integers(1, 255, (height, width, channels), np.uint8)
+
+
+def make_folder(folder: Path, n: int, name: str = "transforms.json", stem: str = "r_", **top: Any) -> Path:
+    """`n` views around the demo's place, RGBA; blender form unless `top` says more."""
+    folder.mkdir(exist_ok=True)
+    frames = []
+    for index, camera in enumerate(demo_cameras(8, n)):
+        Image.fromarray(picture(index)).save(folder / f"{stem}{index}.png")
+        frames.append({"file_path": f"./{stem}{index}", "transform_matrix": camera.c2w.tolist()})
+    (folder / name).write_text(json.dumps({"camera_angle_x": 0.7, **top, "frames": frames}))
+    return folder
+
+
+def message(folder: Path | str, kind: type[Exception] = DataError) -> str:
+    with pytest.raises(kind) as caught:
+        load_scene(str(folder))
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1
+    return text
+
+
+def edit(path: Path, change: Any) -> None:
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def test_blender_folder(tmp_path: Path):
+    folder = make_folder(tmp_path / "toy", 5, "transforms_train.json", "train_")
+    make_folder(folder, 3, "transforms_test.json", "test_")
+    make_folder(folder, 1, "transforms_val.json", "val_")
+    scene = load_scene(folder)
+    assert scene.name == "toy" and scene.has_alpha
+    assert [c.name for c in scene.test.cameras] == ["./test_0", "./test_1", "./test_2"]
+    for index in range(5):
+        np.testing.assert_array_equal(scene.train.images[index], picture(index))
+    world = read_cameras(folder / "transforms_train.json", (8, 6))
+    for camera, expected in zip(scene.train.cameras, world, strict=True):
+        back = camera.transformed(scene.world_from_model)
+        np.testing.assert_allclose(back.c2w, expected.c2w, atol=1e-12)
+        assert (camera.fx, camera.width, camera.height) == (expected.fx, 8, 6)
+
+
+def test_every_eighth_view_is_held_out(tmp_path: Path):
+    scene = load_scene(make_folder(tmp_path / "a", 17))
+    assert [c.name for c in scene.test.cameras] == ["./r_0", "./r_8", "./r_16"]
+    assert len(scene.train.cameras) == 14 and scene.train.cameras[7].name == "./r_9"
+    np.testing.assert_array_equal(scene.train.images[7], picture(9))
+    np.testing.assert_array_equal(scene.test.images[1], picture(8))
+
+
+def test_few_views_are_all_trained_on(tmp_path: Path):
+    scene = load_scene(make_folder(tmp_path / "a", 7))
+    assert len(scene.train.cameras) == 7 and scene.test.images.shape == (0, 6, 8, 4)
+
+
+def test_opaque_pictures_have_no_alpha(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    for index in range(3):
+        Image.fromarray(picture(index, channels=3)).save(folder / f"r_{index}.png")
+    scene = load_scene(folder)
+    assert not scene.has_alpha and (scene.train.images[..., 3] == 255).all()
+
+
+def test_lego(lego_400: Path, tmp_path: Path):
+    """The first views of the real data set; its numbers are read by another program."""
+    for split, n in (("train", 6), ("test", 2)):
+        (tmp_path / split).mkdir()
+        for index in range(n):
+            shutil.copy(lego_400 / split / f"r_{index}.png", tmp_path / split)
+        document = json.loads((lego_400 / f"transforms_{split}.json").read_text())
+        document["frames"] = document["frames"][:n]
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(document))
+    calls: list[tuple[int, int]] = []
+    scene = load_scene(tmp_path, lambda done, n: calls.append((done, n)))
+    assert scene.train.images.shape == (6, 400, 400, 4) and scene.test.images.shape == (2, 400, 400, 4)
+    expected = cv2.imread(str(lego_400 / "train" / "r_5.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(scene.train.images[5], expected[..., [2, 1, 0, 3]])
+    assert calls == [(i, 8) for i in range(1, 9)] and scene.has_alpha
+    eye = scene.world_from_model @ scene.train.cameras[0].c2w[:, 3]
+    np.testing.assert_allclose(np.linalg.norm(eye[:3]), 4.0311, atol=1e-3)
+
+
+def test_pictures_of_another_size_than_the_file_says(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3, w=16, h=12, fl_x=20.0, fl_y=18.0, cx=9.0, cy=5.0)
+    camera = load_scene(folder).train.cameras[0]
+    assert (camera.width, camera.height) == (8, 6)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (10, 9, 4.5, 2.5)
+
+
+def test_suffixes_and_separators(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    (folder / "sub").mkdir()
+    Image.fromarray(picture(1, channels=3)).save(folder / "sub" / "x.jpeg")
+    Image.fromarray(picture(2, channels=3)).save(folder / "y.jpg")
+    (folder / "r_2").mkdir()  # a folder is not the picture
+
+    def change(document: Any) -> None:
+        document["frames"][0]["file_path"] = "sub\\x"
+        document["frames"][1]["file_path"] = "y.jpg"
+
+    edit(folder / "transforms.json", change)
+    scene = load_scene(folder)
+    assert [c.name for c in scene.train.cameras] == ["sub\\x", "y.jpg", "./r_2"]
+    np.testing.assert_array_equal(scene.train.images[2], picture(2))
+
+
+# --- pictures ---
+
+
+def test_kinds_of_pictures(tmp_path: Path):
+    path = tmp_path / "p.png"
+    grey = picture(0, channels=1)[..., 0]
+    opaque = np.full_like(grey, 255)
+    expected = np.stack([grey, grey, grey, opaque], axis=-1)
+    Image.fromarray(grey).save(path)
+    np.testing.assert_array_equal(read_picture(path), expected)
+    Image.fromarray(np.stack([grey, opaque // 3], axis=-1)).save(path)
+    np.testing.assert_array_equal(read_picture(path), np.dstack([grey, grey, grey, opaque // 3]))
+    palette = Image.fromarray(grey // 64).convert("P")
+    palette.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120])
+    palette.save(path, transparency=0)
+    colours = np.array([[10, 20, 30, 0], [40, 50, 60, 255], [70, 80, 90, 255], [100, 110, 120, 255]])
+    np.testing.assert_array_equal(read_picture(path), colours[np.asarray(palette)])
+    Image.fromarray(grey > 128).save(path)
+    np.testing.assert_array_equal(read_picture(path)[..., 0], np.where(grey > 128, 255, 0))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_16_bits(tmp_path: Path, channels: int):
+    path = tmp_path / "p.png"
+    values = np.random.default_rng(channels).integers(0, 65536, (6, 8, channels), np.uint16)
+    values[0, 0], values[0, 1] = 0, 65535
+    assert cv2.imwrite(str(path), values)  # BGR
+    read = read_picture(path)
+    expected = values / 257.0
+    order = {1: [0, 0, 0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[channels]
+    # Pillow cuts colours to their upper byte: off by less than one step, where rounding would be by half.
+    np.testing.assert_allclose(
+        read[..., : len(order)], expected[..., order], atol=0.5 if channels == 1 else 1
+    )
+    assert read[0, 1, 0] == 255 and read[0, 0, 0] == 0
+
+
+def test_floating_point_is_refused(tmp_path: Path):
+    Image.fromarray(np.ones((2, 2), np.float32)).save(tmp_path / "p.tif")
+    with pytest.raises(DataError, match=r"p\.tif: picture: expected 8 or 16 bits a channel"):
+        read_picture(tmp_path / "p.tif")
+
+
+# --- errors ---
+
+
+def test_missing_folder(tmp_path: Path):
+    text = message(tmp_path / "nowhere")
+    assert text.startswith(
+        f"{tmp_path / 'nowhere'}: no such folder: expected a folder with a transforms.json"
+    )
+
+
+def test_a_file_in_the_folders_place(tmp_path: Path):
+    (tmp_path / "f").write_text("x")
+    assert "expected a folder with a transforms.json, got a file" in message(tmp_path / "f")
+
+
+def test_empty_folder_and_folder_without_transforms(tmp_path: Path):
+    expected = f"{tmp_path}: expected transforms_train.json or transforms.json in it, got "
+    assert message(tmp_path) == expected + "an empty folder"
+    (tmp_path / "picture.png").write_bytes(b"")
+    assert message(tmp_path) == expected + "neither"
+
+
+def test_no_frames(tmp_path: Path):
+    (tmp_path / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
+    text = message(tmp_path, FormatError)
+    assert "transforms_train.json: frames: expected a list of at least one frame, got []" in text
+
+
+def test_a_missing_picture(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    (folder / "r_1.png").unlink()
+    text = message(folder)
+    assert "transforms.json: frame 1 (./r_1): picture is missing: expected " in text
+    assert str(folder / "r_1") in text and text.endswith("with one of .png, .jpg, .jpeg")
+
+
+def test_a_name_too_long_is_a_missing_picture(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    edit(folder / "transforms.json", lambda d: d["frames"][1].update(file_path="x" * 5000))
+    assert "frame 1 (xxx" in message(folder)
+
+
+@pytest.mark.parametrize(("suffix", "n_bytes"), [("png", 40), ("jpg", 20)])
+def test_a_truncated_picture(tmp_path: Path, suffix: str, n_bytes: int):
+    folder = make_folder(tmp_path / "a", 3)
+    path = folder / f"r_1.{suffix}"
+    (folder / "r_1.png").unlink()
+    Image.fromarray(picture(1, 8, 6, 3)).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[:-n_bytes])
+    assert message(folder).startswith(f"{path}: picture: cannot be read to its end: ")
+
+
+def test_a_picture_that_is_not_one(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    (folder / "r_2.png").write_text("hello")
+    assert message(folder).startswith(f"{folder / 'r_2.png'}: picture: expected a PNG or JPEG file: ")
+
+
+def test_pictures_of_different_sizes(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    Image.fromarray(picture(1, 7, 6)).save(folder / "r_2.png")
+    text = message(folder)
+    assert text == f"{folder / 'r_2.png'}: size: expected 8x6 like {folder / 'r_0.png'}, got 7x6"
+
+
+def test_a_bad_matrix(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 3)
+    edit(folder / "transforms.json", lambda d: d["frames"][2].update(transform_matrix=[[1, 2], [3, 4]]))
+    text = message(folder, FormatError)
+    assert "frame 2 (./r_2): camera matrix: expected 4 rows of 4 numbers, got 2 rows" in text
+
+
+def test_one_view_is_not_enough(tmp_path: Path):
+    assert "training views: expected at least 2, got 1" in message(make_folder(tmp_path / "a", 1))
+
+
+# --- lenses ---
+
+LENS = {"k1": -0.12, "k2": 0.05, "k3": -0.01, "k4": 0.004, "p1": 0.004, "p2": -0.003}
+
+
+def distorted_view(camera: Camera, lens: dict[str, float], shade: Any) -> np.ndarray:
+    """What a lens shows of `shade(x, y)`, the plane at depth 1: the lens model is inverted by fixed point."""
+    u = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx + np.zeros((camera.height, 1))
+    v = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy + np.zeros((1, camera.width))
+    x, y = u.copy(), v.copy()
+    for _ in range(60):
+        r2 = x * x + y * y
+        radial = 1 + lens["k1"] * r2 + lens["k2"] * r2**2 + lens["k3"] * r2**3 + lens["k4"] * r2**4
+        x = (u - 2 * lens["p1"] * x * y - lens["p2"] * (r2 + 2 * x * x)) / radial
+        y = (v - lens["p1"] * (r2 + 2 * y * y) - 2 * lens["p2"] * x * y) / radial
+    return shade(x, y)
+
+
+def smooth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A plane of smooth colours in the form of a picture."""
+    channels = [np.sin(9 * x + 1), np.sin(7 * y), np.sin(6 * x - 8 * y), np.ones_like(x)]
+    return (np.stack(channels, axis=-1) * 120 + 128).round().astype(np.uint8)
+
+
+def test_a_lens_is_made_straight():
+    camera = Camera("a", np.eye(4), 96, 80, 70.0, 75.0, 46.0, 41.5)
+    no_lens = dict.fromkeys(LENS, 0.0)
+    bent, straight = (distorted_view(camera, lens, smooth).astype(int) for lens in (LENS, no_lens))
+    assert np.abs(bent - straight)[8:-8, 8:-8].max() > 20
+    result = undistort(bent.astype(np.uint8), camera, **LENS)
+    # Linear interpolation of a sine of at most 0.14 radians a pixel: 120 * 0.14² / 8, and two roundings.
+    assert np.abs(result.astype(int) - straight)[8:-8, 8:-8].max() <= 2
+
+
+def test_undistort_agrees_with_opencv_where_it_can():
+    camera = Camera("a", np.eye(4), 64, 48, 50.0, 52.0, 31.0, 25.0)
+    image = cv2.GaussianBlur(picture(3, 64, 48), (7, 7), 2)
+    image[..., 3] = 255
+    lens = {**LENS, "k4": 0.0}
+    matrix = np.array([[50.0, 0, 30.5], [0, 52, 24.5], [0, 0, 1]])
+    expected = cv2.undistort(image, matrix, np.array([lens[k] for k in ("k1", "k2", "p1", "p2", "k3")]))
+    result = undistort(image, camera, **lens)
+    difference = np.abs(result.astype(int) - expected)[8:-8, 8:-8]
+    assert difference.max() <= 2  # OpenCV rounds positions to 1/32 pixel and colours as integers
+    assert np.abs(result.astype(int) - image)[8:-8, 8:-8].max() > 8
+
+
+def test_hidden_colours_do_not_bleed():
+    image = np.zeros((20, 20, 4), np.uint8)
+    image[:, :10] = [200, 100, 50, 255]
+    image[:, 10:] = [0, 255, 0, 0]  # green, but transparent
+    result = undistort(image, Camera("a", np.eye(4), 20, 20, 20.0, 20.0, 7.0, 10.0), k1=0.4)
+    partly = result[result[..., 3] > 8]
+    assert len(np.unique(partly[:, 3])) > 2
+    assert np.abs(partly[:, :3].astype(int) - [200, 100, 50]).max() <= 2
+
+
+def test_lenses_of_a_folder_are_undone(tmp_path: Path):
+    cameras = [Camera("a", c.c2w, 96, 80, 70.0, 75.0, 46.0, 41.5) for c in demo_cameras(8, 3)]
+    folder = make_folder(tmp_path / "a", 3, w=96, h=80, fl_x=70.0, fl_y=75.0, cx=46.0, cy=41.5, **LENS)
+    edit(folder / "transforms.json", lambda d: d["frames"][2].update(dict.fromkeys(LENS, 0.0)))
+    bent = distorted_view(cameras[0], LENS, smooth)
+    bent[..., 3] = 255
+    for index in range(3):
+        Image.fromarray(bent).save(folder / f"r_{index}.png")
+    scene = load_scene(folder)
+    straight = distorted_view(cameras[0], dict.fromkeys(LENS, 0.0), smooth).astype(int)
+    assert np.abs(scene.train.images[1].astype(int) - straight)[8:-8, 8:-8, :3].max() <= 2
+    np.testing.assert_array_equal(scene.train.images[2], bent)  # the frame's own lens: none
+    assert not scene.has_alpha
+
+
+def test_a_lens_that_is_not_a_number(tmp_path: Path):
+    assert "frame 0 (./r_0): k1: expected a finite number, got x" in message(
+        make_folder(tmp_path / "a", 3, k1="x"), FormatError
+    )
+
+
+def test_without_opencv_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[train\]'"):
+        undistort(picture(0), Camera("a", np.eye(4), 8, 6, 5.0, 5.0, 4.0, 3.0), k1=0.1)

@@ -1,0 +1,97 @@
+"""The cube that a scene fills, found from its cameras, and from its silhouettes where pictures have alpha."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from player.cameras import Camera, focus_point
+
+N_CELLS = 64
+MARGIN_CELLS = 1.5
+
+
+def scene_box(cameras: Sequence[Camera], alphas: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """The centre [3] and the half side of the scene's cube, in the cameras' frame.
+
+    `cameras`: at least one. `alphas`: [n_views, height, width], above 0 where the picture shows something of
+    the scene; None if pictures do not tell.
+
+    Without silhouettes: centred where the optical axes meet, as large as the cameras see around it. With
+    them: the box of the visual hull, and a margin of 1.5 cells of its grid.
+
+    >>> from vfr_bake.data.demo import AABB, demo_views
+    >>> train, _ = demo_views(size=32, n_train=12, n_test=0)
+    >>> centre, half = scene_box(train.cameras, train.images[..., 3])
+    >>> bool((centre - half < AABB[0]).all() and (centre + half > AABB[1]).all())
+    True
+    """
+    centre, half = _seen_box(cameras)
+    if alphas is None:
+        return centre, half
+    # The second pass has smaller cells, so a tighter hull: the first box may be several times too large.
+    for _ in range(2):
+        kept = _visual_hull(cameras, alphas, centre, half)
+        if len(kept) == 0:
+            break
+        cell = 2 * half / N_CELLS
+        low, high = kept.min(axis=0), kept.max(axis=0)
+        new_half = float((high - low).max() / 2 + (0.5 + MARGIN_CELLS) * cell)
+        if new_half >= half:
+            break
+        centre, half = (low + high) / 2, new_half
+    return centre, half
+
+
+def _seen_box(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
+    centre = focus_point(cameras)
+    distance = float(np.median([np.linalg.norm(camera.c2w[:3, 3] - centre) for camera in cameras]))
+    tangent = float(np.median([max(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]))
+    half = distance * tangent
+    return centre, half if half > 0 else 1.0
+
+
+def _visual_hull(
+    cameras: Sequence[Camera], alphas: np.ndarray, centre: np.ndarray, half: float
+) -> np.ndarray:
+    """The centres [n, 3] of the grid cells that no view sees past and at least one view sees."""
+    cell = 2 * half / N_CELLS
+    axis = (np.arange(N_CELLS, dtype=np.float32) + 0.5) * np.float32(2 / N_CELLS) - 1
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * np.float32(half)
+    seen = np.zeros(len(points), bool)
+    reach = (
+        cell * np.sqrt(3) / 2
+    )  # from a cell's centre to its corners: what a thin thing in the cell may be off by
+    for camera, alpha in zip(cameras, alphas, strict=True):
+        rotation = camera.c2w[:3, :3]
+        eye = camera.c2w[:3, 3] - centre
+        near = max(float(np.linalg.norm(eye)) - half, cell)
+        step = max(1, int(np.ceil(max(camera.fx, camera.fy) * reach / near)))
+        mask = _dilated(alpha > 0, step)
+        local = points @ rotation.astype(np.float32) - (eye @ rotation).astype(np.float32)
+        depth = -local[:, 2]
+        ahead = depth > cell / 2
+        depth = np.where(ahead, depth, np.float32(1))
+        column = np.float32(camera.fx) * local[:, 0] / depth + np.float32(camera.cx)
+        row = np.float32(camera.cy) - np.float32(camera.fy) * local[:, 1] / depth
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        hit = np.zeros(len(points), bool)
+        hit[inside] = mask[(row[inside] // step).astype(np.intp), (column[inside] // step).astype(np.intp)]
+        kept = ~inside | hit
+        points, seen = points[kept], (seen | inside)[kept]
+        if len(points) == 0:
+            break
+    return points[seen].astype(np.float64) + centre
+
+
+def _dilated(mask: np.ndarray, step: int) -> np.ndarray:
+    """`mask` in blocks of `step` pixels, true wherever the mask is within `step` pixels, or a bit more."""
+    height, width = mask.shape
+    rows, columns = -(-height // step), -(-width // step)
+    padded = np.zeros((rows * step, columns * step), bool)
+    padded[:height, :width] = mask
+    blocks = np.zeros((rows + 2, columns + 2), bool)
+    blocks[1:-1, 1:-1] = padded.reshape(rows, step, columns, step).any(axis=(1, 3))
+    grown = blocks[:-2] | blocks[1:-1] | blocks[2:]
+    return grown[:, :-2] | grown[:, 1:-1] | grown[:, 2:]
