@@ -1,0 +1,29 @@
+"""sRGB and linear light: the two curves of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear).
+
+Pictures, PLY and OBJ hold sRGB; glTF vertex colours (COLOR_0) and EXR hold linear light.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def linear_from_srgb(srgb: ArrayLike) -> np.ndarray:
+    """Linear light in [0, 1] from sRGB values in [0, 1]; any shape, computed in float64.
+
+    >>> linear_from_srgb([0.0, 128 / 255, 1.0]).round(4).tolist()
+    [0.0, 0.2159, 1.0]
+    """
+    value = np.asarray(srgb, np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: ArrayLike) -> np.ndarray:
+    """sRGB values in [0, 1] from linear light in [0, 1]: the inverse of `linear_from_srgb`.
+
+    >>> srgb_from_linear([0.0, 0.21586, 1.0]).round(4).tolist()
+    [0.0, 0.502, 1.0]
+    """
+    value = np.asarray(linear, np.float64)
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0) ** (1 / 2.4) - 0.055)

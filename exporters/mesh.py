@@ -1,0 +1,111 @@
+"""The triangle mesh that every mesh writer takes: arrays, checked once.
+
+Faces run counter-clockwise seen from outside; colours are sRGB, as in a picture; positions are float64 so
+that a world far from its origin survives the arithmetic and is rounded to float32 only by the writer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from player.errors import ConfigError, FormatError, ShapeError
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A mesh with a normal and a colour at every vertex.
+
+    Args:
+        vertices: [n_vertices, 3] float32 or float64, finite.
+        faces: [n_faces, 3] int32, vertex numbers from 0, counter-clockwise seen from outside.
+        normals: [n_vertices, 3] float32 or float64, of unit length (to 1e-3), pointing outwards.
+        colours: [n_vertices, 4] uint8, sRGB and alpha (not premultiplied).
+
+    Raises:
+        ShapeError: an array has another shape or type.
+        FormatError: a face names a vertex that is not there, a number is not finite, a normal is not of unit
+            length.
+
+    >>> up = np.tile([0.0, 0.0, 1.0], (3, 1))
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> mesh = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, np.full((3, 4), 255, np.uint8))
+    >>> mesh.transformed(np.diag([2.0, 2, 2, 1])).bounds.tolist()
+    [[0.0, 0.0, 0.0], [2.0, 2.0, 0.0]]
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+
+    def __post_init__(self) -> None:
+        n_vertices = len(self.vertices)
+        for name, width, kinds in (
+            ("vertices", 3, (np.float32, np.float64)),
+            ("faces", 3, (np.int32,)),
+            ("normals", 3, (np.float32, np.float64)),
+            ("colours", 4, (np.uint8,)),
+        ):
+            array = getattr(self, name)
+            rows = len(array) if name == "faces" else n_vertices
+            if array.shape != (rows, width) or array.dtype.type not in kinds:
+                types = " or ".join(np.dtype(kind).name for kind in kinds)
+                raise ShapeError(
+                    f"mesh: {name}: expected [{rows}, {width}] {types}, got {array.shape} {array.dtype}"
+                )
+        if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= n_vertices):
+            raise FormatError(
+                f"mesh: faces: expected vertex numbers 0 to {n_vertices - 1}, "
+                f"got {self.faces.min()} to {self.faces.max()}"
+            )
+        if not np.isfinite(self.vertices).all():
+            raise FormatError("mesh: vertices: expected finite numbers, got NaN or infinity")
+        length = np.linalg.norm(self.normals, axis=-1)
+        if not (np.abs(length - 1) <= 1e-3).all():
+            worst = int(np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf)))
+            raise FormatError(f"mesh: normals: expected unit length, got {length[worst]} at vertex {worst}")
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] smallest and largest coordinate; NaN for a mesh without vertices."""
+        if not len(self.vertices):
+            return np.full((2, 3), np.nan)
+        return np.stack([self.vertices.min(0), self.vertices.max(0)])
+
+    def transformed(self, matrix: np.ndarray) -> TriangleMesh:
+        """The mesh in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale > 0,
+        translation).
+
+        Raises ConfigError for any other matrix: a shear or a mirror would need other normals and another
+        winding.
+        """
+        matrix = np.asarray(matrix, np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise ConfigError(f"mesh: matrix: expected [4, 4] finite numbers, got shape {matrix.shape}")
+        linear = matrix[:3, :3]
+        scale = np.cbrt(np.linalg.det(linear))
+        if (
+            scale <= 0
+            or not np.allclose(linear @ linear.T / scale**2, np.eye(3), rtol=0, atol=1e-5)
+            or (matrix[3] != [0, 0, 0, 1]).any()
+        ):
+            raise ConfigError(
+                f"mesh: matrix: expected rotation, uniform scale > 0 and translation, got {matrix.tolist()}"
+            )
+        vertices = self.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]
+        normals = self.normals.astype(np.float64) @ (linear.T / scale)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        return replace(self, vertices=vertices, normals=normals)
+
+
+def take_faces(mesh: TriangleMesh, keep: np.ndarray) -> TriangleMesh:
+    """The mesh of the faces where `keep` [n_faces] bool is true, without the vertices that none of them
+    uses.
+    """
+    faces = mesh.faces[keep]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = (np.cumsum(used) - 1).astype(np.int32)
+    return TriangleMesh(mesh.vertices[used], number[faces], mesh.normals[used], mesh.colours[used])

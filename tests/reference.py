@@ -1,0 +1,58 @@
+"""Oracles in float64: slow, readable, written from the formulas and not from the code that they check.
+
+Row vectors, y = x @ W + b. Letters as in the docstrings of the modules that they check. Real spherical
+harmonics carry the Condon-Shortley phase (-1)^m and are ordered l^2 + l + m, as in instant-ngp.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+
+def spherical_harmonics(dirs: np.ndarray, degree: int) -> np.ndarray:
+    """Y [n, degree^2] at unit `dirs` [n, 3], bands 0 .. degree - 1, by angles and associated Legendre
+    functions.
+
+    scipy's `lpmv` has the phase (-1)^m; for m < 0 the sine takes the place of the cosine, with the same
+    phase.
+    """
+    cos_theta = np.clip(dirs[:, 2], -1, 1)
+    phi = np.arctan2(dirs[:, 1], dirs[:, 0])
+    bases = []
+    for band in range(degree):
+        for m in range(-band, band + 1):
+            k = (2 * band + 1) / (4 * np.pi)
+            k *= special.factorial(band - abs(m)) / special.factorial(band + abs(m))
+            legendre = special.lpmv(abs(m), band, cos_theta)
+            circular = np.ones_like(phi)
+            if m:
+                circular = np.sqrt(2) * (np.cos(m * phi) if m > 0 else np.sin(-m * phi))
+            bases.append(np.sqrt(k) * legendre * circular)
+    return np.stack(bases, axis=-1)
+
+
+def gelu(x: np.ndarray) -> np.ndarray:
+    """x Phi(x), with Phi the normal distribution function (the exact form, not the tanh one)."""
+    return x * special.ndtr(x)
+
+
+def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+    """rgb [n, 3] of a head (`exporters.onnx_head.HeadWeights`) at `features` [n, n_channels], `dirs` [n,
+    3].
+    """
+    h = np.asarray(features, np.float64)
+    for weight, bias in weights.spatial:
+        h = gelu(h @ weight.astype(np.float64) + bias)
+    weight, bias = weights.to_sh
+    f = (h @ weight.astype(np.float64) + bias).reshape(len(h), weights.sh_degree**2, weights.n_sh_features)
+    y = spherical_harmonics(np.asarray(dirs, np.float64), weights.sh_degree)
+    e = (f * y[:, :, None]).reshape(len(h), f.shape[1] * f.shape[2])
+    d_bottleneck, d_sh, bias = weights.directional_first
+    z = gelu(h @ d_bottleneck.astype(np.float64) + e @ d_sh.astype(np.float64) + bias)
+    for weight, bias in weights.directional:
+        z = gelu(z @ weight.astype(np.float64) + bias)
+    weight, bias = weights.output
+    return special.expit(z @ weight.astype(np.float64) + bias)
