@@ -1,0 +1,113 @@
+"""Which package may import what: held by the source, and by a process in which torch cannot be imported."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGES = ("player", "exporters", "vfr_bake")
+MAX_LINES = 400
+
+# Anywhere in the package, even inside a function.
+FORBIDDEN = {
+    "player": {"exporters", "vfr_bake", "torch", "triton", "scipy", "cv2", "skimage", "onnx", "tqdm", "tyro"},
+    "exporters": {"vfr_bake", "torch", "triton", "cv2", "tqdm", "tyro", "trimesh", "open3d"},
+    "vfr_bake": {"trimesh", "open3d"},
+}
+# At the top level, where importing the package alone would need them.
+LAZY = {
+    "player": {"numba", "PIL", "onnxruntime"},
+    "exporters": {"onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL"},
+    "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton"},
+}
+# The one module of the player that is compiled: everybody else imports it only if numba is there.
+TOP_LEVEL_EXCEPTIONS = {("player/march_compiled.py", "numba")}
+
+MODULES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
+IDS = [path.relative_to(REPOSITORY).as_posix() for path in MODULES]
+
+
+def imported(tree: ast.AST, top_level: bool) -> Iterator[str]:
+    """The first part of every imported name; with `top_level`, of what runs when the module is imported."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield (node.module or "").split(".")[0] if node.level == 0 else "."
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            yield from imported(ast.Module(node.orelse, []), top_level)
+        elif not (
+            top_level and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.Try)
+        ):
+            yield from imported(node, top_level)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_imports_go_one_way(path: Path) -> None:
+    package = path.relative_to(REPOSITORY).parts[0]
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    everywhere = set(imported(tree, top_level=False))
+    assert not everywhere & FORBIDDEN[package]
+    assert "." not in everywhere, "relative imports: write the whole name"
+    heavy = set(imported(tree, top_level=True)) & LAZY[package]
+    name = path.relative_to(REPOSITORY).as_posix()
+    assert not {module for module in heavy if (name, module) not in TOP_LEVEL_EXCEPTIONS}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=IDS)
+def test_module_is_short_and_says_what_it_is(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") <= MAX_LINES
+    assert ast.get_docstring(ast.parse(text)), "a module docstring is expected"
+    assert path.stem not in {"utils", "helpers", "common", "misc"}
+
+
+def test_there_are_modules() -> None:
+    assert all(any(name.startswith(package) for name in IDS) for package in PACKAGES)
+
+
+@pytest.mark.parametrize(
+    "missing", [["torch"], ["torch", "numba", "scipy", "skimage", "onnx", "cv2", "tqdm", "tyro"]]
+)
+def test_player_and_exporters_start_without(missing: list[str]) -> None:
+    program = (
+        f"import sys; sys.modules.update(dict.fromkeys({missing!r})); import player.cli; "
+        "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface, exporters.parity, "
+        "exporters.onnx_head; "
+        "print('torch' in sys.modules and sys.modules['torch'])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "None"
+
+
+def test_pyproject_lists_every_package() -> None:
+    """Read as text: Python 3.10 has no TOML parser."""
+    text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
+    block = re.search(r"^packages = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
+    assert block, "[tool.setuptools] packages is expected"
+    listed = re.findall(r'"([\w.]+)"', block[1])
+    folders = {".".join(path.parent.relative_to(REPOSITORY).parts) for path in MODULES}
+    assert sorted(listed) == sorted(folders)
+    assert all((REPOSITORY / name.replace(".", "/") / "__init__.py").is_file() for name in listed)
+    assert all((REPOSITORY / package / "py.typed").is_file() for package in PACKAGES)
+
+
+def test_constraints_pin_exactly_and_cover_every_dependency() -> None:
+    pins = set()
+    for line in (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith("#"):
+            match = re.fullmatch(r"([\w.-]+)==[\w.]+(; python_version (<|>=) \"3\.11\")?", line)
+            assert match, f"constraints.txt: expected name==version, got {line!r}"
+            pins.add(re.sub(r"[-_.]+", "-", match[1]).lower())
+    text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
+    wanted = set(re.findall(r'^\s*(?:fast = \[)?"([A-Za-z][\w-]*)(?:\[\w+\])?>=', text, re.MULTILINE))
+    assert len(wanted) > 12
+    assert not {name.lower() for name in wanted} - pins
