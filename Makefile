@@ -1,0 +1,73 @@
+# Two commands do everything on a fresh Linux machine: `make demo` and `make test`. Each makes its own environment.
+PYTHON ?= python3
+VENV ?= .venv
+# Where a machine without an NVIDIA GPU looks for the small CPU build of torch; out of reach, PyPI's build is used.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+INPUTS := pyproject.toml constraints.txt
+# What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d): Debian names.
+SYSTEM_LIBRARIES := libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libX11.so.6 libudev.so.1 libidn2.so.0
+SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check env format system-libraries clean
+
+help:  ## say what there is
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 26
+	@echo "  settings:               PYTHON=$(PYTHON) VENV=$(VENV) TORCH_INDEX=$(TORCH_INDEX)"
+
+demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures and figures in demo/
+	$(BIN)/python -m vfr_bake.demo --output demo
+
+test: $(VENV)/.dev system-libraries check  ## style, types and tests
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.dev  ## style and types alone
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+format: $(VENV)/.dev  ## put the code into the house's style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+env: $(VENV)/.dev  ## the environment for development, in .venv
+
+clean:  ## remove the environment and what tools left behind (not demo/)
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+
+# Shell lines, not make functions: asked each time, because libraries come and go without a file that make could watch.
+# Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
+system-libraries: $(VENV)/.dev  ## install the system libraries that a test needs, or say which
+	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
+	missing=; for name in $(SYSTEM_LIBRARIES); do \
+	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $$name 2>/dev/null || missing="$$missing $$name"; \
+	done; \
+	test -n "$$missing" || exit 0; \
+	command="apt-get install -y --no-install-recommends $(SYSTEM_PACKAGES)"; \
+	echo "missing system libraries:$$missing"; \
+	if command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+	  $$command || { apt-get update && $$command; }; \
+	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
+	  sudo $$command || { sudo apt-get update && sudo $$command; }; \
+	else \
+	  echo "please run: sudo $$command    (or your system's packages of the same libraries)" >&2; exit 1; \
+	fi
+
+# The stamps: an extra is installed again only when what it is installed from has changed.
+$(VENV)/.dev $(VENV)/.train: $(VENV)/.%: $(VENV)/.torch $(INPUTS)
+	$(PIP) install --quiet -c constraints.txt -e '.[$*]'
+	@touch $@
+
+# torch alone and first: with a GPU from PyPI, else from TORCH_INDEX (one retry, then pip falls back to its other indexes).
+$(VENV)/.torch: $(BIN)/python constraints.txt
+	@if test "$$(uname -s)" != Linux || nvidia-smi >/dev/null 2>&1; then index=; \
+	else index="--retries 1 --extra-index-url $(TORCH_INDEX)"; fi; set -x; \
+	$(PIP) install --quiet --no-deps -c constraints.txt $$index torch
+	@touch $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 to 3.13 expected, got " + sys.version if not (3, 10) <= sys.version_info < (3, 14) else 0)'
+	$(PYTHON) -m venv $(VENV)
