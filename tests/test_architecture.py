@@ -79,8 +79,8 @@ def test_there_are_modules() -> None:
 def test_player_and_exporters_start_without(missing: list[str]) -> None:
     program = (
         f"import sys; sys.modules.update(dict.fromkeys({missing!r})); import player.cli; "
-        "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface, exporters.parity, "
-        "exporters.onnx_head; "
+        "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface; "
+        "import exporters.parity, exporters.onnx_head; "
         "print('torch' in sys.modules and sys.modules['torch'])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=REPOSITORY)

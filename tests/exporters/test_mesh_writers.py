@@ -114,7 +114,7 @@ def test_trimesh_reads(suffix: str, mesh: TriangleMesh) -> None:
             read.volume, 1.0, rtol=1e-6
         )  # 1 * 2 * 3 / 6: positive, so faces look outwards
     if suffix == ".glb":
-        return  # trimesh drops COLOR_0 where a material is named, and keeps the low byte of 16 bits: Open3D reads it
+        return  # trimesh drops COLOR_0 where a material is named, and of 16 bits keeps the low 8: see Open3D
     n_colours = 3 if suffix == ".obj" else 4
     colours = np.asarray(read.visual.vertex_colors)  # type: ignore[union-attr]
     assert np.array_equal(colours[:, :n_colours], mesh.colours[:, :n_colours])
