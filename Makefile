@@ -7,9 +7,10 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INPUTS := pyproject.toml constraints.txt
-# What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d): Debian names.
-SYSTEM_LIBRARIES := libusb-1.0.so.0 libGL.so.1 libEGL.so.1 libX11.so.6 libudev.so.1 libidn2.so.0
-SYSTEM_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0
+# What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d), and the
+# Debian package of each. Only what is missing is installed, and nothing that is there is upgraded.
+SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6 \
+  libudev.so.1:libudev1 libidn2.so.0:libidn2-0
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check env format system-libraries clean
@@ -42,12 +43,13 @@ clean:  ## remove the environment and what tools left behind (not demo/)
 # Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
 system-libraries: $(VENV)/.dev  ## install the system libraries that a test needs, or say which
 	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
-	missing=; for name in $(SYSTEM_LIBRARIES); do \
-	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $$name 2>/dev/null || missing="$$missing $$name"; \
+	missing=; for pair in $(SYSTEM_LIBRARIES); do \
+	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
+	    || missing="$$missing $${pair#*:}"; \
 	done; \
 	test -n "$$missing" || exit 0; \
-	command="apt-get install -y --no-install-recommends $(SYSTEM_PACKAGES)"; \
-	echo "missing system libraries:$$missing"; \
+	command="apt-get install -y --no-upgrade --no-install-recommends$$missing"; \
+	echo "missing system libraries, by their Debian packages:$$missing"; \
 	if command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
 	  $$command || { apt-get update && $$command; }; \
 	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
