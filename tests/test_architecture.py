@@ -27,8 +27,8 @@ LAZY = {
     "exporters": {"onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL"},
     "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton"},
 }
-# The one module of the player that is compiled: everybody else imports it only if numba is there.
-TOP_LEVEL_EXCEPTIONS = {("player/march_compiled.py", "numba")}
+# Modules that are nothing without it; whoever imports them does so inside a function.
+TOP_LEVEL_EXCEPTIONS = {("player/march_compiled.py", "numba"), ("vfr_bake/options.py", "tyro")}
 
 MODULES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
 IDS = [path.relative_to(REPOSITORY).as_posix() for path in MODULES]
