@@ -130,28 +130,38 @@ def load_transforms(path: Path) -> dict[str, Any]:
         raise FormatError(f"{path}: no such file: expected a transforms.json") from error
     except (OSError, ValueError) as error:
         raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+    return parse_transforms(data, str(path))
+
+
+def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
+    """The same from the bytes of the file; `where` names them in the messages.
+
+    >>> parse_transforms(b'{"frames": []}', "cameras")
+    Traceback (most recent call last):
+    player.errors.FormatError: cameras: frames: expected a list of at least one frame, got []
+    """
     try:
         document = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: expected JSON, got {_brief(str(error))}") from error
+        raise FormatError(f"{where}: expected JSON, got {_brief(str(error))}") from error
     if not isinstance(document, dict):
-        raise FormatError(f"{path}: expected a JSON object with frames, got {_brief(document)}")
+        raise FormatError(f"{where}: expected a JSON object with frames, got {_brief(document)}")
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise FormatError(f"{path}: frames: expected a list of at least one frame, got {_brief(frames)}")
+        raise FormatError(f"{where}: frames: expected a list of at least one frame, got {_brief(frames)}")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
-            raise FormatError(f"{path}: frame {index}: expected an object, got {_brief(frame)}")
+            raise FormatError(f"{where}: frame {index}: expected an object, got {_brief(frame)}")
         name = frame.get("file_path")
         if not isinstance(name, str) or not name or any(_unwritable(c) for c in name):
-            raise FormatError(f"{path}: frame {index}: file_path: expected a path, got {_brief(name)}")
-        where = f"{path}: frame {index} ({name})"
+            raise FormatError(f"{where}: frame {index}: file_path: expected a path, got {_brief(name)}")
+        place = f"{where}: frame {index} ({name})"
         model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
         if model not in PINHOLE_MODELS:
             expected = ", ".join(PINHOLE_MODELS)
-            raise FormatError(f"{where}: camera_model: expected one of {expected}, got {_brief(model)}")
+            raise FormatError(f"{place}: camera_model: expected one of {expected}, got {_brief(model)}")
         if frame.get("is_fisheye", document.get("is_fisheye", False)):
-            raise FormatError(f"{where}: is_fisheye: expected a pinhole camera, got a fisheye")
+            raise FormatError(f"{place}: is_fisheye: expected a pinhole camera, got a fisheye")
     return document
 
 
@@ -179,11 +189,11 @@ def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera
 
 
 def transforms_cameras(
-    document: dict[str, Any], path: Path, size: tuple[int, int] | None = None
+    document: dict[str, Any], where: Path | str, size: tuple[int, int] | None = None
 ) -> list[Camera]:
-    """The cameras of what `load_transforms` returned; `path` is for the messages. Raises FormatError."""
+    """The cameras of what `load_transforms` returned; `where` is for the messages. Raises FormatError."""
     return [
-        _frame_camera(document, frame, f"{path}: frame {index} ({frame['file_path']})", size)
+        _frame_camera(document, frame, f"{where}: frame {index} ({frame['file_path']})", size)
         for index, frame in enumerate(document["frames"])
     ]
 

@@ -1,0 +1,155 @@
+"""The bake, step by step: what is seen, what of it is stored, the head, the mesh, and a check from the
+written files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporters.onnx_head import head_onnx
+from exporters.ply import ply_bytes
+from player.asset import Asset, GridArrays, write_asset
+from player.bricks import pack_vertices
+from player.cameras import Camera, write_cameras
+from player.density import encode_density
+from player.files import check_target
+from player.manifest import Manifest
+from player.render import render
+from vfr_bake import __version__
+from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.mesh import bake_mesh
+from vfr_bake.baking.projection import Projection, code_scales, encode_features, project
+from vfr_bake.baking.visibility import corner_vertices, visible_cells
+from vfr_bake.config import BakeConfig
+from vfr_bake.rendering.render import composited_features, render_image
+from vfr_bake.training.metrics import psnr, to_8_bit
+from vfr_bake.training.model_file import Model
+
+Report = Callable[[str, int, int], object]
+"""Called with (stage, done, of)."""
+N_RENDERED = 200_000
+"""Rays whose rendered features decide the projection."""
+VERTEX_CHUNK = 1 << 18
+"""Vertices evaluated at once: 32 MB of features."""
+FAINTEST, DENSEST = 1e-5, 20.0
+"""Optical depths of one march step at codes 0 and 255: from invisible to opaque, in steps of 5.9 %."""
+
+
+@dataclass(frozen=True)
+class BakeResult:
+    """What was written and what it cost."""
+
+    n_vertices: int
+    n_bytes: int
+    seconds: float
+    figures: dict[str, Any]
+
+
+def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
+    """Bake `model` into the asset `folder`. Raises OutputError, TrainingError (nothing visible),
+    ParityError."""
+    check_target(folder, force)
+    begin = time.monotonic()
+    resolution = config.resolution or model.field.config.max_resolution
+    visible = visible_cells(model, resolution, config.weight_floor, _stage(report, "visibility"))
+    rendered = _rendered_features(model)
+    first_layer = model.field.head.spatial[0].weight.detach().numpy()
+    projection = project(first_layer, rendered, config.n_channels)
+    arrays, scales, density_range = _grid_arrays(model, visible, projection, _stage(report, "grid"))
+    head = head_onnx(fold_head(model.field.head, projection.first * scales))
+    mesh, n_floaters = bake_mesh(model, visible, config.mesh_resolution or resolution, _stage(report, "mesh"))
+    figures = {
+        "n_vertices": len(arrays.density),
+        "visible_cells": int(visible.sum()),
+        "first_layer_kept": projection.kept,
+        "mesh_faces": len(mesh.faces),
+        "mesh_floaters_removed": n_floaters,
+    }
+    camera = model.cameras[0]
+    manifest = Manifest(
+        generator=f"vfr-bake {__version__}",
+        resolution=resolution,
+        step=float(model.occupancy.step),
+        density_range=density_range,
+        n_channels=arrays.features.shape[1],
+        view_size=(camera.width, camera.height),
+        world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
+        n_samples=config.n_samples,
+        background=tuple(model.background.tolist()),
+        provenance={"bake": asdict(config), "train": model.train, "trained": model.figures, "baked": figures},
+    )
+    write_asset(folder, manifest, arrays, head, ply_bytes(mesh), write_cameras(model.cameras), force)
+    figures = figures | check_asset(model, folder, config.check_views, _stage(report, "check"))
+    n_bytes = sum(path.stat().st_size for path in folder.iterdir())
+    return BakeResult(len(arrays.density), n_bytes, time.monotonic() - begin, figures)
+
+
+def _stage(report: Report, name: str) -> Callable[[int, int], object]:
+    return lambda done, of: report(name, done, of)
+
+
+def _rendered_features(model: Model) -> np.ndarray:
+    """Rendered features of rays spread over all training views, those that hit something."""
+    cameras = model.model_cameras()
+    random = np.random.default_rng(0)
+    per_view = max(1, N_RENDERED // len(cameras))
+    found = []
+    for camera in cameras:
+        rays_o, rays_d = camera.rays()
+        rows = random.choice(len(rays_o), min(per_view, len(rays_o)), replace=False)
+        features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[rows], rays_d[rows])
+        found.append(features[opacity > 0])
+    return np.concatenate(found)
+
+
+def _grid_arrays(
+    model: Model, visible: np.ndarray, projection: Projection, progress: Callable[[int, int], object]
+) -> tuple[GridArrays, np.ndarray, tuple[float, float]]:
+    """Codes at the corners of the visible cells, the scale of each channel's code, and the range of the
+    density's."""
+    resolution = len(visible)
+    vertices = corner_vertices(visible)
+    brick_coords, brick_masks, order = pack_vertices(vertices)
+    vertices = vertices[order]
+    features = np.empty((len(vertices), len(projection.matrix)), np.float32)
+    log_sigmas = np.empty(len(vertices), np.float32)
+    matrix = projection.matrix.T.astype(np.float32)
+    for start in range(0, len(vertices), VERTEX_CHUNK):
+        rows = slice(start, start + VERTEX_CHUNK)
+        points = (vertices[rows] / resolution).astype(np.float32)
+        features[rows] = model.field.features(points) @ matrix
+        log_sigmas[rows] = model.field.log_densities(points)
+        progress(min(start + VERTEX_CHUNK, len(vertices)), len(vertices))
+    scales = code_scales(features)
+    step = model.occupancy.step
+    density_range = (float(np.log(FAINTEST / step)), float(np.log(DENSEST / step)))
+    arrays = GridArrays(
+        brick_coords=brick_coords,
+        brick_masks=brick_masks,
+        density=encode_density(log_sigmas, density_range),
+        features=encode_features(features, scales),
+    )
+    return arrays, scales, density_range
+
+
+def check_asset(
+    model: Model, folder: Path, n_views: int, progress: Callable[[int, int], object]
+) -> dict[str, Any]:
+    """Training views played from the written files against the full model's pictures: PSNR between the two,
+    mean."""
+    asset = Asset.open(folder, verify=True)
+    chosen = np.unique(np.linspace(0, len(model.cameras) - 1, n_views).round().astype(int))
+    in_model = model.model_cameras()
+    agreement = []
+    for done, index in enumerate(chosen):
+        camera: Camera = model.cameras[index]
+        played = render(asset, camera, background=tuple(model.background.tolist()))
+        full = render_image(model.field, model.occupancy, in_model[index], model.background)
+        agreement.append(psnr(to_8_bit(played.rgb) / 255, to_8_bit(full) / 255))
+        progress(done + 1, len(chosen))
+    return {"psnr_to_full_model": float(np.mean(agreement))}

@@ -1,0 +1,62 @@
+"""The surface of a field as a mesh with vertex colours: what the training views see of it, and nothing
+else."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from exporters.mesh import TriangleMesh, take_faces
+from exporters.surface import extract_surface, remove_small_components
+from vfr_bake.baking.visibility import Progress
+from vfr_bake.rendering.render import composited_features, head_colours
+from vfr_bake.training.metrics import to_8_bit
+from vfr_bake.training.model_file import Model
+
+FLOATER_FRACTION = 1e-3
+"""Connected parts with a smaller share of the faces are floaters and go."""
+STAND_OFF = 3.0
+"""Colours are seen from this many voxels above the surface, along its normal."""
+
+
+def bake_mesh(
+    model: Model, visible: np.ndarray, resolution: int, progress: Progress
+) -> tuple[TriangleMesh, int]:
+    """The mesh in the WORLD frame, and how many floating parts were removed.
+
+    `visible` [n, n, n] bool are the cells that some training view sees; faces away from all of them (the
+    inside of a solid) are dropped.
+    """
+    aabb = np.array([[-1.0] * 3, [1.0] * 3])
+
+    def density(points: np.ndarray) -> np.ndarray:
+        return np.exp(model.field.log_densities(np.ascontiguousarray((points + 1) / 2)))
+
+    vertices, faces, normals = extract_surface(
+        density, aabb, resolution, progress=lambda share: progress(round(share * 100), 100)
+    )
+    mesh = TriangleMesh(vertices, faces, normals, np.zeros((len(vertices), 4), np.uint8))
+    mesh = take_faces(mesh, _seen(vertices, visible)[faces].any(axis=1))
+    mesh, n_removed = remove_small_components(mesh, FLOATER_FRACTION)
+    colours = _colours(model, mesh, 2 / resolution)
+    coloured = TriangleMesh(mesh.vertices, mesh.faces, mesh.normals, colours)
+    return coloured.transformed(model.world_from_model), n_removed
+
+
+def _seen(vertices: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Whether a visible cell lies within one cell of each vertex."""
+    n = len(visible)
+    cells = np.clip(((vertices + 1) / 2 * n).astype(int), 0, n - 1)
+    seen = np.zeros(len(vertices), bool)
+    for offset in np.ndindex(3, 3, 3):
+        near = np.clip(cells + np.array(offset) - 1, 0, n - 1)
+        seen |= visible[tuple(near.T)]
+    return seen
+
+
+def _colours(model: Model, mesh: TriangleMesh, voxel: float) -> np.ndarray:
+    """[n_vertices, 4] uint8 sRGB: the head's colour of a short ray down the normal onto each vertex."""
+    rays_d = -mesh.normals.astype(np.float32)
+    rays_o = mesh.vertices.astype(np.float32) - rays_d * np.float32(STAND_OFF * voxel)
+    features, opacity, _ = composited_features(model.field, model.occupancy, rays_o, rays_d)
+    rgb = head_colours(model.field, features / np.maximum(opacity, 1e-3)[:, None], rays_d)
+    return np.concatenate([to_8_bit(rgb), np.full((len(rgb), 1), 255, np.uint8)], axis=1)

@@ -1,0 +1,279 @@
+"""`vfr-train`, `vfr-bake` and `vfr-eval`: settings from the command line, bars on stderr, results on stdout.
+
+Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from player.errors import DataError, MissingExtraError, VfrError
+from player.files import check_target, write_bytes
+
+if TYPE_CHECKING:
+    from vfr_bake.data.scene import Scene
+    from vfr_bake.training.trainer import Trainer
+
+SECONDS_BETWEEN_LINES = 30.0
+"""Where stderr is no terminal, progress is a line this often instead of a bar."""
+
+
+def train_main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `vfr-train`."""
+    return _run("vfr-train", lambda: _train(_parse("vfr-train", "Train", argv)))
+
+
+def bake_main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `vfr-bake`."""
+    return _run("vfr-bake", lambda: _bake(_parse("vfr-bake", "Bake", argv)))
+
+
+def eval_main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `vfr-eval`."""
+    return _run("vfr-eval", lambda: _eval(_parse("vfr-eval", "Eval", argv)))
+
+
+def _run(name: str, command: Callable[[], int]) -> int:
+    try:
+        return command()
+    except VfrError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return 130
+
+
+def _need_train_extra() -> None:
+    for package in ("torch", "numba", "tyro", "tqdm"):
+        if find_spec(package) is None:
+            raise MissingExtraError(
+                f"{package} is not installed: training and baking need: pip install vfr-bake[train]"
+            )
+
+
+def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
+    _need_train_extra()
+    import tyro
+
+    from vfr_bake import options as classes
+
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+    return tyro.cli(
+        getattr(classes, options), prog=name, args=None if argv is None else list(argv), config=config
+    )
+
+
+def _train(options: Any) -> int:
+    check_target(options.model, options.force)
+    from vfr_bake.data import load_scene
+    from vfr_bake.training.trainer import Trainer
+
+    config = options.config
+    with _Bar("reading pictures") as bar:
+        scene = load_scene(options.data, bar.count)
+    trainer = Trainer(scene, config)
+    interrupted = False
+    last = None
+    with _Bar("training") as bar:
+        error_sum, n_steps, rays = 0.0, 0, 0.0
+        try:
+            for last in trainer.run():
+                weight = max(0.02, 1 / (n_steps + 1))
+                n_steps += 1
+                if last.loss == last.loss:  # a skipped step reports NaN
+                    error_sum += weight * (last.loss - error_sum)
+                    rays += weight * (last.n_rays - rays)
+                rate = rays * n_steps / max(last.seconds, 1e-9)
+                bar.share(
+                    last.progress,
+                    f"loss {error_sum:.5f}  PSNR {_decibels(error_sum):.2f} dB  {rate:,.0f} rays/s",
+                )
+        except KeyboardInterrupt:
+            interrupted = True
+    if last is None:
+        raise KeyboardInterrupt
+    figures: dict[str, Any] = {
+        "steps": last.step + 1,
+        "seconds": round(last.seconds, 1),
+        "skipped_steps": trainer.n_bad_steps,
+        "training_psnr": round(_decibels(error_sum), 3),
+    }
+    if not interrupted and config.eval_views and scene.test.cameras:
+        figures |= _test_figures(trainer, scene, config.eval_views)
+    _save(options.model, trainer, scene, figures)
+    tested = (
+        f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
+        if "test_psnr" in figures
+        else ""
+    )
+    _result(
+        options.json,
+        figures | {"model": str(options.model)},
+        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{tested}"
+        + (" (stopped early)" if interrupted else ""),
+    )
+    return 130 if interrupted else 0
+
+
+def _decibels(error: float) -> float:
+    from math import log10
+
+    return -10 * log10(error) if error > 0 else float("inf")
+
+
+def _test_figures(trainer: Trainer, scene: Scene, n_views: int) -> dict[str, Any]:
+    import numpy as np
+
+    from vfr_bake.training.evaluation import evaluate
+
+    scores = []
+    n_views = min(n_views, len(scene.test.cameras))
+    with _Bar("test views") as bar:
+        for score in evaluate(trainer.field, trainer.occupancy, scene.test, np.ones(3), n_views):
+            scores.append(score.psnr)
+            bar.count(len(scores), n_views)
+    return {"test_psnr": float(np.mean(scores)), "test_views": len(scores)}
+
+
+def _save(path: Path, trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> None:
+    from vfr_bake.training.model_file import Model, save_model
+
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
+    model = Model(
+        field=trainer.field,
+        occupancy=trainer.occupancy,
+        world_from_model=scene.world_from_model,
+        cameras=cameras,
+        has_alpha=scene.has_alpha,
+        train={"data": scene.name} | asdict(trainer.config),
+        figures=figures,
+    )
+    save_model(path, model)
+
+
+def _bake(options: Any) -> int:
+    check_target(options.asset, options.force)
+    from vfr_bake.baking.bake import bake
+    from vfr_bake.training.model_file import load_model
+
+    model = load_model(options.model)
+    bars: dict[str, _Bar] = {}
+
+    def report(stage: str, done: int, of: int) -> None:
+        bar = bars.setdefault(stage, _Bar(stage))
+        bar.count(done, of)
+        if done >= of:
+            bar.close()
+
+    result = bake(model, options.asset, options.config, report, options.force)
+    megabytes = result.n_bytes / 1e6
+    figures = {
+        "asset": str(options.asset),
+        "megabytes": megabytes,
+        "seconds": result.seconds,
+    } | result.figures
+    _result(
+        options.json,
+        figures,
+        f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
+        f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; "
+        f"as played it agrees with the full model to {result.figures['psnr_to_full_model']:.1f} dB",
+    )
+    return 0
+
+
+def _eval(options: Any) -> int:
+    from vfr_bake.data import load_scene
+    from vfr_bake.training.evaluation import evaluate
+    from vfr_bake.training.model_file import load_model
+
+    model = load_model(options.model)
+    with _Bar("reading pictures") as bar:
+        scene = load_scene(options.data, bar.count)
+    if not scene.test.cameras:
+        raise DataError(f"{options.data}: test views: expected at least 1, got none")
+    cameras = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
+    to_model = _inverse(model.world_from_model)
+    views = type(scene.test)([c.transformed(to_model) for c in cameras], scene.test.images)
+    scores = []
+    with _Bar("test views") as bar:
+        for score in evaluate(model.field, model.occupancy, views, model.background):
+            scores.append(score)
+            bar.count(len(scores), len(cameras))
+    mean = sum(score.psnr for score in scores) / len(scores)
+    figures = {
+        "psnr": mean,
+        "per_view": [asdict(score) for score in scores],
+        "n_views": len(scores),
+        "background": model.background.tolist(),
+        "bits": 8,
+    }
+    _result(options.json, figures, f"{options.model}: {mean:.2f} dB mean PSNR over {len(scores)} test views")
+    return 0
+
+
+def _inverse(matrix: Any) -> Any:
+    import numpy as np
+
+    return np.linalg.inv(matrix)
+
+
+def _result(target: Path | None, figures: dict[str, Any], sentence: str) -> None:
+    """The result on stdout, as a sentence or as JSON; or the sentence there and the JSON in a file."""
+    text = json.dumps(figures, indent=1, sort_keys=True) + "\n"
+    if target is not None and str(target) == "-":
+        sys.stdout.write(text)
+        return
+    if target is not None:
+        write_bytes(target, text.encode())
+    print(sentence)
+
+
+class _Bar:
+    """A tqdm bar on stderr where that is a terminal, else a line now and then."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: Any = None
+        self._last_line = time.monotonic()
+        self._begin = self._last_line
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def count(self, done: int, of: int) -> None:
+        self._show(done / of if of else 1.0, f"{done}/{of}")
+
+    def share(self, share: float, text: str) -> None:
+        self._show(share, text)
+
+    def _show(self, share: float, text: str) -> None:
+        if not sys.stderr.isatty():
+            if time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
+                self._last_line = time.monotonic()
+                left = (self._last_line - self._begin) * (1 - share) / max(share, 1e-9)
+                print(f"{self._title}: {share:.0%}, {left:.0f} s left, {text}", file=sys.stderr, flush=True)
+            return
+        if self._bar is None:
+            from tqdm import tqdm
+
+            layout = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}  {postfix}"
+            self._bar = tqdm(total=1.0, desc=self._title, bar_format=layout, file=sys.stderr)
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update(share - self._bar.n)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

@@ -1,0 +1,159 @@
+"""Every setting, one frozen dataclass a command. The attribute docstrings are the help texts and carry the
+units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from player.errors import ConfigError
+
+
+def _check(condition: bool, name: str, expected: str, got: Any) -> None:
+    if not condition:
+        raise ConfigError(f"{name}: expected {expected}, got {got}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldConfig:
+    """Architecture of a field (section 4 of the paper); stored in the model file."""
+
+    n_levels: int = 16
+    """Levels of the hash grid."""
+    base_resolution: int = 16
+    """Cells per axis of the coarsest level, over the scene box."""
+    max_resolution: int = 512
+    """Cells per axis of the finest level."""
+    log2_table_size: int = 18
+    """A level with more vertices than two to this power shares entries by hashing (paper: 19)."""
+    density_width: int = 64
+    """Hidden width of the density network; 0 for a linear map."""
+    head_width: int = 256
+    """Width of every layer of the head, and of its bottleneck."""
+    sh_degree: int = 4
+    """Bands of spherical harmonics in the view encoding: degree 4 means l = 0..3, 16 basis functions."""
+    n_sh_features: int = 4
+    """Features that multiply each basis function (equation 4 of the paper)."""
+
+    def __post_init__(self) -> None:
+        _check(1 <= self.n_levels <= 32, "n_levels", "1 to 32", self.n_levels)
+        _check(
+            2 <= self.base_resolution <= self.max_resolution,
+            "base_resolution",
+            "2 to max_resolution",
+            self.base_resolution,
+        )
+        _check(self.max_resolution <= 8192, "max_resolution", "at most 8192", self.max_resolution)
+        _check(10 <= self.log2_table_size <= 24, "log2_table_size", "10 to 24", self.log2_table_size)
+        _check(0 <= self.density_width <= 1024, "density_width", "0 to 1024", self.density_width)
+        _check(4 <= self.head_width <= 1024, "head_width", "4 to 1024", self.head_width)
+        _check(1 <= self.sh_degree <= 8, "sh_degree", "1 to 8", self.sh_degree)
+        _check(1 <= self.n_sh_features <= 32, "n_sh_features", "1 to 32", self.n_sh_features)
+
+    @property
+    def n_channels(self) -> int:
+        """Feature channels of a point: two per level."""
+        return 2 * self.n_levels
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Settings of `vfr-train`. The defaults are made for two CPU cores; the paper's GPU figures stand beside
+    them."""
+
+    steps: int = 20_000
+    """Optimiser steps at most (paper: 20,000). Training ends here or when the minutes are over."""
+    minutes: float = 8.0
+    """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
+    further."""
+    batch_samples: int = 32_768
+    """Samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in proportion
+    and quality after a few minutes depends on how many steps were taken."""
+    max_rays: int = 16_384
+    """Rays in a batch at most, however few samples they need."""
+    grid_rate: float = 1e-2
+    """Adam learning rate of the hash grid."""
+    network_rate: float = 2e-3
+    """Adam learning rate of the density network and the head."""
+    pilot_steps: int = 300
+    """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
+    paper)."""
+    step_cells: float = 1.0
+    """Length of a march step, in cells of the finest level."""
+    occupancy_resolution: int = 128
+    """Cells per axis of the occupancy grid."""
+    seed: int = 0
+    """Seed of every random number."""
+    eval_views: int = 25
+    """Test views rendered at the end, spread evenly; 0 for none. `vfr-eval` renders them all."""
+    field: FieldConfig = field(default_factory=FieldConfig)
+
+    def __post_init__(self) -> None:
+        _check(self.steps >= 1, "steps", "at least 1", self.steps)
+        _check(self.minutes > 0, "minutes", "more than 0", self.minutes)
+        _check(4096 <= self.batch_samples <= 2**22, "batch_samples", "4,096 to 4,194,304", self.batch_samples)
+        _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
+        _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)
+        _check(0 < self.network_rate < 1, "network_rate", "between 0 and 1", self.network_rate)
+        _check(self.pilot_steps >= 0, "pilot_steps", "at least 0", self.pilot_steps)
+        _check(0.1 <= self.step_cells <= 16, "step_cells", "0.1 to 16", self.step_cells)
+        _check(
+            8 <= self.occupancy_resolution <= 512,
+            "occupancy_resolution",
+            "8 to 512",
+            self.occupancy_resolution,
+        )
+        _check(self.eval_views >= 0, "eval_views", "at least 0", self.eval_views)
+
+    @property
+    def step(self) -> float:
+        """Length of a march step in model units; the box [-1, 1]^3 is 2 wide."""
+        return 2.0 * self.step_cells / self.field.max_resolution
+
+
+def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
+    """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
+    names."""
+    names = {f.name for f in fields(FieldConfig)}
+    _check(set(values) == names, where, f"the settings {sorted(names)}", sorted(values))
+    for name, value in values.items():
+        _check(
+            isinstance(value, int) and not isinstance(value, bool), f"{where}: {name}", "an integer", value
+        )
+    return FieldConfig(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeConfig:
+    """Settings of `vfr-bake`."""
+
+    resolution: int = 0
+    """Cells per axis of the baked grid; 0 takes the field's finest level."""
+    n_channels: int = 16
+    """Feature channels kept of the field's; the projection is folded into the head."""
+    n_samples: int = 5
+    """Feature lookups per ray, k; the player can be asked for another number."""
+    weight_floor: float = 0.005
+    """A cell is stored if some training ray gives one of its samples at least this weight."""
+    mesh_resolution: int = 256
+    """Voxels along each side of the box for the mesh; 0 leaves the mesh at the grid's own resolution."""
+    check_views: int = 4
+    """Training views played from the written files and compared with the full model."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self.resolution == 0 or 8 <= self.resolution <= 2048,
+            "resolution",
+            "0 or 8 to 2048",
+            self.resolution,
+        )
+        _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
+        _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
+        _check(0 < self.weight_floor < 1, "weight_floor", "between 0 and 1", self.weight_floor)
+        _check(
+            self.mesh_resolution == 0 or 8 <= self.mesh_resolution <= 1024,
+            "mesh_resolution",
+            "0 or 8 to 1024",
+            self.mesh_resolution,
+        )
+        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)

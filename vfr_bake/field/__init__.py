@@ -1,0 +1,1 @@
+"""The field of section 3 of the paper: hash grid, density, head, pilot network."""

@@ -1,0 +1,278 @@
+"""The march through the occupancy grid, with the field's density evaluated on the way so that it stops when
+opaque.
+
+Letters: the model frame's box is `aabb` = [-1, 1]^3, u = (x + 1) / 2 its unit cube. Samples of a ray lie at
+t_i = t_near + (i + jitter) * step; `distance` [n, n, n] is the Chebyshev distance in cells to the nearest
+occupied cell (0: occupied), so that d - 1 whole cells around an empty one can be skipped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from vfr_bake.kernels.hash_grid import FLAGS, encode_point
+
+
+@njit(inline="always")
+def ray_box(rays_o, rays_d, ray):
+    """Entry and exit of a ray in [-1, 1]^3, entry at least 0; entry >= exit where it misses."""
+    kind = rays_o.dtype.type
+    t_near, t_far = kind(0), kind(1e30)
+    for axis in range(3):
+        o, d = rays_o[ray, axis], rays_d[ray, axis]
+        if d == 0:
+            if o < -1 or o > 1:
+                t_far = kind(-1)
+            continue
+        a, b = (kind(-1) - o) / d, (kind(1) - o) / d
+        t_near = max(t_near, min(a, b))
+        t_far = min(t_far, max(a, b))
+    return t_near, t_far
+
+
+@njit(inline="always")
+def _empty_length(ux, uy, uz, rays_d, ray, distance, n):
+    """Path length that is certainly empty from a point of the unit cube; 0 in an occupied cell."""
+    kind = rays_d.dtype.type
+    cells = kind(n)
+    ix = min(max(np.int64(ux * cells), 0), n - 1)
+    iy = min(max(np.int64(uy * cells), 0), n - 1)
+    iz = min(max(np.int64(uz * cells), 0), n - 1)
+    d = np.int64(distance[ix, iy, iz])
+    if d == 0:
+        return kind(0)
+    leave = kind(1e30)
+    for axis in range(3):
+        u, i = (ux, ix) if axis == 0 else ((uy, iy) if axis == 1 else (uz, iz))
+        v = rays_d[ray, axis] * kind(0.5)
+        if v > 0:
+            leave = min(leave, (kind(i + d) / cells - u) / v)
+        elif v < 0:
+            leave = min(leave, (kind(i - d + 1) / cells - u) / v)
+    return max(leave, kind(1e-12))
+
+
+@njit(fastmath=FLAGS, error_model="numpy")
+def next_sample(rays_o, rays_d, ray, t_near, t_far, i, jitter, step, distance):
+    """First lattice sample from number `i` on that lies in an occupied cell: (number, t, u); number -1 past
+    the exit.
+
+    Skips land on or before the cell border that they aim at, so no occupied sample is ever jumped over.
+    """
+    kind = rays_o.dtype.type
+    half = kind(0.5)
+    n = distance.shape[0]
+    while True:
+        t = t_near + (kind(i) + jitter) * step
+        ux = (rays_o[ray, 0] + t * rays_d[ray, 0]) * half + half
+        uy = (rays_o[ray, 1] + t * rays_d[ray, 1]) * half + half
+        uz = (rays_o[ray, 2] + t * rays_d[ray, 2]) * half + half
+        if not t < t_far:
+            return -1, t, ux, uy, uz
+        empty = _empty_length(ux, uy, uz, rays_d, ray, distance, n)
+        if empty == 0:
+            return i, t, ux, uy, uz
+        i += max(np.int64(empty / step), 1)
+
+
+@njit(fastmath=FLAGS, error_model="numpy")
+def density_logit(feature, w1, b1, w2, b2, hidden):
+    """Pre-activation of the density, w2 . relu(w1 feature + b1) + b2; without hidden layer (w1 empty) w2 .
+    feature + b2."""
+    kind = feature.dtype.type
+    total = b2
+    if w1.shape[0] == 0:
+        for c in range(feature.shape[0]):
+            total += w2[c] * feature[c]
+        return total
+    for j in range(b1.shape[0]):
+        hidden[j] = b1[j]
+    for c in range(feature.shape[0]):
+        f = feature[c]
+        for j in range(b1.shape[0]):
+            hidden[j] += f * w1[c, j]
+    for j in range(b1.shape[0]):
+        total += w2[j] * max(hidden[j], kind(0))
+    return total
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def density_logits(points, grid, network, out):
+    """Pre-activation densities `out` [n_points] at `points` [n_points, 3] of the unit cube."""
+    table, scales, offsets, hashed, mask = grid
+    w1, b1, w2, b2 = network
+    block = 1024
+    for start in prange((points.shape[0] + block - 1) // block):
+        feature = np.zeros(2 * scales.shape[0], table.dtype)
+        hidden = np.zeros(b1.shape[0], table.dtype)
+        for i in range(start * block, min((start + 1) * block, points.shape[0])):
+            encode_point(
+                points[i, 0], points[i, 1], points[i, 2], table, scales, offsets, hashed, mask, feature
+            )
+            out[i] = density_logit(feature, w1, b1, w2, b2, hidden)
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def march_samples(
+    rays_o, rays_d, jitter, step, distance, grid, network, limits, counts, starts, t_mid, points, features
+):
+    """Visible samples of as many rays as fit, in one pass: what is counted is what is written.
+
+    `t_mid` [n_chunks, capacity], `points` [n_chunks, capacity, 3] and `features` [n_chunks, capacity,
+    n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only if the
+    most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever written
+    past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the first
+    sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops).
+    """
+    table, scales, offsets, hashed, mask = grid
+    w1, b1, w2, b2 = network
+    largest_logit, opaque = limits
+    kind = table.dtype.type
+    n_chunks, capacity = t_mid.shape
+    n_rays = rays_o.shape[0]
+    used = np.zeros(n_chunks, np.int64)
+    for chunk in prange(n_chunks):
+        hidden = np.zeros(b1.shape[0], table.dtype)
+        k = 0
+        for ray in range(chunk, n_rays, n_chunks):
+            counts[ray] = -1
+        for ray in range(chunk, n_rays, n_chunks):
+            t_near, t_far = ray_box(rays_o, rays_d, ray)
+            if t_near >= t_far:
+                counts[ray] = 0
+                starts[ray] = k
+                continue
+            if k + np.int64((t_far - t_near) / step) + 2 > capacity:
+                break
+            starts[ray] = k
+            tau = kind(0)
+            i = 0
+            while tau <= opaque:
+                i, t, ux, uy, uz = next_sample(
+                    rays_o, rays_d, ray, t_near, t_far, i, jitter[ray], step, distance
+                )
+                if i < 0:
+                    break
+                feature = features[chunk, k]
+                encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
+                logit = density_logit(feature, w1, b1, w2, b2, hidden)
+                t_mid[chunk, k] = t
+                points[chunk, k, 0] = ux
+                points[chunk, k, 1] = uy
+                points[chunk, k, 2] = uz
+                k += 1
+                i += 1
+                tau += np.exp(min(logit, largest_logit)) * step
+            counts[ray] = k - starts[ray]
+        used[chunk] = k
+    return used
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def render_features(rays_o, rays_d, step, distance, grid, network, limits, out, opacity, depth):
+    """Composited features without a stored sample: out [n_rays, n_channels], opacity [n_rays], depth
+    [n_rays] (mean t)."""
+    table, scales, offsets, hashed, mask = grid
+    w1, b1, w2, b2 = network
+    largest_logit, opaque = limits
+    kind = table.dtype.type
+    half = kind(0.5)
+    block = 64
+    n_rays = rays_o.shape[0]
+    for start in prange((n_rays + block - 1) // block):
+        hidden = np.zeros(b1.shape[0], table.dtype)
+        feature = np.zeros(out.shape[1], table.dtype)
+        for ray in range(start * block, min((start + 1) * block, n_rays)):
+            t_near, t_far = ray_box(rays_o, rays_d, ray)
+            tau = kind(0)
+            trans = kind(1)
+            t_sum = kind(0)
+            i = 0
+            while tau <= opaque:
+                i, t, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
+                if i < 0:
+                    break
+                i += 1
+                encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
+                delta = np.exp(min(density_logit(feature, w1, b1, w2, b2, hidden), largest_logit)) * step
+                weight = -trans * np.expm1(-delta)
+                for c in range(out.shape[1]):
+                    out[ray, c] += weight * feature[c]
+                t_sum += weight * t
+                tau += delta
+                trans = np.exp(-tau)
+            opacity[ray] = -np.expm1(-tau)
+            depth[ray] = t_sum / opacity[ray] if tau > 0 else kind(0)
+
+
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def mark_visible_cells(rays_o, rays_d, step, distance, grid, network, limits, weight_floor, visible):
+    """Set `visible` [r, r, r] (uint8) where a sample of some ray weighs at least `weight_floor`.
+
+    Several threads may set one cell: all write the same 1, so the result does not depend on their order.
+    """
+    table, scales, offsets, hashed, mask = grid
+    w1, b1, w2, b2 = network
+    largest_logit, opaque = limits
+    kind = table.dtype.type
+    half = kind(0.5)
+    r = visible.shape[0]
+    block = 64
+    n_rays = rays_o.shape[0]
+    for start in prange((n_rays + block - 1) // block):
+        hidden = np.zeros(b1.shape[0], table.dtype)
+        feature = np.zeros(2 * scales.shape[0], table.dtype)
+        for ray in range(start * block, min((start + 1) * block, n_rays)):
+            t_near, t_far = ray_box(rays_o, rays_d, ray)
+            tau = kind(0)
+            i = 0
+            while tau <= opaque:
+                i, _, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
+                if i < 0:
+                    break
+                i += 1
+                encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
+                delta = np.exp(min(density_logit(feature, w1, b1, w2, b2, hidden), largest_logit)) * step
+                if -np.exp(-tau) * np.expm1(-delta) >= weight_floor:
+                    jx = min(max(np.int64(ux * kind(r)), 0), r - 1)
+                    jy = min(max(np.int64(uy * kind(r)), 0), r - 1)
+                    jz = min(max(np.int64(uz * kind(r)), 0), r - 1)
+                    visible[jx, jy, jz] = 1
+                tau += delta
+
+
+@njit(cache=True)
+def chebyshev_distance(occupied, distance):
+    """Chebyshev distance in cells to the nearest occupied cell, at most 255; two sweeps over the 26
+    neighbours.
+
+    `occupied` [n, n, n] bool, `distance` [n, n, n] uint8 out. Outside the grid nothing is occupied.
+    """
+    n = occupied.shape[0]
+    for x in range(n):
+        for y in range(n):
+            for z in range(n):
+                best = 0 if occupied[x, y, z] else 255
+                for dx in range(-1, 1):
+                    for dy in range(-1, 2):
+                        for dz in range(-1, 2):
+                            if dx == 0 and (dy > 0 or (dy == 0 and dz >= 0)):
+                                continue
+                            a, b, c = x + dx, y + dy, z + dz
+                            if a >= 0 and 0 <= b < n and 0 <= c < n:
+                                best = min(best, np.int64(distance[a, b, c]) + 1)
+                distance[x, y, z] = best
+    for x in range(n - 1, -1, -1):
+        for y in range(n - 1, -1, -1):
+            for z in range(n - 1, -1, -1):
+                best = np.int64(distance[x, y, z])
+                for dx in range(0, 2):
+                    for dy in range(-1, 2):
+                        for dz in range(-1, 2):
+                            if dx == 0 and (dy < 0 or (dy == 0 and dz <= 0)):
+                                continue
+                            a, b, c = x + dx, y + dy, z + dz
+                            if a < n and 0 <= b < n and 0 <= c < n:
+                                best = min(best, np.int64(distance[a, b, c]) + 1)
+                distance[x, y, z] = best

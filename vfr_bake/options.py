@@ -1,0 +1,61 @@
+"""What the command lines of `vfr-train`, `vfr-bake` and `vfr-eval` take; `tyro` makes the parsers out of
+it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from vfr_bake.config import BakeConfig, TrainConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a Volume Feature Rendering field on posed photographs.
+
+    The model file holds everything that vfr-bake needs. Ctrl-C ends training early and keeps the model.
+    """
+
+    data: Positional[str]
+    """Folder with transforms_train.json (NeRF-synthetic) or transforms.json, or `demo` for the built-in
+    scene."""
+    model: Positional[Path]
+    """The model file to write, for example model.pt."""
+    config: TrainConfig = field(default_factory=TrainConfig)
+    force: bool = False
+    """Replace the model file if it exists."""
+    json: Path | None = None
+    """Also write what was measured as JSON to this file; - for stdout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bake:
+    """Bake a trained model into an asset: sparse 8-bit grid, ONNX head and mesh, played by vfr-play on any
+    CPU.
+
+    The data set is not needed; the model file holds the training cameras.
+    """
+
+    model: Positional[Path]
+    """A model file written by vfr-train."""
+    asset: Positional[Path]
+    """The folder to write."""
+    config: BakeConfig = field(default_factory=BakeConfig)
+    force: bool = False
+    """Replace the folder if it exists."""
+    json: Path | None = None
+    """Also write what was measured as JSON to this file; - for stdout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Render the test views with the full model and compare them with the photographs, over white."""
+
+    model: Positional[Path]
+    """A model file written by vfr-train."""
+    data: Positional[str]
+    """The data set, as for vfr-train."""
+    json: Path | None = None
+    """Write psnr (mean, dB) and per_view as JSON to this file; - for stdout."""

@@ -1,0 +1,1 @@
+"""From rays to composited features: occupancy grid, samples, compositing, pictures."""

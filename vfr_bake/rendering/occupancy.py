@@ -1,0 +1,78 @@
+"""Occupancy grid: which cells of the box may hold matter, so that the march skips the others.
+
+A moving maximum of the density per cell, as in instant-ngp and nerfacc: decayed, raised where the field is
+dense, and compared with a threshold on the opacity of one march step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vfr_bake.field.field import VfrField
+from vfr_bake.kernels.march import chebyshev_distance
+
+OPACITY_THRESHOLD = 0.01
+"""A cell is empty when a whole march step through it is less opaque than this (nerfacc's default)."""
+DECAY = 0.95
+"""All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
+found matter."""
+SHARE = 32
+"""An update looks at one cell in this many at random, and at as many of the occupied ones."""
+
+
+class OccupancyGrid:
+    """`densities` [n, n, n] float32 per model unit, and `distance` [n, n, n] uint8 for the march.
+
+    >>> grid = OccupancyGrid(16, step=0.01, seed=0)
+    >>> int(grid.distance.max())
+    0
+    """
+
+    def __init__(self, resolution: int, step: float, seed: int) -> None:
+        self.resolution = resolution
+        self.step = step
+        self.densities = np.full((resolution,) * 3, np.inf, np.float32)
+        self.distance = np.zeros((resolution,) * 3, np.uint8)
+        self.n_updates = 0
+        self._random = np.random.default_rng(seed)
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """[n, n, n] bool."""
+        return self.distance == 0
+
+    def update(self, field: VfrField) -> None:
+        """Look at the field at one random point of each chosen cell."""
+        n_cells = self.resolution**3
+        flat = self.densities.reshape(-1)
+        if self.n_updates == 0:
+            cells = np.arange(n_cells)
+            flat[:] = 0
+        else:
+            cells = self._random.integers(0, n_cells, n_cells // SHARE)
+            occupied = np.flatnonzero(self.distance == 0)
+            if len(occupied) > len(cells):
+                occupied = self._random.choice(occupied, len(cells))
+            cells = np.unique(np.concatenate([cells, occupied]))
+        flat *= DECAY
+        flat[cells] = np.maximum(flat[cells], self._sample(field, cells))
+        self.n_updates += 1
+        # A fog everywhere must not count as full: the mean bounds the threshold while the field is still
+        # thin.
+        threshold = min(-np.log1p(-OPACITY_THRESHOLD) / self.step, float(flat.mean()))
+        self._set_occupied(self.densities > threshold)
+
+    def _sample(self, field: VfrField, cells: np.ndarray) -> np.ndarray:
+        n = self.resolution
+        corner = np.stack(np.unravel_index(cells, (n, n, n)), axis=-1)
+        points = (corner + self._random.random((len(cells), 3))) / n
+        return np.exp(field.log_densities(points.astype(np.float32)))
+
+    def _set_occupied(self, occupied: np.ndarray) -> None:
+        if not occupied.any():
+            occupied = np.ones_like(occupied)  # nothing found yet: look everywhere rather than nowhere
+        chebyshev_distance(occupied, self.distance)
+
+    def restore(self, occupied: np.ndarray) -> None:
+        """Take `occupied` [n, n, n] bool from a model file."""
+        self._set_occupied(occupied)

@@ -1,0 +1,107 @@
+"""Samples along rays: lattice points in occupied cells, up to where the ray is opaque.
+
+Letters as in `vfr_bake.kernels.march`. The ray's samples are rows `starts[r] : starts[r] + counts[r]` of the
+flat arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vfr_bake.field.density import LARGEST_LOGIT
+from vfr_bake.field.field import VfrField
+from vfr_bake.kernels import march as kernels
+from vfr_bake.rendering.occupancy import OccupancyGrid
+
+OPAQUE_DEPTH = float(-np.log(1e-3))
+"""Optical depth at which a ray stops: what lies behind weighs less than 1e-3 in all."""
+LIMITS = (np.float32(LARGEST_LOGIT), np.float32(OPAQUE_DEPTH))
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Visible samples of a batch of rays."""
+
+    t_mid: Tensor
+    """[n_samples] distance along the ray in model units."""
+    points: Tensor
+    """[n_samples, 3] in the unit cube."""
+    features: Tensor
+    """[n_samples, n_channels], as the march has met them."""
+    rays: Tensor
+    """[n_served] indices of the rays that were served; rays past the sample budget are left out."""
+    starts: Tensor
+    """[n_served] first sample of each."""
+    counts: Tensor
+    """[n_served] number of samples of each, 0 where a ray meets nothing."""
+
+
+def march(
+    field: VfrField,
+    occupancy: OccupancyGrid,
+    rays_o: Tensor,
+    rays_d: Tensor,
+    jitter: Tensor,
+    budget: int,
+    n_chunks: int = 2,
+) -> Samples:
+    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays] in [0, 1).
+
+    The budget is grown to hold at least one whole ray per chunk.
+    """
+    step = occupancy.step
+    longest = int(np.ceil(2 * 3**0.5 / step)) + 3
+    capacity = max(budget // n_chunks, longest)
+    n_channels = field.config.n_channels
+    t_mid = np.empty((n_chunks, capacity), np.float32)
+    points = np.empty((n_chunks, capacity, 3), np.float32)
+    features = np.empty((n_chunks, capacity, n_channels), np.float32)
+    counts = np.empty(len(rays_o), np.int64)
+    starts = np.empty(len(rays_o), np.int64)
+    used = kernels.march_samples(
+        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), occupancy.distance,
+        *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features,
+    )  # fmt: skip
+    first = np.concatenate([[0], np.cumsum(used)])
+    served = np.flatnonzero(counts >= 0)
+    return Samples(
+        t_mid=torch.from_numpy(_join(t_mid, used)),
+        points=torch.from_numpy(_join(points, used)),
+        features=torch.from_numpy(_join(features, used)),
+        rays=torch.from_numpy(served),
+        starts=torch.from_numpy(starts[served] + first[served % n_chunks]),
+        counts=torch.from_numpy(counts[served]),
+    )
+
+
+def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:
+    return np.concatenate([chunk[:n] for chunk, n in zip(chunks, used, strict=True)])
+
+
+def march_reference(
+    field: VfrField, occupied: np.ndarray, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, step: float
+) -> list[Tensor]:
+    """The t of every ray's visible samples, ray by ray and lattice point by lattice point: what `march` must
+    find."""
+    n = len(occupied)
+    found = []
+    for o, d, offset in zip(rays_o, rays_d, jitter, strict=True):
+        slabs = torch.stack([(-1 - o) / d, (1 - o) / d])
+        parallel = torch.where(o.abs() <= 1, torch.inf, -torch.inf) * torch.tensor([[-1.0], [1.0]])
+        slabs = torch.where(d == 0, parallel, slabs)
+        t_near = slabs.min(dim=0).values.max().clamp(min=0)
+        t_far = slabs.max(dim=0).values.min()
+        t = t_near + (torch.arange(int(2 * 3**0.5 / step) + 2) + offset) * step
+        t = t[t < t_far]
+        u = (o + t[:, None] * d + 1) / 2
+        cells = (u * n).long().clamp(0, n - 1)
+        t, u = t[occupied[tuple(cells.T)]], u[occupied[tuple(cells.T)]]
+        with torch.no_grad():
+            sigmas = field.density(field.grid.reference(u))
+        before = torch.cumsum(sigmas * step, dim=0) - sigmas * step
+        found.append(t[before <= OPAQUE_DEPTH])
+    return found
