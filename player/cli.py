@@ -166,9 +166,9 @@ def _slice(text: str) -> slice:
 
 def _play(arguments: argparse.Namespace) -> int:
     from player.asset import Asset
-    from player.cameras import frame_names
     from player.images import write_png
     from player.render import Renderer, check_size
+    from player.transforms import frame_names
 
     output: Path = arguments.output
     _check_output(output, arguments.force)
@@ -217,7 +217,8 @@ def _check_output(output: Path, force: bool) -> None:
 
 
 def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
-    from player.cameras import orbit, read_cameras
+    from player.cameras import orbit
+    from player.transforms import read_cameras
 
     width, height = asset.manifest.view_size
     if arguments.orbit is not None:
@@ -312,8 +313,8 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _info(arguments: argparse.Namespace) -> int:
     from player.asset import Asset
-    from player.cameras import read_cameras
     from player.head import count_parameters
+    from player.transforms import read_cameras
 
     asset = Asset.open(arguments.asset)
     m = asset.manifest

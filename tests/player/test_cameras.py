@@ -13,9 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from player import cameras as module
-from player.cameras import Camera, focus_point, frame_names, orbit, read_cameras, write_cameras
+from player import transforms as module
+from player.cameras import Camera, focus_point, orbit
 from player.errors import FormatError
+from player.transforms import frame_names, read_cameras, write_cameras
 
 POSE = np.array([[0.0, -0.6, 0.8, 3.0], [1, 0, 0, -2], [0, 0.8, 0.6, 1], [0, 0, 0, 1]])
 

@@ -15,11 +15,12 @@ from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
 from player.asset import Asset, GridArrays, write_asset
 from player.bricks import pack_vertices
-from player.cameras import Camera, write_cameras
+from player.cameras import Camera
 from player.density import encode_density
 from player.files import check_target
 from player.manifest import Manifest
 from player.render import render
+from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.mesh import bake_mesh

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from player.cameras import Camera, load_transforms, transforms_cameras, transforms_number
+from player.cameras import Camera
 from player.errors import DataError, MissingExtraError
+from player.transforms import load_transforms, transforms_cameras, transforms_number
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 
 SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from player.cameras import Camera, parse_transforms, transforms_cameras, write_cameras
+from player.cameras import Camera
 from player.errors import FormatError, VersionError
 from player.files import write_bytes
+from player.transforms import parse_transforms, transforms_cameras, write_cameras
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
