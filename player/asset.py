@@ -80,7 +80,7 @@ class Asset:
 
         Args:
             folder: the asset's folder.
-            verify: also compare every checksum, which reads every byte.
+            verify: compare every checksum first, which reads every byte.
 
         Raises:
             FormatError: not an asset, or one that breaks the format; VersionError if it is a newer one.
@@ -90,12 +90,11 @@ class Asset:
         manifest = _read_manifest(folder)
         for name, entry in manifest.files.items():
             _check_size(folder / name, entry)
+            if verify:
+                _check_sum(folder / name, entry)
         arrays = GridArrays(**{name: _map_array(folder / f"{name}.npy") for name in _DTYPES})
         arrays.check(manifest, f"{folder}/")
-        asset = cls(folder, manifest, arrays)
-        if verify:
-            asset.verify()
-        return asset
+        return cls(folder, manifest, arrays)
 
     def path(self, name: str) -> Path:
         """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
@@ -231,7 +230,7 @@ def _digest(path: Path) -> str:
 
 def _map_array(path: Path) -> np.ndarray:
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, EOFError, OSError, SyntaxError, TypeError) as error:
         raise FormatError(f"{path}: expected a numpy array, got something else: {error}") from error
     if not isinstance(array, np.memmap) or not array.flags.c_contiguous:

@@ -12,6 +12,7 @@ MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of equal
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -103,14 +104,16 @@ def equal_mass_bins(samples: Samples, k: int) -> Bins:
     rank = np.repeat(np.arange(len(starts)), ends - starts + 1)
     weights = samples.weights.astype(np.float64)
     share = weights / np.add.reduceat(weights, starts)[rank]
+    unit = samples.s[ends].astype(np.float64)  # the last sample's s, so that moments are at most 1 too
     mass = _cumulative(share, starts, rank)
-    moment = _cumulative(share * samples.s, starts, rank)
+    mass /= mass[ends][rank]
+    moment = _cumulative(share * (samples.s / unit[rank]), starts, rank)
     cuts = np.arange(1, k) / k
     found = np.searchsorted(rank + mass, np.arange(len(starts))[:, None] + cuts)
     found = np.clip(found, starts[:, None], ends[:, None])
-    at_cut = moment[found] - (mass[found] - cuts) * samples.s[found]
+    at_cut = moment[found] - (mass[found] - cuts) * (samples.s[found] / unit[:, None])
     edges = np.concatenate([np.zeros((len(starts), 1)), at_cut, moment[ends][:, None]], axis=1)
-    centroids = np.diff(edges, axis=1) * k
+    centroids = np.diff(edges, axis=1) * k * unit[:, None]
     return Bins(
         ray=np.repeat(samples.ray[starts], k),
         s=centroids.reshape(-1).astype(np.float32),
@@ -123,9 +126,14 @@ def equal_mass_bins(samples: Samples, k: int) -> Bins:
 
 
 def _cumulative(values: np.ndarray, starts: np.ndarray, rank: np.ndarray) -> np.ndarray:
-    """Sums along each ray, the sample itself included."""
-    running = np.cumsum(values)
-    return running - (running[starts] - values[starts])[rank]
+    """Sums of values 0..1 along each ray, the sample itself included.
+
+    In integers of 2^-50, whose sums are exact even where they wrap around: a ray's sums must not depend on
+    the rays before it.
+    """
+    whole = np.rint(values * 2.0**50).astype(np.int64)
+    running = np.cumsum(whole)
+    return (running - (running[starts] - whole[starts])[rank]) * 2.0**-50
 
 
 def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
@@ -153,8 +161,13 @@ def _add(
 ) -> np.ndarray:
     """Add each fetch to the row of its ray; returns the indices of those where too little is stored."""
     gaps = []
-    for start in range(0, len(fetches.ray), BLOCK):
-        ray, s, weights = (column[start : start + BLOCK] for column in fetches)
+    firsts = np.flatnonzero(np.diff(fetches.ray, prepend=-1))
+    cuts = np.searchsorted(
+        firsts, np.arange(0, len(fetches.ray), BLOCK)
+    )  # no ray is cut: sums keep their order
+    edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
+    for start, stop in itertools.pairwise(edges):
+        ray, s, weights = (column[start:stop] for column in fetches)
         values, total = _fetch(grid, entries.point[:, ray] + s * entries.direction[:, ray])
         poor = total < MIN_TOTAL
         scale = np.where(poor, np.float32(0), weights / np.where(poor, np.float32(1), total))

@@ -6,7 +6,7 @@ onnxruntime is imported when a head is opened, not before, so that `vfr-play --h
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ class Head:
 
     def __init__(self, path: Path, n_channels: int) -> None:
         import onnxruntime as ort
-        from onnxruntime.capi import onnxruntime_pybind11_state as state
+        from onnxruntime.capi import onnxruntime_pybind11_state as state  # pyright: ignore[reportAttributeAccessIssue]
 
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
@@ -64,11 +64,12 @@ class Head:
         rgb = np.empty((len(features), 3), np.float32)
         for start in range(0, len(features), CHUNK):
             part = slice(start, start + CHUNK)
-            rgb[part] = self._session.run(["rgb"], {"features": features[part], "dirs": dirs[part]})[0]
+            outputs = self._session.run(["rgb"], {"features": features[part], "dirs": dirs[part]})
+            rgb[part] = np.asarray(outputs[0])
         return rgb
 
 
-def _check_ports(path: Path, kind: str, ports: list[Any], expected: dict[str, int]) -> None:
+def _check_ports(path: Path, kind: str, ports: Sequence[Any], expected: dict[str, int]) -> None:
     got = {port.name: port for port in ports}
     if set(got) != set(expected):
         raise FormatError(f"{path}: {kind}s: expected {sorted(expected)}, got {sorted(got)}")

@@ -31,7 +31,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [1, 0]; any minor of a reader's major is read, unknown keys of newer ones ignored |
+| `version` | [major, minor] | [1, 0]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
 | `resolution` | integer, 1..2048 | cells per axis |
 | `aabb` | 2 x 3 numbers | box, model frame |

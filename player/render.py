@@ -29,7 +29,7 @@ March = Literal["auto", "numpy", "numba"]
 MAX_PIXELS = 1 << 26
 """Largest picture, 8192 x 8192: a frame takes 24 bytes a pixel."""
 
-TASK_BLOCKS = {"numba": 96, "numpy": 256}
+TASK_BLOCKS = {"numba": 96, "numpy": 128}
 """Blocks a task: enough rays for the head's chunks and, in numpy, for its calls; few enough to share out
 evenly."""
 

@@ -1,0 +1,122 @@
+"""A small analytic asset: two spherical shells, features that are linear in the position."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from player.asset import Asset, GridArrays, write_asset
+from player.bricks import pack_vertices
+from player.density import encode_density
+from player.manifest import Manifest
+from tests.player.oracle_march import Scene
+
+RESOLUTION = 64
+DENSITY_RANGE = (-2.0, 6.0)
+STEP = 0.9 * 2 / RESOLUTION
+WORLD_FROM_MODEL = [[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, 2.0], [0.0, 0.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def head_bytes(n_channels: int = 4, output: str = "rgb") -> bytes:
+    """rgb = sigmoid(features W + dirs V), 3 channels out of `n_channels`."""
+    rng = np.random.default_rng(0)
+    w = helper.make_tensor("w", TensorProto.FLOAT, [n_channels, 3], rng.normal(0, 0.02, n_channels * 3))
+    v = helper.make_tensor("v", TensorProto.FLOAT, [3, 3], rng.normal(0, 0.5, 9))
+    nodes = [
+        helper.make_node("MatMul", ["features", "w"], ["a"]),
+        helper.make_node("MatMul", ["dirs", "v"], ["b"]),
+        helper.make_node("Add", ["a", "b"], ["c"]),
+        helper.make_node("Sigmoid", ["c"], [output]),
+    ]
+
+    def port(name: str, width: int) -> onnx.ValueInfoProto:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
+
+    graph = helper.make_graph(
+        nodes, "head", [port("features", n_channels), port("dirs", 3)], [port(output, 3)], [w, v]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    return model.SerializeToString()
+
+
+def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+    right = np.cross([0, 0, 1.0], back)
+    right /= np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, :4] = np.stack([right, np.cross(back, right), back, np.array(eye)], axis=-1)
+    return c2w
+
+
+def cameras_bytes(n: int = 5) -> bytes:
+    frames = []
+    for i in range(n):
+        angle = 2 * math.pi * i / n
+        eye = (1 + 6 * math.cos(angle), 2 + 6 * math.sin(angle), 5.0)
+        frames.append({"file_path": f"./test/r_{i}", "transform_matrix": look_at(eye, (1, 2, 3)).tolist()})
+    return json.dumps({"w": 48, "h": 40, "camera_angle_x": 1.0, "frames": frames}).encode()
+
+
+def shells() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stored vertices in the order on disk, their density codes and features."""
+    axis = np.arange(RESOLUTION + 1)
+    vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = np.linalg.norm(vertices / RESOLUTION * 2 - 1, axis=-1)
+    inner, outer = np.abs(radius - 0.5) * RESOLUTION / 2, np.abs(radius - 0.99) * RESOLUTION / 2
+    near = np.minimum(inner, outer)
+    stored = near < 2.7
+    vertices, near = vertices[stored], near[stored]
+    _, _, order = pack_vertices(vertices)
+    vertices, near = vertices[order], near[order]
+    codes = encode_density(3.0 - 1.3 * near, DENSITY_RANGE)
+    features = np.concatenate([vertices * 3 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
+    return vertices, codes, features
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    vertices, codes, features = shells()
+    keys = [tuple(v) for v in vertices.tolist()]
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    by_key = dict(zip(keys, codes.tolist(), strict=True)), dict(zip(keys, features, strict=True))
+    return Scene(RESOLUTION, box, STEP, DENSITY_RANGE, *by_key)
+
+
+@pytest.fixture(scope="session")
+def shells_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The asset; do not change it, take `broken_folder` for that."""
+    folder = tmp_path_factory.mktemp("assets") / "shells"
+    vertices, codes, features = shells()
+    coords, masks, _ = pack_vertices(vertices)
+    manifest = Manifest(
+        generator="tests",
+        resolution=RESOLUTION,
+        step=STEP,
+        density_range=DENSITY_RANGE,
+        n_channels=4,
+        view_size=(48, 40),
+        world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
+        provenance={"psnr": 30.5},
+    )
+    arrays = GridArrays(coords, masks, codes, features)
+    write_asset(folder, manifest, arrays, head_bytes(), b"ply\n", cameras_bytes())
+    return folder
+
+
+@pytest.fixture(scope="session")
+def asset(shells_folder: Path) -> Asset:
+    return Asset.open(shells_folder, verify=True)
+
+
+@pytest.fixture
+def broken_folder(shells_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the asset, to be broken by the test."""
+    return Path(shutil.copytree(shells_folder, tmp_path / "broken"))

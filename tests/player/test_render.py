@@ -1,0 +1,180 @@
+"""Pictures: frames, backgrounds, threads, and the block bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from player import render as render_module
+from player.asset import Asset
+from player.bounds import BLOCK, block_bounds
+from player.cameras import Camera
+from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
+from player.head import CHUNK, Head, count_parameters
+from player.images import png_bytes
+from player.march import march
+from player.render import MAX_PIXELS, Renderer, render
+from player.transforms import read_cameras
+from tests.player.conftest import head_bytes, look_at
+from tests.player.oracle_march import Scene, march_ray
+
+
+@pytest.fixture
+def camera(asset: Asset) -> Camera:
+    return read_cameras(asset.path("cameras.json"))[1]
+
+
+def inside_camera() -> Camera:
+    return Camera("inside", look_at((1, 2, 3.2), (3, 2, 3)), 50, 37, 30.0, 30.0, 25.0, 18.5)
+
+
+@pytest.mark.parametrize("module", ["numpy", "numba"])
+def test_picture_is_the_naive_loop(module: str, asset: Asset, scene: Scene, camera: Camera) -> None:
+    """World camera, rotated and scaled model, head, background, depth: the whole chain for every 37th
+    pixel."""
+    frame = render(asset, camera, background=(0.25, 0.5, 1.0), march=module)
+    model = camera.transformed(np.linalg.inv(asset.world_from_model))
+    rays_o, rays_d = model.rays()
+    head = Head(asset.path("head.onnx"), 4)
+    for pixel in range(0, camera.width * camera.height, 37):
+        ray = march_ray(scene, rays_o[pixel], rays_d[pixel], 5)
+        at = divmod(pixel, camera.width)
+        expected = (1 - ray.opacity) * np.array([0.25, 0.5, 1.0])
+        if ray.opacity > 1 / 1024:
+            expected += ray.opacity * head(np.float32(ray.features[None]), rays_d[pixel][None])[0]
+        # rays are rounded once more than in `Camera.rays`: 1e-6 of a pixel beside a steep edge
+        np.testing.assert_allclose(frame.rgb[at], expected, rtol=0, atol=2e-4)
+        assert abs(frame.opacity[at] - ray.opacity) < 1e-4
+        assert abs(frame.depth[at] - 2 * ray.depth) < 1e-3
+
+
+def test_the_picture_shows_something(asset: Asset, camera: Camera) -> None:
+    frame = render(asset, camera)
+    assert 0.2 < (frame.opacity > 0.5).mean() < 0.8
+    assert frame.rgb.dtype == frame.opacity.dtype == frame.depth.dtype == np.float32
+    assert frame.rgb.shape == (40, 48, 3) and frame.opacity.shape == frame.n_samples.shape == (40, 48)
+
+
+@pytest.mark.parametrize("module", ["numpy", "numba"])
+def test_threads_and_tasks_do_not_change_a_bit(
+    module: str, asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = []
+    for n_threads, blocks in ((1, 1000), (2, 7), (3, 1)):
+        monkeypatch.setitem(render_module.TASK_BLOCKS, module, blocks)
+        with Renderer(asset, n_threads, module) as renderer:  # type: ignore[arg-type]
+            frames.append(renderer.render(camera.resized(101, 83)))
+    for frame in frames[1:]:
+        for name in ("rgb", "opacity", "depth", "n_samples"):
+            assert getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes(), name
+
+
+@pytest.mark.parametrize("view", ["outside", "inside", "beside"])
+def test_block_bounds_hold_every_sample(view: str, asset: Asset, camera: Camera) -> None:
+    beside = Camera("beside", look_at((1, 4.1, 3), (5, 4.3, 3.2)), 60, 50, 25.0, 25.0, 30.0, 25.0)
+    camera = {"outside": camera, "inside": inside_camera(), "beside": beside}[view]
+    model = camera.transformed(np.linalg.inv(asset.world_from_model))
+    near, far = block_bounds(asset.grid, model)
+    rays_o, rays_d = model.rays()
+    free = march(asset.grid, rays_o, rays_d, 0)
+    assert free.opacity.any()
+    rows, columns = np.divmod(np.arange(len(rays_o)), camera.width)
+    bounds = (near[rows // BLOCK, columns // BLOCK], far[rows // BLOCK, columns // BLOCK])
+    bounded = march(asset.grid, rays_o, rays_d, 0, bounds)
+    for a, b in zip(free, bounded, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_block_bounds_leave_empty_sky_away(asset: Asset, camera: Camera) -> None:
+    model = camera.resized(480, 400).transformed(np.linalg.inv(asset.world_from_model))
+    near, far = block_bounds(asset.grid, model)
+    assert 0.2 < (far >= near).mean() < 0.9
+    away = replace(model, c2w=model.c2w @ np.diag([-1.0, 1, -1, 1]))
+    near, far = block_bounds(asset.grid, away)
+    assert not (far >= near).any()
+
+
+def test_looking_away_is_background(asset: Asset, camera: Camera) -> None:
+    away = replace(camera, c2w=camera.c2w @ np.diag([-1.0, 1, -1, 1]))
+    frame = render(asset, away, background=(0.0, 1.0, 0.5))
+    assert (frame.to_uint8() == [0, 255, 128]).all() and not frame.opacity.any()
+
+
+def test_transparent_is_straight_and_composites_to_the_same(asset: Asset, camera: Camera) -> None:
+    over = render(asset, camera, background=(1.0, 0.0, 0.5))
+    straight = render(asset, camera, background="transparent")
+    a = straight.opacity[..., None]
+    composed = straight.rgb * a + (1 - a) * np.float32([1, 0, 0.5])
+    np.testing.assert_allclose(composed, over.rgb, rtol=0, atol=2e-3)  # what is not shaded has A < 1/1024
+    pixels = straight.to_uint8()
+    assert pixels.shape == (40, 48, 4)
+    assert (pixels[..., 3] == np.floor(straight.opacity * 255 + 0.5)).all()
+    assert not pixels[straight.opacity == 0].any()
+
+
+def test_default_background_and_k_are_the_assets_own(asset: Asset, camera: Camera) -> None:
+    a, b = render(asset, camera), render(asset, camera, n_samples=5, background=(1.0, 1.0, 1.0))
+    assert a.rgb.tobytes() == b.rgb.tobytes()
+    every = render(asset, camera, n_samples=0)
+    assert every.opacity.tobytes() == a.opacity.tobytes() and every.rgb.tobytes() != a.rgb.tobytes()
+
+
+def test_rounding_to_eight_bits() -> None:
+    values = np.float32([[[-1, 0, 0.5 / 255 - 1e-6]], [[0.5 / 255 + 1e-6, 1, 7]]])
+    zeros = np.zeros((2, 1), np.float32)
+    frame = render_module.Frame(values, zeros, zeros, zeros, (0.0, 0.0, 0.0))
+    assert frame.to_uint8().tolist() == [[[0, 0, 0]], [[1, 255, 255]]]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (17, 3)])
+def test_sizes_that_are_no_multiple_of_a_block(size: tuple[int, int], asset: Asset, camera: Camera) -> None:
+    frame = render(asset, camera.resized(*size))
+    assert frame.rgb.shape == (size[1], size[0], 3) and frame.opacity[size[1] // 2, size[0] // 2] > 0
+
+
+def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=rf"size: expected at most {MAX_PIXELS} pixels .* got 20000x20000"):
+        render(asset, camera.resized(20000, 20000))
+    with pytest.raises(ConfigError, match="samples: expected 0"):
+        render(asset, camera, n_samples=-1)
+    with pytest.raises(ConfigError, match="threads: expected at least 1, got 0"):
+        Renderer(asset, 0)
+    monkeypatch.setattr("player.march_compiled.numba", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[fast\]'"):
+        Renderer(asset, 1, "numba")
+    with Renderer(asset, 1) as renderer:
+        assert renderer.march == "numpy"
+
+
+def test_head_is_the_formula_in_any_number_of_pixels(asset: Asset) -> None:
+    head = Head(asset.path("head.onnx"), 4)
+    rng = np.random.default_rng(0)
+    w, v = rng.normal(0, 0.02, 12).reshape(4, 3), rng.normal(0, 0.5, 9).reshape(3, 3)
+    features = rng.uniform(-100, 100, (CHUNK * 2 + 1, 4)).astype(np.float32)
+    dirs = rng.normal(size=(len(features), 3)).astype(np.float32)
+    expected = 1 / (1 + np.exp(-(features @ w + dirs @ v)))
+    for n in (0, 1, CHUNK, len(features)):
+        np.testing.assert_allclose(head(features[:n], dirs[:n]), expected[:n], rtol=0, atol=1e-6)
+    assert count_parameters(head_bytes()) == 4 * 3 + 3 * 3
+
+
+def test_heads_that_do_not_fit(tmp_path: Path) -> None:
+    path = tmp_path / "head.onnx"
+    for data, message in (
+        (b"not onnx", "expected an ONNX graph"),
+        (b"", "expected an ONNX graph"),
+        (head_bytes(5), r"features: expected float \[n, 4\], got tensor\(float\) \['n', 5\]"),
+        (head_bytes(4, "colour"), r"outputs: expected \['rgb'\], got \['colour'\]"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(FormatError, match=message) as caught:
+            Head(path, 4)
+        assert "\n" not in str(caught.value)
+
+
+def test_png_wants_bytes() -> None:
+    with pytest.raises(ShapeError, match="pixels: expected"):
+        png_bytes(np.zeros((2, 2, 3), np.float32))
