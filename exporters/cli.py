@@ -21,8 +21,8 @@ Write the mesh of a baked asset as one file for another program.
 The suffix of FILE picks the format:
   {formats}
 
-Positions are in the units and axes of the world that the cameras of the data set are in: the frame that the
-model was trained in is undone. Nothing is half written: FILE appears when it is complete and checked.
+Positions are in the units and axes of the world that the cameras of the data set are in, like the asset's
+own mesh.ply. Nothing is half written: FILE appears when it is complete and checked.
 """
 
 _EPILOG = """\
@@ -79,19 +79,14 @@ def export_mesh(asset_path: Path, target: Path, force: bool = False) -> dict:
     from player.files import check_target, write_bytes
 
     check_target(target, force)
-    import numpy as np
-
     from exporters.glb import glb_bytes
     from exporters.obj import obj_bytes
     from exporters.parity import check_mesh_bytes
     from exporters.ply import ply_bytes, read_ply
     from player.asset import Asset
 
-    asset = Asset.open(asset_path, verify=True)
-    # The asset keeps its mesh in the model's frame: the one place where the world's is restored.
-    mesh = read_ply(asset.path("mesh.ply")).transformed(
-        np.asarray(asset.manifest.world_from_model, np.float64)
-    )
+    # In the world's frame already: whoever opens mesh.ply itself sees the right place and size too.
+    mesh = read_ply(Asset.open(asset_path, verify=True).path("mesh.ply"))
     data = {".ply": ply_bytes, ".obj": obj_bytes, ".glb": glb_bytes}[suffix](mesh)
     check_mesh_bytes(suffix, data, mesh, str(target))
     write_bytes(target, data)

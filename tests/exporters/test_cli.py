@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,37 +13,56 @@ import pytest
 from exporters import cli
 from exporters.glb import parse_glb
 from exporters.ply import ply_bytes, read_ply
-from player.asset import Asset
+from player.asset import GridArrays, write_asset
+from player.bricks import pack_vertices
+from player.cameras import Camera
+from player.manifest import Manifest
+from player.transforms import write_cameras
 from tests.exporters.meshes import tetrahedron
 
-# The model's frame is the world's halved, turned a quarter about z, and moved.
-WORLD_FROM_MODEL = np.array([[0.0, -2, 0, 10], [2, 0, 0, 20], [0, 0, 2, 30], [0, 0, 0, 1]])
+# The asset's mesh is in the world already; an exporter that applies this again is far off.
+WORLD_FROM_MODEL = (
+    (0.0, -2.0, 0.0, 10.0),
+    (2.0, 0.0, 0.0, 20.0),
+    (0.0, 0.0, 2.0, 30.0),
+    (0.0, 0.0, 0.0, 1.0),
+)
+
+
+def write_small_asset(folder: Path, mesh: bytes) -> Path:
+    """One stored cell, a head that nobody opens, and `mesh`: all that `vfr-export` looks at."""
+    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    coords, masks, _ = pack_vertices(corners)
+    arrays = GridArrays(coords, masks, np.full(8, 200, np.uint8), np.zeros((8, 4), np.int8))
+    manifest = Manifest(
+        generator="tests",
+        resolution=8,
+        step=0.25,
+        density_range=(-2.0, 6.0),
+        n_channels=4,
+        view_size=(2, 2),
+        world_from_model=WORLD_FROM_MODEL,
+    )
+    camera = Camera("a", np.eye(4), 2, 2, 1.0, 1.0, 1.0, 1.0)
+    write_asset(folder, manifest, arrays, b"head", mesh, write_cameras([camera]))
+    return folder
 
 
 @pytest.fixture
-def asset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The mesh of an asset and its manifest's matrix; the format itself is tested where it is defined."""
-    folder = tmp_path / "asset"
-    folder.mkdir()
-    (folder / "mesh.ply").write_bytes(ply_bytes(tetrahedron()))
-    opened = SimpleNamespace(
-        path=lambda name: folder / name, manifest=SimpleNamespace(world_from_model=WORLD_FROM_MODEL.tolist())
-    )
-    monkeypatch.setattr(Asset, "open", lambda path, verify: opened)
-    return folder
+def asset(tmp_path: Path) -> Path:
+    return write_small_asset(tmp_path / "asset", ply_bytes(tetrahedron()))
 
 
 def test_writes_world_coordinates(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "mesh.ply"
     assert cli.main([str(asset), str(target)]) == 0
     mesh = read_ply(target)
-    np.testing.assert_allclose(
-        mesh.vertices, [[10, 20, 30], [10, 22, 30], [6, 20, 30], [10, 20, 36]], atol=1e-6
-    )
+    assert np.array_equal(mesh.vertices, tetrahedron().vertices)
+    assert target.read_bytes() == (asset / "mesh.ply").read_bytes()
     assert np.array_equal(mesh.colours, tetrahedron().colours)
     output = capsys.readouterr()
     assert output.out.startswith(f"{target}: 4 vertices, 4 faces, ") and output.err == ""
-    assert "bounds (6, 20, 30) to (10, 22, 36)" in output.out
+    assert "bounds (0, 0, 0) to (1, 2, 3)" in output.out
 
 
 def test_glb_is_y_up_and_json_is_one_line(
@@ -56,11 +74,9 @@ def test_glb_is_y_up_and_json_is_one_line(
     assert summary["file"] == str(target) and summary["format"] == "glb" and summary["faces"] == 4
     assert summary["bytes"] == target.stat().st_size
     document, _ = parse_glb(target.read_bytes(), "MESH.GLB")
-    assert document["accessors"][0]["min"] == [6, 30, -22] and document["accessors"][0]["max"] == [
-        10,
-        36,
-        -20,
-    ]
+    positions = document["accessors"][0]
+    assert positions["min"] == [0, 0, -2] and positions["max"] == [1, 3, 0]
+    assert summary["bounds"] == [[0, 0, 0], [1, 2, 3]]
 
 
 def test_existing_target(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,13 +97,21 @@ def test_unknown_suffix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "got none" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("damage", ["cut short", "changed", "no mesh"])
 def test_damaged_mesh_leaves_nothing_behind(
-    asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (asset / "mesh.ply").write_bytes(ply_bytes(tetrahedron())[:-1])
+    """Whether the file no longer is what was baked, or what was baked is no mesh."""
+    data = ply_bytes(tetrahedron())
+    asset = write_small_asset(tmp_path / "asset", data[:-1] if damage == "no mesh" else data)
+    if damage == "cut short":
+        (asset / "mesh.ply").write_bytes(data[:-1])
+    elif damage == "changed":
+        (asset / "mesh.ply").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     assert cli.main([str(asset), str(tmp_path / "mesh.glb")]) == 1
     error = capsys.readouterr().err
-    assert "mesh.ply: size: expected" in error and error.count("\n") == 1
+    assert ("mesh.ply: sha256: expected" if damage == "changed" else "mesh.ply: size: expected") in error
+    assert error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["asset"]
 
 
