@@ -13,7 +13,8 @@ from player.errors import OutputError
 
 
 def check_target(path: Path, force: bool = False) -> None:
-    """Refuse a target that exists, unless `force`; called before long work, so that nobody waits for a refusal.
+    """Refuse a target that exists, unless `force`; called before long work, so that nobody waits for a
+    refusal.
 
     >>> check_target(Path("surely/not/there.png"))
     """
@@ -22,7 +23,10 @@ def check_target(path: Path, force: bool = False) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` beside `path` and rename it into place. Raises OutputError (full disk, read-only folder, ...)."""
+    """Write `data` beside `path` and rename it into place.
+
+    Raises OutputError: full disk, read-only folder, ...
+    """
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,7 +36,7 @@ def write_bytes(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         Path(temporary).chmod(0o666 & ~_umask())
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
@@ -42,9 +46,11 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
-    """A temporary folder beside `path` that becomes `path` when the block ends well, and vanishes when it does not.
+    """A temporary folder beside `path` that becomes `path` when the block ends well, and vanishes when it
+    does not.
 
-    With `force` a folder that exists is replaced, in two renames: the old one is gone only when the new one is complete.
+    With `force` a folder that exists is replaced, in two renames: the old one is gone only when the new one
+    is complete. Raises OutputError: `path` exists, full disk, read-only folder, ...
     """
     check_target(path, force)
     temporary = None
@@ -65,17 +71,26 @@ def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
 
 def _replace_folder(new: Path, path: Path) -> None:
     if not path.exists():
-        os.replace(new, path)
+        new.replace(path)
         return
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-    os.replace(path, old / path.name)
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+    old = aside / path.name
     try:
-        os.replace(new, path)
-    except OSError:
-        os.replace(old / path.name, path)
-        raise
+        path.replace(old)
+        new.replace(path)
     finally:
-        shutil.rmtree(old, ignore_errors=True)
+        if not path.exists():
+            _restore(old, path)
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _restore(old: Path, path: Path) -> None:
+    try:
+        old.replace(path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot put the old one back: {error.strerror or error}: it is in {old}"
+        ) from error
 
 
 def _umask() -> int:
