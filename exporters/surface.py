@@ -33,7 +33,7 @@ def extract_surface(
     aabb: np.ndarray,
     resolution: int,
     level: float | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface where the density equals `level`, inside a box; where it leaves the box the mesh is open.
 
@@ -120,7 +120,7 @@ def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[Tr
 
 
 def _sample_grid(
-    sample_density: Density, axes: list[np.ndarray], level: float, progress: Callable[[float], None] | None
+    sample_density: Density, axes: list[np.ndarray], level: float, progress: Callable[[float], object] | None
 ) -> tuple[np.ndarray, float, float]:
     """log(sigma / level), clipped, [nx, ny, nz] float32, and the range of sigma."""
     nx, ny, nz = map(len, axes)

@@ -56,3 +56,42 @@ def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.nd
         z = gelu(z @ weight.astype(np.float64) + bias)
     weight, bias = weights.output
     return special.expit(z @ weight.astype(np.float64) + bias)
+
+
+def hash_grid_feature(
+    point: np.ndarray, table: np.ndarray, resolutions: list[int], offsets: np.ndarray, size: int
+) -> np.ndarray:
+    """Features of one point [3] of the unit cube, level by level and corner by corner (Mueller et al. 2022,
+    eq. 4).
+
+    `table` [n_entries, 2] float64; a level of more than `size` vertices is hashed into `size` entries.
+    """
+    out = []
+    for resolution, offset in zip(resolutions, offsets, strict=False):
+        position = [float(x) * resolution for x in point]
+        cell = [min(int(p), resolution - 1) for p in position]
+        total = np.zeros(2)
+        for corner in np.ndindex(2, 2, 2):
+            weight = 1.0
+            for axis in range(3):
+                inside = position[axis] - cell[axis]
+                weight *= inside if corner[axis] else 1 - inside
+            x, y, z = (cell[axis] + corner[axis] for axis in range(3))
+            side = resolution + 1
+            if side**3 > size:
+                row = (x ^ (y * 2654435761 % 2**32) ^ (z * 805459861 % 2**32)) % size
+            else:
+                row = (z * side + y) * side + x
+            total += weight * table[offset + row]
+        out.append(total)
+    return np.concatenate(out)
+
+
+def composite_ray(sigmas: np.ndarray, features: np.ndarray, step: float) -> tuple[np.ndarray, float]:
+    """Equation 3 of the paper for one ray in float64: (sum w_i F_i, 1 - exp(-tau))."""
+    tau, total = 0.0, np.zeros(features.shape[1])
+    for sigma, feature in zip(sigmas.astype(np.float64), features.astype(np.float64), strict=True):
+        delta = sigma * step
+        total += np.exp(-tau) * -np.expm1(-delta) * feature
+        tau += delta
+    return total, -np.expm1(-tau)

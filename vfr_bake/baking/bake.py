@@ -59,8 +59,7 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     resolution = config.resolution or model.field.config.max_resolution
     visible = visible_cells(model, resolution, config.weight_floor, _stage(report, "visibility"))
     rendered = _rendered_features(model)
-    first_layer = model.field.head.spatial[0].weight.detach().numpy()
-    projection = project(first_layer, rendered, config.n_channels)
+    projection = project(model.field.head.first_weights(), rendered, config.n_channels)
     arrays, scales, density_range = _grid_arrays(model, visible, projection, _stage(report, "grid"))
     head = head_onnx(fold_head(model.field.head, projection.first * scales))
     mesh, n_floaters = bake_mesh(model, visible, config.mesh_resolution or resolution, _stage(report, "mesh"))

@@ -35,7 +35,7 @@ def bake_mesh(
         density, aabb, resolution, progress=lambda share: progress(round(share * 100), 100)
     )
     mesh = TriangleMesh(vertices, faces, normals, np.zeros((len(vertices), 4), np.uint8))
-    mesh = take_faces(mesh, _seen(vertices, visible)[faces].any(axis=1))
+    mesh = take_faces(mesh, np.any(_seen(vertices, visible)[faces], axis=1))
     mesh, n_removed = remove_small_components(mesh, FLOATER_FRACTION)
     colours = _colours(model, mesh, 2 / resolution)
     coloured = TriangleMesh(mesh.vertices, mesh.faces, mesh.normals, colours)

@@ -108,5 +108,9 @@ class _Encode(torch.autograd.Function):
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
         gradient = grads[0].contiguous().numpy()
-        kernels.scatter(points.numpy(), gradient, *ctx.grid.layout, get_num_threads(), grad_table.numpy())
+        scales, offsets, hashed, mask = ctx.grid.layout
+        n_threads = get_num_threads()
+        kernels.scatter(
+            points.numpy(), gradient, scales, offsets, hashed, mask, n_threads, grad_table.numpy()
+        )
         return None, None if in_place else grad_table, None, None

@@ -8,6 +8,7 @@ layer.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
@@ -47,3 +48,7 @@ class Head(nn.Module):
         for layer in self.directional:
             h = gelu(layer(h))
         return torch.sigmoid(self.out(h))
+
+    def first_weights(self) -> np.ndarray:
+        """[width, n_channels] of the first layer, which is linear in the composited feature."""
+        return self.spatial[0].weight.detach().numpy()  # type: ignore[operator]

@@ -32,8 +32,9 @@ def composite_reference(
     out, opacity = [], []
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         delta = sigmas[start : start + count] * step
-        tau = torch.cumsum(delta, dim=0)
-        weights = torch.exp(-(tau - delta)) * -torch.expm1(-delta)
+        # The optical depth in front of each sample; a difference of sums would cancel behind a dense one.
+        before = torch.cumsum(torch.cat([delta.new_zeros(1), delta]), dim=0)[:-1]
+        weights = torch.exp(-before) * -torch.expm1(-delta)
         out.append((weights[:, None] * features[start : start + count]).sum(dim=0))
         opacity.append(-torch.expm1(-delta.sum()))
     return torch.stack(out), torch.stack(opacity)
@@ -47,8 +48,9 @@ class _Composite(torch.autograd.Function):
         out = torch.empty(len(starts), features.shape[1], dtype=features.dtype)
         opacity = torch.empty(len(starts), dtype=features.dtype)
         kernels.composite(
-            *_numpy(sigmas, features, starts, counts), kind(step), *_numpy(weights, taus, out, opacity)
-        )
+            _array(sigmas), _array(features), starts.numpy(), counts.numpy(), kind(step),
+            weights.numpy(), taus.numpy(), out.numpy(), opacity.numpy(),
+        )  # fmt: skip
         ctx.save_for_backward(features, starts, counts, weights, taus)
         ctx.step = kind(step)
         return out, opacity
@@ -56,15 +58,14 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads):
         features, starts, counts, weights, taus = ctx.saved_tensors
-        grad_out, grad_opacity = (g.contiguous() for g in grads)
         # Rows that belong to no ray (there are none in a march) would keep this zero.
         grad_sigmas, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
         kernels.composite_backward(
-            *_numpy(features, starts, counts), ctx.step,
-            *_numpy(weights, taus, grad_out, grad_opacity, grad_sigmas, grad_features),
+            _array(features), starts.numpy(), counts.numpy(), ctx.step, weights.numpy(), taus.numpy(),
+            _array(grads[0]), _array(grads[1]), grad_sigmas.numpy(), grad_features.numpy(),
         )  # fmt: skip
         return grad_sigmas, grad_features, None, None, None
 
 
-def _numpy(*tensors: Tensor) -> list[np.ndarray]:
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()

@@ -90,9 +90,11 @@ def march_reference(
     n = len(occupied)
     found = []
     for o, d, offset in zip(rays_o, rays_d, jitter, strict=True):
-        slabs = torch.stack([(-1 - o) / d, (1 - o) / d])
-        parallel = torch.where(o.abs() <= 1, torch.inf, -torch.inf) * torch.tensor([[-1.0], [1.0]])
-        slabs = torch.where(d == 0, parallel, slabs)
+        crosses = d != 0
+        if bool((o[~crosses].abs() > 1).any()):
+            found.append(torch.zeros(0))  # parallel to a face that it lies outside of
+            continue
+        slabs = torch.stack([(-1 - o[crosses]) / d[crosses], (1 - o[crosses]) / d[crosses]])
         t_near = slabs.min(dim=0).values.max().clamp(min=0)
         t_far = slabs.max(dim=0).values.min()
         t = t_near + (torch.arange(int(2 * 3**0.5 / step) + 2) + offset) * step
@@ -102,6 +104,6 @@ def march_reference(
         t, u = t[occupied[tuple(cells.T)]], u[occupied[tuple(cells.T)]]
         with torch.no_grad():
             sigmas = field.density(field.grid.reference(u))
-        before = torch.cumsum(sigmas * step, dim=0) - sigmas * step
+        before = torch.cumsum(torch.cat([sigmas.new_zeros(1), sigmas * step]), dim=0)[:-1]
         found.append(t[before <= OPAQUE_DEPTH])
     return found

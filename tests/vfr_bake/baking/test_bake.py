@@ -1,0 +1,144 @@
+"""The bake piece by piece, and whole on a small trained scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from exporters.onnx_head import head_onnx
+from exporters.ply import read_ply
+from player.asset import Asset
+from player.errors import OutputError, TrainingError
+from player.render import render
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.projection import code_scales, encode_features, project
+from vfr_bake.baking.visibility import corner_vertices, visible_cells
+from vfr_bake.config import BakeConfig, FieldConfig, TrainConfig
+from vfr_bake.data import demo
+from vfr_bake.field.head import Head
+from vfr_bake.rendering.render import render_image
+from vfr_bake.training.metrics import psnr
+from vfr_bake.training.model_file import Model
+from vfr_bake.training.trainer import Trainer
+
+
+def quiet(stage: str, done: int, of: int) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    scene = demo.demo_scene(size=64, n_train=24, n_test=2)
+    field = FieldConfig(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
+    config = TrainConfig(field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48)
+    trainer = Trainer(scene, config)
+    for _ in trainer.run():
+        pass
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
+    return Model(trainer.field, trainer.occupancy, scene.world_from_model, cameras, True, {}, {})
+
+
+def test_projection_is_the_best_of_its_rank() -> None:
+    random = np.random.default_rng(0)
+    first = random.normal(size=(20, 8))
+    rendered = random.normal(size=(500, 8)) * np.array([9, 5, 3, 2, 1, 0.5, 0.1, 0.01])
+    exact = rendered @ first.T
+
+    def loss(projection_matrix: np.ndarray, unprojected: np.ndarray) -> float:
+        return float(np.mean((rendered @ projection_matrix.T @ unprojected.T - exact) ** 2))
+
+    ours = project(first, rendered, 3)
+    best = loss(ours.matrix, ours.first)
+    singular = np.linalg.svd(exact, compute_uv=False)
+    assert best == pytest.approx(float((singular[3:] ** 2).sum() / exact.size), rel=1e-9), "Eckart-Young"
+    assert ours.kept == pytest.approx(1 - best * exact.size / (exact**2).sum(), rel=1e-9)
+    whole = project(first, rendered, 8)
+    np.testing.assert_allclose(whole.first @ whole.matrix, first, atol=1e-10)
+
+
+def test_feature_codes_are_within_half_a_step() -> None:
+    values = np.random.default_rng(0).normal(size=(1000, 3)) * np.array([1e-30, 1.0, 1e30])
+    values[:, 1] = 0
+    scales = code_scales(values)
+    codes = encode_features(values, scales)
+    assert codes.dtype == np.int8 and np.abs(codes.astype(int)).max() == 127
+    assert (np.abs(codes * scales - values) <= scales * 0.5000001).all()
+
+
+def test_every_corner_of_a_visible_cell_is_stored() -> None:
+    cells = np.random.default_rng(0).random((5, 5, 5)) < 0.1
+    expected = {tuple(cell + corner) for cell in np.argwhere(cells) for corner in np.ndindex(2, 2, 2)}
+    assert {tuple(v) for v in corner_vertices(cells)} == expected
+
+
+def test_folded_head_equals_the_head() -> None:
+    torch.manual_seed(0)
+    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
+    scales = np.linspace(0.5, 2, 12)
+    first = head.spatial[0].weight.detach().double().numpy() * scales
+    session = onnxruntime.InferenceSession(head_onnx(fold_head(head, first)))
+    features = torch.randn(50, 12)
+    dirs = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
+    with torch.no_grad():
+        expected = head(features, dirs).numpy()
+    codes = (features.numpy() / scales).astype(np.float32)
+    (rgb,) = session.run(None, {"features": codes, "dirs": dirs.numpy()})
+    np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6)
+
+
+def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
+    settings = BakeConfig(mesh_resolution=64, n_channels=16, check_views=2)
+    result = bake(model, tmp_path / "asset", settings, quiet)
+    asset = Asset.open(tmp_path / "asset", verify=True)
+    assert asset.manifest.n_channels == 16 and result.n_vertices == len(asset.arrays.density)
+    camera, in_model = model.cameras[5], model.model_cameras()[5]
+    full = render_image(model.field, model.occupancy, in_model, model.background)
+    every = psnr(render(asset, camera, n_samples=0).rgb, full)
+    five = psnr(render(asset, camera, n_samples=5).rgb, full)
+    one = psnr(render(asset, camera, n_samples=1).rgb, full)
+    assert every > 35 and five > 32, "the grid, the codes and the choice of samples lose little"
+    assert one < five <= every + 0.5
+    assert result.figures["psnr_to_full_model"] > 32
+
+
+def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:
+    bake(model, tmp_path / "asset", BakeConfig(mesh_resolution=96, check_views=1), quiet)
+    mesh = read_ply(tmp_path / "asset" / "mesh.ply")
+    distance = np.abs(demo.signed_distance(mesh.vertices))
+    voxel = 2 / 96 * model.world_from_model[0, 0]
+    assert np.median(distance) < voxel
+    low, high = demo.AABB
+    assert (mesh.vertices.min(axis=0) > low - 3 * voxel).all()
+    assert (mesh.vertices.max(axis=0) < high + 3 * voxel).all()
+    colours = mesh.colours[:, :3].astype(int)
+    assert colours.std(axis=0).min() > 10, "a colourful scene has colourful vertices"
+
+
+def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
+    empty = Trainer(
+        demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(field=model.field.config, steps=1)
+    )
+    with torch.no_grad():
+        empty.field.density.out.bias.fill_(-30)
+    hollow = Model(empty.field, empty.occupancy, np.eye(4), model.cameras, True, {}, {})
+    with pytest.raises(TrainingError, match="empty or a thin fog"):
+        bake(hollow, tmp_path / "asset", BakeConfig(), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
+    (tmp_path / "asset").mkdir()
+    with pytest.raises(OutputError, match="--force"):
+        bake(model, tmp_path / "asset", BakeConfig(), quiet)
+
+
+def test_a_low_floor_stores_more(model: Model) -> None:
+    def count(floor: float) -> int:
+        return int(visible_cells(model, 64, floor, lambda done, of: None).sum())
+
+    assert count(0.001) > count(0.01) > count(0.2) > 0

@@ -1,0 +1,80 @@
+"""Compositing against a float64 loop, its torch twin and finite differences, on hard inputs too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reference import composite_ray
+from vfr_bake.rendering.compositing import composite, composite_reference
+
+STEP = 0.25
+RAYS = {
+    "nothing": [],
+    "no density": [0.0, 0.0],
+    "one sample": [3.0],
+    "subnormal": [1e-42, 1e-40, 1e-38],
+    "thin": [1e-8] * 200,
+    "opaque first": [1e6, 1.0, 1.0],
+    "opaque last": [0.1, 0.2, 1e8],
+    "ordinary": [0.5, 2.0, 8.0, 1.0, 0.0, 30.0],
+}
+
+
+def packed(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+    torch.manual_seed(0)
+    sigmas = torch.tensor([s for ray in RAYS.values() for s in ray], dtype=dtype)
+    counts = torch.tensor([len(ray) for ray in RAYS.values()])
+    starts = torch.cumsum(counts, 0) - counts
+    return sigmas, torch.randn(len(sigmas), 5, dtype=dtype), starts, counts
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 3e-6)])
+def test_kernel_and_twin_match_the_equation(dtype: torch.dtype, tolerance: float) -> None:
+    sigmas, features, starts, counts = packed(dtype)
+    for function in (composite, composite_reference):
+        out, opacity = function(sigmas, features, starts, counts, STEP)
+        for ray, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
+            rows = slice(start, start + count)
+            expected, alpha = composite_ray(sigmas[rows].numpy(), features[rows].numpy(), STEP)
+            np.testing.assert_allclose(out[ray].numpy(), expected, rtol=0, atol=tolerance)
+            assert opacity[ray].item() == pytest.approx(alpha, abs=tolerance, rel=1e-5)
+
+
+def test_thin_samples_are_not_lost() -> None:
+    # A product of (1 - alpha) in float32 would find no opacity at all here.
+    n = 10_000
+    sigmas, features = torch.full((n,), 1e-9), torch.ones(n, 1)
+    _, opacity = composite(sigmas, features, torch.tensor([0]), torch.tensor([n]), 1.0)
+    assert opacity.item() == pytest.approx(1e-5, rel=1e-3)
+
+
+def test_weights_sum_to_the_opacity() -> None:
+    sigmas, _, starts, counts = packed(torch.float64)
+    out, opacity = composite(sigmas, torch.ones(len(sigmas), 1, dtype=torch.float64), starts, counts, STEP)
+    torch.testing.assert_close(out[:, 0], opacity, rtol=1e-12, atol=0)
+
+
+def test_gradients_match_finite_differences() -> None:
+    torch.manual_seed(3)
+    sigmas = (torch.rand(9, dtype=torch.float64) * 4).requires_grad_()
+    features = torch.randn(9, 3, dtype=torch.float64, requires_grad=True)
+    starts, counts = torch.tensor([0, 4, 4]), torch.tensor([4, 0, 5])
+    assert torch.autograd.gradcheck(composite, (sigmas, features, starts, counts, STEP))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradients_match_autograd_on_hard_inputs(dtype: torch.dtype) -> None:
+    sigmas, features, starts, counts = packed(dtype)
+    gradients = []
+    for function in (composite, composite_reference):
+        s, f = sigmas.clone().requires_grad_(), features.clone().requires_grad_()
+        out, opacity = function(s, f, starts, counts, STEP)
+        torch.manual_seed(5)
+        (out * torch.randn_like(out)).sum().add((opacity * torch.randn_like(opacity)).sum()).backward()
+        gradients.append((s.grad, f.grad))
+    tolerance = 1e-12 if dtype == torch.float64 else 3e-5
+    for ours, twin in zip(*gradients, strict=True):
+        assert torch.isfinite(ours).all()
+        torch.testing.assert_close(ours, twin, rtol=1e-4, atol=tolerance)

@@ -1,0 +1,110 @@
+"""`model.pt`: what goes in comes out, and nothing but a model gets in."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from player.cameras import Camera
+from player.errors import FormatError, VersionError
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.field import VfrField
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.training.model_file import Model, load_model, save_model
+
+CONFIG = FieldConfig(n_levels=2, base_resolution=4, max_resolution=8, log2_table_size=10, head_width=8)
+
+
+@pytest.fixture
+def model() -> Model:
+    torch.manual_seed(0)
+    occupancy = OccupancyGrid(16, step=0.01, seed=0)
+    occupancy.restore(np.random.default_rng(0).random((16, 16, 16)) < 0.5)
+    world = np.diag([2.0, 2, 2, 1])
+    world[:3, 3] = 1, 2, 3
+    camera = Camera("./train/r_0", np.eye(4), 8, 6, 9.0, 9.0, 4.0, 3.0)
+    return Model(VfrField(CONFIG), occupancy, world, [camera], True, {"steps": 3}, {"test_psnr": 30.0})
+
+
+@pytest.fixture
+def saved(model: Model, tmp_path: Path) -> Path:
+    save_model(tmp_path / "model.pt", model)
+    return tmp_path / "model.pt"
+
+
+def change(path: Path, **values: object) -> None:
+    torch.save(torch.load(path, weights_only=True) | values, path)
+
+
+def test_round_trip(model: Model, saved: Path) -> None:
+    again = load_model(saved)
+    for name, tensor in model.field.state_dict().items():
+        assert torch.equal(tensor, again.field.state_dict()[name])
+    assert np.array_equal(model.occupancy.occupied, again.occupancy.occupied)
+    assert np.array_equal(model.world_from_model, again.world_from_model)
+    assert [c.name for c in again.cameras] == ["./train/r_0"] and again.cameras[0].fx == 9
+    assert (again.train, again.figures, again.occupancy.step) == ({"steps": 3}, {"test_psnr": 30.0}, 0.01)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model", pickle.dumps({"format": "vfr-model"})])
+def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "model.pt").write_bytes(content)
+    with pytest.raises(FormatError, match=r"model\.pt: not a model file") as caught:
+        load_model(tmp_path / "model.pt")
+    assert "\n" not in str(caught.value)
+
+
+def test_loading_runs_no_code(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple:
+            return (Path.touch, (tmp_path / "touched",))
+
+    torch.save({"format": "vfr-model", "state": Evil()}, tmp_path / "model.pt")
+    with pytest.raises(FormatError):
+        load_model(tmp_path / "model.pt")
+    assert not (tmp_path / "touched").exists()
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no such file: expected a model written by vfr-train"):
+        load_model(tmp_path / "none.pt")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_cut_short(saved: Path, share: float) -> None:
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(FormatError, match="cut short"):
+        load_model(saved)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"version": [2, 0]}, "expected 1.x, got 2.0"),
+        ({"version": "1"}, "version: expected two integers"),
+        ({"step": float("nan")}, "step: expected a number"),
+        ({"field": {"n_levels": 2}}, "expected the settings"),
+        ({"occupied": torch.zeros(3, dtype=torch.uint8)}, "occupied: expected 4096 bits"),
+        ({"occupancy_resolution": 10**6}, "occupancy_resolution: expected 8 to 512"),
+        ({"world_from_model": torch.zeros(3, 3)}, "world_from_model: expected 4 x 4"),
+        ({"cameras": "{}"}, "cameras: frames"),
+        ({"state": {}}, "the tensors do not fit"),
+    ],
+)
+def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:
+    change(saved, **values)
+    with pytest.raises(VersionError if "1.x" in message else FormatError, match=message):
+        load_model(saved)
+
+
+def test_nan_in_the_weights_is_named(saved: Path) -> None:
+    state = torch.load(saved, weights_only=True)["state"]
+    state["grid.table"][5] = float("nan")
+    change(saved, state=state)
+    with pytest.raises(FormatError, match=r"grid\.table: expected finite numbers"):
+        load_model(saved)

@@ -1,0 +1,121 @@
+"""`make demo`: from pictures to playback on the built-in scene, with what it measured at the end.
+
+python -m vfr_bake.demo --output demo
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from player.errors import VfrError
+from player.files import check_target
+
+TRAIN_MINUTES = 2.0
+"""Leaves room for compiling, baking and playing within five minutes on two cores."""
+N_SHOWN = 4
+"""Test views in the side-by-side picture."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train, bake and play the demo scene into a folder; the last lines on stdout say where and how good."""
+    parser = argparse.ArgumentParser("python -m vfr_bake.demo", description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path("demo"), help="folder to write (default: demo)")
+    parser.add_argument(
+        "--minutes", type=float, default=TRAIN_MINUTES, help="training time (default: %(default)s)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace what an earlier demo wrote")
+    options = parser.parse_args(argv)
+    try:
+        return _demo(options.output, options.minutes, options.force)
+    except VfrError as error:
+        print(f"demo: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def _demo(output: Path, minutes: float, force: bool) -> int:
+    from exporters.cli import main as export
+    from player.cli import main as play
+    from player.transforms import write_cameras
+    from vfr_bake.cli import bake_main, train_main
+    from vfr_bake.data import load_scene
+
+    check_target(output / "model.pt", force)
+    begin = time.monotonic()
+    scene = load_scene("demo")
+    output.mkdir(parents=True, exist_ok=True)
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]
+    (output / "cameras_test.json").write_bytes(write_cameras(cameras))
+    forced = ["--force"] if force else []
+
+    def run(name: str, command: Callable[[list[str]], int], *arguments: str) -> float:
+        print(f"\n== {name} ==  {' '.join(arguments)}", file=sys.stderr)
+        start = time.monotonic()
+        code = command([*arguments, *forced])
+        if code:
+            sys.exit(code)
+        return time.monotonic() - start
+
+    model, asset, frames = (str(output / name) for name in ("model.pt", "asset", "frames"))
+    seconds = {
+        "train": run("vfr-train", train_main, "demo", model, "--minutes", str(minutes),
+                     "--json", f"{output}/train.json"),
+        "bake": run("vfr-bake", bake_main, model, asset, "--json", f"{output}/bake.json"),
+        "play": run("vfr-play", play, asset, "--cameras", f"{output}/cameras_test.json", "--output", frames,
+                    "--json", f"{output}/play.json"),
+        "export": run("vfr-export", export, asset, f"{output}/mesh.glb"),
+    }  # fmt: skip
+    figures = {name: json.loads((output / f"{name}.json").read_text()) for name in ("train", "bake", "play")}
+    picture, played = _side_by_side(scene, Path(frames), output / "side_by_side.png")
+    _summary(output, picture, seconds, figures, played, time.monotonic() - begin)
+    return 0
+
+
+def _side_by_side(scene: Any, frames: Path, target: Path) -> tuple[Path, float]:
+    """Photographs above, played frames below; and the mean PSNR of all played test frames."""
+    import numpy as np
+    from PIL import Image
+
+    from player.transforms import frame_names
+    from vfr_bake.training.metrics import over_background, psnr, to_8_bit
+
+    names = frame_names(scene.test.cameras)
+    photographs = [to_8_bit(over_background(image, np.ones(3))) for image in scene.test.images]
+    played = [np.asarray(Image.open(frames / f"{name}.png").convert("RGB")) for name in names]
+    mean = float(np.mean([psnr(a / 255, b / 255) for a, b in zip(photographs, played, strict=True)]))
+    chosen = np.linspace(0, len(names) - 1, N_SHOWN).round().astype(int)
+    rows = [np.concatenate([pictures[i] for i in chosen], axis=1) for pictures in (photographs, played)]
+    Image.fromarray(np.concatenate(rows)).save(target)
+    return target, mean
+
+
+def _summary(
+    output: Path,
+    picture: Path,
+    seconds: dict[str, float],
+    figures: dict[str, Any],
+    played: float,
+    total: float,
+) -> None:
+    train, bake, play = figures["train"], figures["bake"], figures["play"]
+    full = f", full model {train['test_psnr']:.2f} dB" if "test_psnr" in train else ""
+    print(
+        f"\npictures   {output / 'frames'} ({play['frames']} frames), {picture} (photographs above, played below)\n"
+        f"asset      {output / 'asset'}: {bake['megabytes']:.1f} MB;  mesh {output / 'mesh.glb'}\n"
+        f"quality    {played:.2f} dB played against the test pictures{full}\n"
+        f"speed      {1000 / play['ms_median']:.1f} frames/s at {play['width']}x{play['height']}, "
+        f"{play['threads']} threads, {play['march']} march\n"
+        f"time       {total:.0f} s: train {seconds['train']:.0f}, bake {seconds['bake']:.0f}, "
+        f"play {seconds['play']:.0f}, export {seconds['export']:.0f}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
