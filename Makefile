@@ -20,7 +20,7 @@ help:  ## say what there is
 	@echo "  settings:               PYTHON=$(PYTHON) VENV=$(VENV) TORCH_INDEX=$(TORCH_INDEX)"
 
 demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures and figures in demo/
-	$(BIN)/python -m vfr_bake.demo --output demo
+	$(BIN)/python -m vfr_bake.demo --output demo --force
 
 test: $(VENV)/.dev system-libraries check  ## style, types and tests
 	$(BIN)/python -m pytest

@@ -107,7 +107,8 @@ def _summary(
     train, bake, play = figures["train"], figures["bake"], figures["play"]
     full = f", full model {train['test_psnr']:.2f} dB" if "test_psnr" in train else ""
     print(
-        f"\npictures   {output / 'frames'} ({play['frames']} frames), {picture} (photographs above, played below)\n"
+        f"\npictures   {output / 'frames'} ({play['frames']} frames)\n"
+        f"           {picture} (the scene's own pictures above, played below)\n"
         f"asset      {output / 'asset'}: {bake['megabytes']:.1f} MB;  mesh {output / 'mesh.glb'}\n"
         f"quality    {played:.2f} dB played against the test pictures{full}\n"
         f"speed      {1000 / play['ms_median']:.1f} frames/s at {play['width']}x{play['height']}, "

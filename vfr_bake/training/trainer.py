@@ -86,7 +86,10 @@ class Trainer:
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         config = self.config
-        n_rays = int(min(config.max_rays, max(64, 1.1 * config.batch_samples / self._samples_per_ray)))
+        pilot = step < config.pilot_steps
+        # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
+        budget = config.batch_samples // 2 if pilot else config.batch_samples
+        n_rays = int(min(config.max_rays, max(64, 1.1 * budget / self._samples_per_ray)))
         batch = self._sampler.draw(n_rays)
         jitter = torch.rand(n_rays, generator=self._generator)
         samples = march(
@@ -95,14 +98,14 @@ class Trainer:
             batch.rays_o,
             batch.rays_d,
             jitter,
-            config.batch_samples,
+            budget,
             torch.get_num_threads(),
         )
         n_served, n_samples = len(samples.rays), len(samples.t_mid)
         per_ray = max(n_samples / max(n_served, 1), 1.0)
         self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
         factor = rate_factor(step, progress)
-        loss = self._loss(batch, samples, pilot=step < config.pilot_steps)
+        loss = self._loss(batch, samples, pilot)
         value = float(loss.detach())
         self._adam.zero_grad(set_to_none=True)
         if loss.requires_grad and np.isfinite(value):
