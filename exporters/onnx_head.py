@@ -13,6 +13,7 @@ product with a constant matrix. Built from numpy arrays, the same weights give t
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,9 @@ IR_VERSION = 10
 
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights [n_in, n_out] and bias [n_out]."""
+
+Range = tuple[float, float]
+"""Smallest and largest value of an activation, smallest <= 0 <= largest."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +92,18 @@ def _check_layer(name: str, layer: Layer, n_in: int, n_out: int | None = None) -
     return width
 
 
-def head_onnx(weights: HeadWeights) -> bytes:
-    """The head as a serialised ONNX model (opset 20, float32, any number of pixels).
+def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> bytes:
+    """The head as a serialised ONNX model (opset 20, any number of pixels).
 
     Inputs `features` [n, n_channels] (composited, not divided by the opacity) and `dirs` [n, 3] (unit, from
-    the camera into the scene); output `rgb` [n, 3] sRGB in [0, 1].
+    the camera into the scene); output `rgb` [n, 3] sRGB in [0, 1]; all float32.
+
+    Args:
+        weights: the head.
+        ranges: None for float32 throughout; else one range for each hidden activation, as
+            `exporters.int8_head.activation_ranges` finds them. The wide layers then multiply in 8 bits, in
+            the standard QuantizeLinear/DequantizeLinear form. Ranges are constants of the graph, so a
+            pixel's colour does not depend on which pixels it is evaluated with.
 
     Raises:
         MissingExtraError: the package `onnx` is not installed.
@@ -108,6 +119,10 @@ def head_onnx(weights: HeadWeights) -> bytes:
     h = "features"
     for index, layer in enumerate(weights.spatial):
         h = graph.dense(f"spatial_{index}", h, *layer, activation="Gelu")
+    if ranges is not None:
+        if len(ranges) != 1 + len(weights.directional):
+            raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
+        h = graph.quantized(h, ranges[0])
     f = graph.dense("to_sh", h, *weights.to_sh)
     e = graph.add("Mul", [f, _harmonics(graph, weights)], "sh_encoded")
     d_bottleneck, d_sh, bias = weights.directional_first
@@ -115,6 +130,8 @@ def head_onnx(weights: HeadWeights) -> bytes:
     z = graph.add("Gemm", [e, graph.constant("directional_0_sh_weight", d_sh), z], "directional_0_linear")
     z = graph.add("Gelu", [z], "directional_0", approximate="none")
     for index, layer in enumerate(weights.directional, start=1):
+        if ranges is not None:
+            z = graph.quantized(z, ranges[index])
         z = graph.dense(f"directional_{index}", z, *layer, activation="Gelu")
     z = graph.dense("output", z, *weights.output)
     graph.add("Sigmoid", [z], "rgb")
@@ -146,9 +163,13 @@ class _Graph:
         self._numpy_helper = numpy_helper
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
+        self._scales: dict[str, float] = {}  # of the tensors that have 8 bits
 
     def constant(self, name: str, array: np.ndarray) -> str:
-        kind = np.int64 if array.dtype.kind == "i" else np.float32
+        """A constant: 8-bit and 32-bit integers as they are, other integers as int64, the rest as float32."""
+        kind: Any = array.dtype
+        if kind not in (np.int8, np.uint8, np.int32):
+            kind = np.int64 if kind.kind == "i" else np.float32
         self.constants.append(self._numpy_helper.from_array(np.ascontiguousarray(array, kind), name))
         return name
 
@@ -159,15 +180,55 @@ class _Graph:
     def dense(
         self, name: str, x: str, weight: np.ndarray, bias: np.ndarray, activation: str | None = None
     ) -> str:
-        inputs = [x, self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
+        if x in self._scales:
+            inputs = [x, *self._quantized_layer(name, weight, bias, self._scales[x])]
+        else:
+            inputs = [x, self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
         linear = self.add("Gemm", inputs, f"{name}_linear")
         return self.add(activation, [linear], name, approximate="none") if activation else linear
+
+    def quantized(self, x: str, limits: Range) -> str:
+        """`x` rounded to 256 levels between its limits, zero among them; what follows may multiply in 8
+        bits."""
+        scale = max((limits[1] - limits[0]) / 255, 1e-12)
+        zero = int(np.clip(np.rint(-limits[0] / scale), 0, 255))
+        steps = [
+            self.constant(f"{x}_scale", np.array(scale)),
+            self.constant(f"{x}_zero", np.array(zero, np.uint8)),
+        ]
+        self.add("QuantizeLinear", [x, *steps], f"{x}_codes")
+        out = self.add("DequantizeLinear", [f"{x}_codes", *steps], f"{x}_rounded")
+        self._scales[out] = float(np.float32(scale))
+        return out
+
+    def _quantized_layer(self, name: str, weight: np.ndarray, bias: np.ndarray, x_scale: float) -> list[str]:
+        """Weights with signed 8-bit codes, a scale for each output; the bias in steps of the products'
+        scale."""
+        scales = np.maximum(np.abs(weight).max(axis=0), 1e-12) / 127
+        scales = scales.astype(np.float32)
+        codes = np.clip(np.rint(weight / scales), -127, 127).astype(np.int8)
+        product_scales = scales * np.float32(x_scale)
+        bias_codes = np.clip(np.rint(bias / product_scales.astype(np.float64)), -(2**31) + 1, 2**31 - 1)
+        n = len(scales)
+        inputs = []
+        for part, values, steps in (
+            ("weight", codes, scales), ("bias", bias_codes.astype(np.int32), product_scales)
+        ):  # fmt: skip
+            zero = np.zeros(n, values.dtype)
+            parts = [
+                self.constant(f"{name}_{part}_codes", values),
+                self.constant(f"{name}_{part}_scale", steps),
+                self.constant(f"{name}_{part}_zero", zero),
+            ]
+            axis = values.ndim - 1
+            inputs.append(self.add("DequantizeLinear", parts, f"{name}_{part}", axis=axis))
+        return inputs
 
 
 def _harmonics(graph: _Graph, weights: HeadWeights) -> str:
     """Y(dirs), each basis repeated `n_sh_features` times: monomials of every order, then one matrix product.
 
-    A monomial of order k is one of order k - 1 times x, y or z: two gathers and a product for a whole order.
+    A monomial of order k is one of order k - 1 times x, y or z.
     """
     exponents, coefficients = sh_monomials(weights.sh_degree)
     columns = np.repeat(coefficients, weights.n_sh_features, axis=1)
@@ -181,11 +242,16 @@ def _harmonics(graph: _Graph, weights: HeadWeights) -> str:
                 previous.index(tuple(power - (axis == k) for k, power in enumerate(powers)))  # type: ignore[arg-type]
                 for powers, axis in zip(current, axes, strict=True)
             ]
-            sources = [("parent", name, parents), ("axis", "dirs", axes)]
+            # Columns are picked by a product with zeros and ones: exact, and much faster than Gather.
             factors = [
-                graph.add("Gather", [source, graph.constant(f"sh_{order}_{kind}_index", np.array(index))],
-                          f"sh_{order}_{kind}", axis=1)
-                for kind, source, index in sources
+                graph.add(
+                    "MatMul",
+                    [source, graph.constant(f"sh_{order}_{kind}_pick", np.eye(width)[:, index])],
+                    f"sh_{order}_{kind}",
+                )
+                for kind, source, width, index in (
+                    ("parent", name, len(previous), parents), ("axis", "dirs", 3, axes)
+                )
             ]  # fmt: skip
             name = graph.add("Mul", factors, f"sh_{order}")
             previous = current

@@ -31,8 +31,8 @@ MAX_TAU = np.float32(-np.log(1e-3))
 """The march stops behind this optical depth, where a thousandth of the light is left: a quarter of an 8-bit
 level."""
 
-MIN_OPACITY = np.float32(1 / 1024)
-"""Rays below this opacity are not shaded: they could not change an 8-bit value by more than a quarter of a
+MIN_OPACITY = np.float32(1 / 512)
+"""Rays below this opacity are not shaded: they could not change an 8-bit value by more than half a
 level."""
 
 SKIP_MARGIN = np.float32(0.01)

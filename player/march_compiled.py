@@ -175,8 +175,17 @@ def _collect(settings, lookup, point, direction, first, length, scratch_s, scrat
         optical = math.exp(low + slope * code) * step
         taken += 1
         tau += optical
-        weight = trans * _opacity(optical)
-        trans = math.exp(-tau)
+        behind = math.exp(-tau)
+        # alpha = -expm1(-optical), without its cost: a difference where it does not cancel, else four terms
+        if optical > F32(0.1):
+            weight = trans - behind
+        else:
+            weight = (
+                trans
+                * optical
+                * (F32(1) - optical * (F32(1 / 2) - optical * (F32(1 / 6) - optical * F32(1 / 24))))
+            )
+        trans = behind
         if weight > F32(0.0):
             scratch_s[n] = s
             scratch_w[n] = weight

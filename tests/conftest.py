@@ -24,3 +24,23 @@ def lego_400() -> Path:
     if not (folder / "transforms_train.json").is_file():
         pytest.fail(f"{folder}: expected the lego_400 data set: set VFR_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built-in scene as a small NeRF-synthetic folder: 12 views to train on and 2 to test, 32x32."""
+    from dataclasses import replace
+
+    from PIL import Image
+
+    from player.transforms import write_cameras
+    from vfr_bake.data.demo import demo_views
+
+    root = tmp_path_factory.mktemp("data")
+    for split, views in zip(("train", "test"), demo_views(size=32, n_train=12, n_test=2), strict=True):
+        (root / split).mkdir()
+        for index, image in enumerate(views.images):
+            Image.fromarray(image).save(root / split / f"r_{index}.png")
+        cameras = [replace(c, name=f"./{split}/r_{index}") for index, c in enumerate(views.cameras)]
+        (root / f"transforms_{split}.json").write_bytes(write_cameras(cameras))
+    return root

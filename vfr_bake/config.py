@@ -66,7 +66,7 @@ class TrainConfig:
     minutes: float = 8.0
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
     further."""
-    batch_samples: int = 32_768
+    batch_samples: int = 16_384
     """Samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in proportion
     and quality after a few minutes depends on how many steps were taken."""
     max_rays: int = 16_384
@@ -78,7 +78,7 @@ class TrainConfig:
     pilot_steps: int = 300
     """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
     paper)."""
-    step_cells: float = 1.0
+    step_cells: float = 2.0
     """Length of a march step, in cells of the finest level."""
     occupancy_resolution: int = 128
     """Cells per axis of the occupancy grid."""
@@ -127,28 +127,26 @@ def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
 class BakeConfig:
     """Settings of `vfr-bake`."""
 
-    resolution: int = 0
-    """Cells per axis of the baked grid; 0 takes the field's finest level."""
+    resolution: int = 448
+    """Cells per axis of the baked grid; never more than the field's finest level has."""
     n_channels: int = 16
     """Feature channels kept of the field's; the projection is folded into the head."""
     n_samples: int = 5
     """Feature lookups per ray, k; the player can be asked for another number."""
     weight_floor: float = 0.005
     """A cell is stored if some training ray gives one of its samples at least this weight."""
-    mesh_resolution: int = 256
+    head_bits: int = 8
+    """Bits of the head's wide layers: 8 is about twice as fast to play as 32 (float32)."""
+    mesh_resolution: int = 192
     """Voxels along each side of the box for the mesh; 0 leaves the mesh at the grid's own resolution."""
     check_views: int = 4
     """Training views played from the written files and compared with the full model."""
 
     def __post_init__(self) -> None:
-        _check(
-            self.resolution == 0 or 8 <= self.resolution <= 2048,
-            "resolution",
-            "0 or 8 to 2048",
-            self.resolution,
-        )
+        _check(8 <= self.resolution <= 2048, "resolution", "8 to 2048", self.resolution)
         _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
         _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
+        _check(self.head_bits in (8, 32), "head_bits", "8 or 32", self.head_bits)
         _check(0 < self.weight_floor < 1, "weight_floor", "between 0 and 1", self.weight_floor)
         _check(
             self.mesh_resolution == 0 or 8 <= self.mesh_resolution <= 1024,

@@ -43,7 +43,7 @@ def test_picture_is_the_naive_loop(module: str, asset: Asset, scene: Scene, came
         ray = march_ray(scene, rays_o[pixel], rays_d[pixel], 5)
         at = divmod(pixel, camera.width)
         expected = (1 - ray.opacity) * np.array([0.25, 0.5, 1.0])
-        if ray.opacity > 1 / 1024:
+        if ray.opacity > 1 / 512:
             expected += ray.opacity * head(np.float32(ray.features[None]), rays_d[pixel][None])[0]
         # rays are rounded once more than in `Camera.rays`: 1e-6 of a pixel beside a steep edge
         np.testing.assert_allclose(frame.rgb[at], expected, rtol=0, atol=2e-4)
@@ -108,7 +108,7 @@ def test_transparent_is_straight_and_composites_to_the_same(asset: Asset, camera
     straight = render(asset, camera, background="transparent")
     a = straight.opacity[..., None]
     composed = straight.rgb * a + (1 - a) * np.float32([1, 0, 0.5])
-    np.testing.assert_allclose(composed, over.rgb, rtol=0, atol=2e-3)  # what is not shaded has A < 1/1024
+    np.testing.assert_allclose(composed, over.rgb, rtol=0, atol=2e-3)  # what is not shaded has A < 1/512
     pixels = straight.to_uint8()
     assert pixels.shape == (40, 48, 4)
     assert (pixels[..., 3] == np.floor(straight.opacity * 255 + 0.5)).all()

@@ -13,12 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from player.cameras import Camera
-from player.transforms import write_cameras
 from vfr_bake.cli import bake_main, eval_main, train_main
-from vfr_bake.data.demo import demo_views
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -28,25 +24,9 @@ SMALL = [
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small NeRF-synthetic folder of the built-in scene."""
-    root = tmp_path_factory.mktemp("data")
-    train, test = demo_views(size=32, n_train=12, n_test=2)
-    for split, views in (("train", train), ("test", test)):
-        (root / split).mkdir()
-        cameras = []
-        for index, (camera, image) in enumerate(zip(views.cameras, views.images, strict=True)):
-            Image.fromarray(image).save(root / split / f"r_{index}.png")
-            name = f"./{split}/r_{index}"
-            cameras.append(Camera(name, camera.c2w, 32, 32, camera.fx, camera.fy, camera.cx, camera.cy))
-        (root / f"transforms_{split}.json").write_bytes(write_cameras(cameras))
-    return root
-
-
-@pytest.fixture(scope="module")
-def model(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(small_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "model.pt"
-    assert train_main([str(folder), str(path), "--steps", "150", *SMALL]) == 0
+    assert train_main([str(small_data), str(path), "--steps", "150", *SMALL]) == 0
     return path
 
 
@@ -58,17 +38,17 @@ def one_error(capsys: pytest.CaptureFixture[str], *parts: str) -> None:
 
 
 def test_train_reports_what_it_measured(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [str(folder), str(tmp_path / "model.pt"), "--steps", "25", "--json", "-", *SMALL]
+    arguments = [str(small_data), str(tmp_path / "model.pt"), "--steps", "25", "--json", "-", *SMALL]
     assert train_main(arguments) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["steps"] == 25 and figures["test_views"] == 2 and figures["skipped_steps"] == 0
     assert 3 < figures["test_psnr"] < 50
 
 
-def test_eval_has_the_mean_and_every_view(model: Path, folder: Path, tmp_path: Path) -> None:
-    assert eval_main([str(model), str(folder), "--json", str(tmp_path / "eval.json")]) == 0
+def test_eval_has_the_mean_and_every_view(model: Path, small_data: Path, tmp_path: Path) -> None:
+    assert eval_main([str(model), str(small_data), "--json", str(tmp_path / "eval.json")]) == 0
     figures = json.loads((tmp_path / "eval.json").read_text())
     assert [view["name"] for view in figures["per_view"]] == ["./test/r_0", "./test/r_1"]
     assert figures["psnr"] == pytest.approx(np.mean([view["psnr"] for view in figures["per_view"]]))
@@ -114,10 +94,10 @@ def test_bad_data_is_one_line(
 
 
 def test_a_model_that_exists_is_kept_before_any_work(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "model.pt").write_bytes(b"precious")
-    assert train_main([str(folder), str(tmp_path / "model.pt")]) == 1
+    assert train_main([str(small_data), str(tmp_path / "model.pt")]) == 1
     one_error(capsys, "model.pt", "--force")
     assert (tmp_path / "model.pt").read_bytes() == b"precious"
 
@@ -130,14 +110,14 @@ def test_a_file_that_is_no_model(command, tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "out").exists()
 
 
-def test_a_setting_out_of_range(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert train_main([str(folder), str(tmp_path / "model.pt"), "--minutes", "-1"]) == 1
+def test_a_setting_out_of_range(small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), "--minutes", "-1"]) == 1
     one_error(capsys, "minutes: expected more than 0, got -1")
 
 
 def test_a_full_disk_leaves_nothing(
     model: Path,
-    folder: Path,
+    small_data: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -146,7 +126,7 @@ def test_a_full_disk_leaves_nothing(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    assert train_main([str(folder), str(tmp_path / "model.pt"), "--steps", "2", *SMALL]) == 1
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), "--steps", "2", *SMALL]) == 1
     one_error(capsys, "model.pt", "No space left on device")
     assert list(tmp_path.iterdir()) == []
 
@@ -158,11 +138,11 @@ def test_usage_is_2() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT is not sent like this on Windows")
-def test_ctrl_c_leaves_a_usable_model(folder: Path, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
     path = tmp_path / "model.pt"
     code = "import sys, vfr_bake.cli as cli; cli.SECONDS_BETWEEN_LINES = 0.2; sys.exit(cli.train_main())"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(folder), str(path), "--steps", "1000000", *SMALL],
+        [sys.executable, "-c", code, str(small_data), str(path), "--steps", "1000000", *SMALL],
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -173,4 +153,4 @@ def test_ctrl_c_leaves_a_usable_model(folder: Path, tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
     process.stderr.close()
-    assert eval_main([str(path), str(folder)]) == 0
+    assert eval_main([str(path), str(small_data)]) == 0

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from exporters.int8_head import activation_ranges
 from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
 from player.asset import Asset, GridArrays, write_asset
@@ -35,6 +36,8 @@ Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
 N_RENDERED = 200_000
 """Rays whose rendered features decide the projection."""
+N_CALIBRATION = 20_000
+"""Of these, how many decide the ranges of the head's activations."""
 VERTEX_CHUNK = 1 << 18
 """Vertices evaluated at once: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
@@ -56,12 +59,17 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     ParityError."""
     check_target(folder, force)
     begin = time.monotonic()
-    resolution = config.resolution or model.field.config.max_resolution
+    resolution = min(config.resolution, model.field.config.max_resolution)
     visible = visible_cells(model, resolution, config.weight_floor, _stage(report, "visibility"))
-    rendered = _rendered_features(model)
+    rendered, dirs = _rendered_features(model)
     projection = project(model.field.head.first_weights(), rendered, config.n_channels)
     arrays, scales, density_range = _grid_arrays(model, visible, projection, _stage(report, "grid"))
-    head = head_onnx(fold_head(model.field.head, projection.first * scales))
+    folded = fold_head(model.field.head, projection.first * scales)
+    ranges = None
+    if config.head_bits == 8:
+        codes = rendered @ (projection.matrix.T / scales)
+        ranges = activation_ranges(folded, codes[:N_CALIBRATION], dirs[:N_CALIBRATION])
+    head = head_onnx(folded, ranges)
     mesh, n_floaters = bake_mesh(model, visible, config.mesh_resolution or resolution, _stage(report, "mesh"))
     figures = {
         "n_vertices": len(arrays.density),
@@ -93,18 +101,22 @@ def _stage(report: Report, name: str) -> Callable[[int, int], object]:
     return lambda done, of: report(name, done, of)
 
 
-def _rendered_features(model: Model) -> np.ndarray:
-    """Rendered features of rays spread over all training views, those that hit something."""
+def _rendered_features(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Rendered features [n, n_channels] and directions [n, 3] of rays spread over all training views, those
+    that hit something, in random order.
+    """
     cameras = model.model_cameras()
     random = np.random.default_rng(0)
     per_view = max(1, N_RENDERED // len(cameras))
-    found = []
+    found, dirs = [], []
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         rows = random.choice(len(rays_o), min(per_view, len(rays_o)), replace=False)
         features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[rows], rays_d[rows])
         found.append(features[opacity > 0])
-    return np.concatenate(found)
+        dirs.append(rays_d[rows][opacity > 0])
+    order = random.permutation(sum(map(len, found)))
+    return np.concatenate(found)[order], np.concatenate(dirs)[order]
 
 
 def _grid_arrays(

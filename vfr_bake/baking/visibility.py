@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from player.cameras import Camera
 from player.errors import TrainingError
 from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.sampling import LIMITS
@@ -23,10 +24,12 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
     """
     visible = np.zeros((resolution,) * 3, np.uint8)
     cameras = model.model_cameras()
+    # No cell between two samples may be missed: other rays than these will be played.
+    step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
-        rays_o, rays_d = camera.rays()
+        rays_o, rays_d = _half_of_the_rays(camera, odd=index % 2 == 1)
         mark_visible_cells(
-            rays_o, rays_d, np.float32(model.occupancy.step), model.occupancy.distance,
+            rays_o, rays_d, np.float32(step), model.occupancy.distance,
             *model.field.kernel_arguments(), LIMITS, np.float32(weight_floor), visible,
         )  # fmt: skip
         progress(index + 1, len(cameras))
@@ -36,6 +39,13 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
             "train longer, or lower --weight-floor"
         )
     return visible.view(bool)
+
+
+def _half_of_the_rays(camera: Camera, odd: bool) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    chosen = (rows + columns) % 2 == odd
+    rays_o, rays_d = camera.rays()
+    return rays_o[chosen], rays_d[chosen]
 
 
 def corner_vertices(cells: np.ndarray) -> np.ndarray:

@@ -5,3 +5,9 @@ compare it with. Kernels are generic in the float type: training runs in float32
 Constants are cast to the type of the arrays, because a bare `1.0` would silently turn float32 arithmetic
 into float64.
 """
+
+from numba import config
+
+# OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
+# old.
+config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]

@@ -22,8 +22,10 @@ from vfr_bake.rendering.sampling import Samples, march
 from vfr_bake.training.optimiser import GridAdam, rate_factor
 from vfr_bake.training.rays import PixelSampler, RayBatch
 
-STEPS_PER_UPDATE = 16
-"""Steps between two looks of the occupancy grid at the field."""
+FOG_STEPS = 512
+"""First steps, in which empty space has to be found and the occupancy grid is updated often."""
+STEPS_PER_UPDATE = (16, 64)
+"""Steps between two looks of the occupancy grid at the field: at first, and later."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""
 
@@ -72,7 +74,7 @@ class Trainer:
             progress = max(step / self.config.steps, seconds / (60 * self.config.minutes))
             if progress >= 1:
                 return
-            if step % STEPS_PER_UPDATE == 0:
+            if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
                 self.occupancy.update(self.field)
             loss, batch_rays, n_samples = self._step(step, progress)
             bad_in_a_row = 0 if np.isfinite(loss) else bad_in_a_row + 1

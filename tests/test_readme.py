@@ -1,0 +1,79 @@
+"""What the README says to type works, in its order; its picture is there and its figures are filled in."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from exporters.cli import main as export
+from player.cli import main as play
+from vfr_bake.cli import bake_main, eval_main, train_main
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+
+# The commands of the README at a size that a test can wait for.
+COMMANDS: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {
+    "vfr-train": (
+        train_main,
+        [
+            *("--steps", "150", "--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
+            *("--head-width", "24", "--occupancy-resolution", "32", "--batch-samples", "4096"),
+        ],
+    ),
+    "vfr-bake": (bake_main, ["--mesh-resolution", "32", "--check-views", "1"]),
+    "vfr-eval": (eval_main, []),
+    "vfr-play": (play, ["--size", "24x24"]),
+    "vfr-export": (export, []),
+}
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_commands_and_the_python_run(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen = set()
+    for line in blocks("bash")[0].splitlines():
+        words = [
+            {"DATA": str(small_data), "transforms_test.json": str(small_data / "transforms_test.json")}.get(
+                word, word
+            )
+            for word in shlex.split(line, comments=True)
+        ]
+        main, smaller = COMMANDS[words[0]]
+        assert main(words[1:] + (smaller if "--info" not in words else [])) == 0, line
+        seen.add(words[0])
+    assert seen == set(COMMANDS)
+    assert len(list(Path("frames").glob("*.png"))) == 60
+    for code in blocks("python"):
+        exec(compile(code, "README.md", "exec"), {})
+
+
+def test_make_targets_of_the_readme_exist() -> None:
+    makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
+    targets = re.findall(r"^    make (\w+)", README, re.MULTILINE)
+    assert targets == ["demo", "test"]
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_pictures_and_files_that_it_names_are_there() -> None:
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", README):
+        assert (REPOSITORY / target).is_file(), target
+
+
+def test_version_is_the_same_everywhere() -> None:
+    from vfr_bake import __version__
+
+    project = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'version = "{__version__}"' in project
+    changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"## {__version__}" in changelog
