@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
+from vfr_bake.field.initialisation import initialise
 
 LARGEST_LOGIT = 15.0
 """Pre-activations are clamped here: exp(15) = 3e6 per model unit is opaque in one step at any step length in
@@ -41,6 +42,8 @@ class DensityNetwork(nn.Module):
         self.hidden = nn.Linear(n_channels, width) if width else None
         self.out = nn.Linear(width or n_channels, 1)
         nn.init.zeros_(self.out.bias)
+        if self.hidden is not None:
+            initialise([self.hidden])
 
     def logits(self, features: Tensor) -> Tensor:
         """Pre-activation [n] of the density at `features` [n, n_channels]."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from vfr_bake.config import FieldConfig
+from vfr_bake.field.initialisation import initialise
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 
 
@@ -38,6 +39,7 @@ class Head(nn.Module):
             [nn.Linear(width + n_sh, width)] + [nn.Linear(width, width) for _ in range(3)]
         )
         self.out = nn.Linear(width, 3)
+        initialise([*self.spatial, *self.directional])
 
     def forward(self, features: Tensor, dirs: Tensor) -> Tensor:
         """Colours [n, 3] in [0, 1], sRGB, from `features` [n, n_channels] and unit `dirs` [n, 3]."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from vfr_bake.config import FieldConfig
+from vfr_bake.field.initialisation import initialise
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 
 
@@ -24,6 +25,7 @@ class Pilot(nn.Module):
             [nn.Linear(config.n_channels + config.sh_degree**2, width), nn.Linear(width, width)]
         )
         self.out = nn.Linear(width, 3)
+        initialise(self.layers)
 
     def forward(self, features: Tensor, dirs: Tensor, counts: Tensor) -> Tensor:
         """Colours [n_samples, 3] of `features` [n_samples, n_channels]; ray r looks along `dirs[r]` and owns

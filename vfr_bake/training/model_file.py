@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from player.cameras import Camera
-from player.errors import FormatError, VersionError
+from player.errors import ConfigError, FormatError, VersionError
 from player.files import write_bytes
 from player.transforms import parse_transforms, transforms_cameras, write_cameras
 from vfr_bake.config import FieldConfig, field_config_from
@@ -87,7 +87,10 @@ def load_model(path: Path) -> Model:
     step = content["step"]
     if not (isinstance(step, float) and 0 < step < 1):
         raise FormatError(f"{path}: step: expected a number between 0 and 1, got {step}")
-    config = field_config_from(content["field"], f"{path}: field")
+    try:
+        config = field_config_from(content["field"], f"{path}: field")
+    except ConfigError as error:
+        raise FormatError(str(error)) from None
     field = _restore_field(path, config, content["state"])
     occupancy = OccupancyGrid(_resolution(path, content), step, seed=0)
     bits = np.unpackbits(content["occupied"].numpy())[: occupancy.resolution**3]
