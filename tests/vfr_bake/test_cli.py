@@ -111,8 +111,10 @@ def test_a_file_that_is_no_model(command, tmp_path: Path, capsys: pytest.Capture
 
 
 def test_a_setting_out_of_range(small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert train_main([str(small_data), str(tmp_path / "model.pt"), "--minutes", "-1"]) == 1
-    one_error(capsys, "minutes: expected more than 0, got -1")
+    with pytest.raises(SystemExit) as caught:
+        train_main([str(small_data), str(tmp_path / "model.pt"), "--minutes", "-1"])
+    assert caught.value.code == 2
+    assert "minutes: expected more than 0, got -1" in capsys.readouterr().err
 
 
 def test_a_full_disk_leaves_nothing(

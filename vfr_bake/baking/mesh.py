@@ -14,6 +14,8 @@ from vfr_bake.training.model_file import Model
 
 FLOATER_FRACTION = 1e-3
 """Connected parts with a smaller share of the faces are floaters and go."""
+N_PROBED = 100_000
+"""Visible cells that are looked at for the largest density."""
 STAND_OFF = 3.0
 """Colours are seen from this many voxels above the surface, along its normal."""
 
@@ -32,7 +34,11 @@ def bake_mesh(
         return np.exp(model.field.log_densities(np.ascontiguousarray((points + 1) / 2)))
 
     vertices, faces, normals = extract_surface(
-        density, aabb, resolution, progress=lambda share: progress(round(share * 100), 100)
+        density,
+        aabb,
+        resolution,
+        _level(model, visible, 2 / resolution),
+        lambda share: progress(round(share * 100), 100),
     )
     mesh = TriangleMesh(vertices, faces, normals, np.zeros((len(vertices), 4), np.uint8))
     mesh = take_faces(mesh, np.any(_seen(vertices, visible)[faces], axis=1))
@@ -40,6 +46,15 @@ def bake_mesh(
     colours = _colours(model, mesh, 2 / resolution)
     coloured = TriangleMesh(mesh.vertices, mesh.faces, mesh.normals, colours)
     return coloured.transformed(model.world_from_model), n_removed
+
+
+def _level(model: Model, visible: np.ndarray, voxel: float) -> float:
+    """The density that is half opaque over a voxel; in a field nowhere so dense, half of its largest."""
+    cells = np.argwhere(visible)
+    some = cells[np.random.default_rng(0).integers(0, len(cells), N_PROBED)]
+    points = ((some + 0.5) / len(visible)).astype(np.float32)
+    largest = float(np.exp(model.field.log_densities(points).max()))
+    return min(float(np.log(2)) / voxel, largest / 2)
 
 
 def _seen(vertices: np.ndarray, visible: np.ndarray) -> np.ndarray:

@@ -42,7 +42,6 @@ def test_it_learns_the_scene(scene: Scene) -> None:
     after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.occupancy, scene.test, white)])
     assert len(reports) == 220 and trainer.n_bad_steps == 0
     assert after > before + 6 and after > 18
-    assert trainer.occupancy.occupied.mean() < 0.6, "the empty space was found to be empty"
 
 
 def test_same_seed_same_field(scene: Scene) -> None:
