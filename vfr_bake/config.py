@@ -135,6 +135,8 @@ class BakeConfig:
     """Feature lookups per ray, k; the player can be asked for another number."""
     weight_floor: float = 0.005
     """A cell is stored if some training ray gives one of its samples at least this weight."""
+    refine_steps: int = 1500
+    """Steps in which the head is adapted to the baked features, the full model being the teacher; 0: none."""
     head_bits: int = 8
     """Bits of the head's wide layers: 8 is about twice as fast to play as 32 (float32)."""
     mesh_resolution: int = 192
@@ -146,6 +148,7 @@ class BakeConfig:
         _check(8 <= self.resolution <= 2048, "resolution", "8 to 2048", self.resolution)
         _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
         _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
+        _check(0 <= self.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", self.refine_steps)
         _check(self.head_bits in (8, 32), "head_bits", "8 or 32", self.head_bits)
         _check(0 < self.weight_floor < 1, "weight_floor", "between 0 and 1", self.weight_floor)
         _check(

@@ -21,11 +21,13 @@ from player.density import encode_density
 from player.files import check_target
 from player.manifest import Manifest
 from player.render import render
+from player.sparse_grid import SparseGrid, build_grid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.projection import Projection, code_scales, encode_features, project
+from vfr_bake.baking.refinement import collect_lessons, refine
 from vfr_bake.baking.visibility import corner_vertices, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import composited_features, render_image
@@ -37,7 +39,7 @@ Report = Callable[[str, int, int], object]
 N_RENDERED = 200_000
 """Rays whose rendered features decide the projection."""
 N_CALIBRATION = 20_000
-"""Of these, how many decide the ranges of the head's activations."""
+"""Rays that decide the ranges of the head's activations."""
 VERTEX_CHUNK = 1 << 18
 """Vertices evaluated at once: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
@@ -61,15 +63,15 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     begin = time.monotonic()
     resolution = min(config.resolution, model.field.config.max_resolution)
     visible = visible_cells(model, resolution, config.weight_floor, _stage(report, "visibility"))
-    rendered, dirs = _rendered_features(model)
+    rendered = _rendered_features(model)
     projection = project(model.field.head.first_weights(), rendered, config.n_channels)
     arrays, scales, density_range = _grid_arrays(model, visible, projection, _stage(report, "grid"))
-    folded = fold_head(model.field.head, projection.first * scales)
-    ranges = None
-    if config.head_bits == 8:
-        codes = rendered @ (projection.matrix.T / scales)
-        ranges = activation_ranges(folded, codes[:N_CALIBRATION], dirs[:N_CALIBRATION])
-    head = head_onnx(folded, ranges)
+    step = float(model.occupancy.step)
+    grid = build_grid(
+        (arrays.brick_coords, arrays.brick_masks, arrays.density, arrays.features),
+        resolution, np.array([[-1.0] * 3, [1.0] * 3]), step, density_range,
+    )  # fmt: skip
+    head = _head(model, projection, scales, grid, config, report)
     mesh, n_floaters = bake_mesh(model, visible, config.mesh_resolution or resolution, _stage(report, "mesh"))
     figures = {
         "n_vertices": len(arrays.density),
@@ -82,7 +84,7 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     manifest = Manifest(
         generator=f"vfr-bake {__version__}",
         resolution=resolution,
-        step=float(model.occupancy.step),
+        step=step,
         density_range=density_range,
         n_channels=arrays.features.shape[1],
         view_size=(camera.width, camera.height),
@@ -97,26 +99,40 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     return BakeResult(len(arrays.density), n_bytes, time.monotonic() - begin, figures)
 
 
+def _head(
+    model: Model,
+    projection: Projection,
+    scales: np.ndarray,
+    grid: SparseGrid,
+    config: BakeConfig,
+    report: Report,
+) -> bytes:
+    """The folded head, adapted to what the player will give it, as ONNX."""
+    lessons = collect_lessons(model, grid, config.n_samples)
+    folded = fold_head(model.field.head, projection.first * scales)
+    folded = refine(folded, lessons, config.refine_steps, _stage(report, "refinement"))
+    if config.head_bits == 32:
+        return head_onnx(folded)
+    some = slice(N_CALIBRATION)
+    return head_onnx(folded, activation_ranges(folded, lessons.codes[some], lessons.dirs[some]))
+
+
 def _stage(report: Report, name: str) -> Callable[[int, int], object]:
     return lambda done, of: report(name, done, of)
 
 
-def _rendered_features(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Rendered features [n, n_channels] and directions [n, 3] of rays spread over all training views, those
-    that hit something, in random order.
-    """
+def _rendered_features(model: Model) -> np.ndarray:
+    """Rendered features of rays spread over all training views, those that hit something."""
     cameras = model.model_cameras()
     random = np.random.default_rng(0)
     per_view = max(1, N_RENDERED // len(cameras))
-    found, dirs = [], []
+    found = []
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         rows = random.choice(len(rays_o), min(per_view, len(rays_o)), replace=False)
         features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[rows], rays_d[rows])
         found.append(features[opacity > 0])
-        dirs.append(rays_d[rows][opacity > 0])
-    order = random.permutation(sum(map(len, found)))
-    return np.concatenate(found)[order], np.concatenate(dirs)[order]
+    return np.concatenate(found)
 
 
 def _grid_arrays(

@@ -12,22 +12,31 @@ from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.sampling import LIMITS
 from vfr_bake.training.model_file import Model
 
+HITS = 16
+"""Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
+closed."""
+VIEWS_OF_A_CELL = 0.4
+"""Share of the training views that see a given piece of surface, roughly."""
+
 Progress = Callable[[int, int], object]
 """Called with (done, of)."""
 
 
 def visible_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
-    """[resolution]^3 bool: cells in which a sample of some training ray weighs at least `weight_floor`.
+    """[resolution]^3 bool: cells in which a sample of some training view's ray weighs at least
+    `weight_floor`, and the gaps of one cell between them.
 
-    Every pixel of every training camera sends a ray through the full model. Raises TrainingError when
-    nothing is seen.
+    Rays leave each training camera as densely as it takes for every surface cell to be met HITS times over
+    all views, whatever the pictures' size. Raises TrainingError when nothing is seen.
     """
     visible = np.zeros((resolution,) * 3, np.uint8)
     cameras = model.model_cameras()
+    density = _ray_density(cameras, 2 / resolution)
     # No cell between two samples may be missed: other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
-        rays_o, rays_d = _half_of_the_rays(camera, odd=index % 2 == 1)
+        size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
+        rays_o, rays_d = camera.resized(*size).rays()
         mark_visible_cells(
             rays_o, rays_d, np.float32(step), model.occupancy.distance,
             *model.field.kernel_arguments(), LIMITS, np.float32(weight_floor), visible,
@@ -38,14 +47,43 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
             f"no cell weighs {weight_floor} in any training view: the model is empty or a thin fog: "
             "train longer, or lower --weight-floor"
         )
-    return visible.view(bool)
+    return close_gaps(visible.view(bool))
 
 
-def _half_of_the_rays(camera: Camera, odd: bool) -> tuple[np.ndarray, np.ndarray]:
-    rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
-    chosen = (rows + columns) % 2 == odd
-    rays_o, rays_d = camera.rays()
-    return rays_o[chosen], rays_d[chosen]
+def _ray_density(cameras: list[Camera], cell: float) -> float:
+    """Rays per pixel along each axis that let HITS rays meet each surface cell at the middle of the box."""
+    footprints = np.array([np.linalg.norm(camera.c2w[:3, 3]) / camera.fx for camera in cameras])
+    hits = VIEWS_OF_A_CELL * float(np.sum((cell / np.maximum(footprints, 1e-9)) ** 2))
+    return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
+
+
+def close_gaps(cells: np.ndarray) -> np.ndarray:
+    """Morphological closing of [n, n, n] bool with a cube of 3 cells: holes and cracks of one cell are
+    filled.
+
+    >>> row = np.zeros((5, 5, 5), bool)
+    >>> row[1:4, 1:4, 1:4] = True
+    >>> row[2, 2, 2] = False
+    >>> bool(close_gaps(row)[2, 2, 2]), int(close_gaps(row).sum())
+    (True, 27)
+    """
+    padded = np.pad(cells, 1)
+    for axis in range(3):
+        padded = _any_of_three(padded, axis)
+    for axis in range(3):
+        padded = ~_any_of_three(~padded, axis)
+    # Outside the box nothing is known to be empty or full: what was marked stays.
+    return padded[1:-1, 1:-1, 1:-1] | cells
+
+
+def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
+    """Each cell or either neighbour along an axis."""
+    out = cells.copy()
+    lower, upper = [slice(None)] * 3, [slice(None)] * 3
+    lower[axis], upper[axis] = slice(None, -1), slice(1, None)
+    out[tuple(lower)] |= cells[tuple(upper)]
+    out[tuple(upper)] |= cells[tuple(lower)]
+    return out
 
 
 def corner_vertices(cells: np.ndarray) -> np.ndarray:

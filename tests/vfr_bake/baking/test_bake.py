@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import torch
 
-from exporters.onnx_head import head_onnx
+from exporters.onnx_head import HeadWeights, head_onnx
 from exporters.ply import read_ply
 from player.asset import Asset
 from player.errors import OutputError, TrainingError
@@ -17,11 +17,12 @@ from player.render import render
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.projection import code_scales, encode_features, project
-from vfr_bake.baking.visibility import corner_vertices, visible_cells
+from vfr_bake.baking.refinement import FoldedHead, Lessons, refine
+from vfr_bake.baking.visibility import close_gaps, corner_vertices, visible_cells
 from vfr_bake.config import BakeConfig, FieldConfig, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
-from vfr_bake.rendering.render import render_image
+from vfr_bake.rendering.render import composited_features, render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.trainer import Trainer
@@ -76,6 +77,31 @@ def test_every_corner_of_a_visible_cell_is_stored() -> None:
     assert {tuple(v) for v in corner_vertices(cells)} == expected
 
 
+def test_gaps_of_one_cell_are_closed_and_nothing_grows() -> None:
+    cells = np.zeros((12, 12, 12), bool)
+    cells[5:8, 2:10, 2:10] = True
+    full = cells.copy()
+    random = np.random.default_rng(0)
+    for _ in range(6):  # single holes, some of them at the rim
+        cells[6, random.integers(3, 9), random.integers(3, 9)] = False
+    assert np.array_equal(close_gaps(cells), full)
+    corner = np.zeros((4, 4, 4), bool)
+    corner[0, 0, 0] = True
+    assert np.array_equal(close_gaps(corner), corner)
+
+
+def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Path) -> None:
+    # Cells a third of a pixel wide: one ray a pixel would miss most of them.
+    camera, in_model = model.cameras[3], model.model_cameras()[3]
+    bake(model, tmp_path / "asset", BakeConfig(resolution=96, mesh_resolution=16, check_views=1), quiet)
+    large = camera.resized(256, 256)
+    played = render(Asset.open(tmp_path / "asset"), large, n_samples=0)
+    _, opacity, _ = composited_features(model.field, model.occupancy, *in_model.resized(256, 256).rays())
+    solid = opacity.reshape(256, 256) > 0.95
+    assert solid.mean() > 0.1
+    assert (played.opacity[solid] < 0.5).mean() < 0.002
+
+
 def test_folded_head_equals_the_head() -> None:
     torch.manual_seed(0)
     head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
@@ -89,6 +115,45 @@ def test_folded_head_equals_the_head() -> None:
     codes = (features.numpy() / scales).astype(np.float32)
     (rgb,) = session.run(None, {"features": codes, "dirs": dirs.numpy()})
     np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6)
+
+
+def test_the_trainable_head_is_the_exported_one() -> None:
+    torch.manual_seed(0)
+    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
+    weights = fold_head(head, head.first_weights() * 0.01)
+    session = onnxruntime.InferenceSession(head_onnx(weights))
+    codes = (torch.rand(50, 12) * 254 - 127).float()
+    dirs = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
+    trainable = FoldedHead(weights)
+    (rgb,) = session.run(None, {"features": codes.numpy(), "dirs": dirs.numpy()})
+    with torch.no_grad():
+        np.testing.assert_allclose(trainable(codes, dirs).numpy(), rgb, rtol=0, atol=2e-6)
+    (again,) = onnxruntime.InferenceSession(head_onnx(trainable.weights())).run(
+        None, {"features": codes.numpy(), "dirs": dirs.numpy()}
+    )
+    np.testing.assert_allclose(again, rgb, rtol=0, atol=2e-6)
+
+
+def test_refinement_brings_the_head_back_to_its_teacher() -> None:
+    torch.manual_seed(0)
+    head = Head(FieldConfig(n_levels=6, head_width=24))
+    weights = fold_head(head, head.first_weights() * 0.02)
+    codes = torch.rand(4000, 12) * 254 - 127
+    dirs = torch.nn.functional.normalize(torch.randn(4000, 3), dim=-1)
+    ones = np.ones(4000, np.float32)
+    with torch.no_grad():
+        wanted = FoldedHead(weights)(codes, dirs).numpy()
+    # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
+    lessons = Lessons((codes * 0.8 + 10).numpy(), dirs.numpy(), ones, wanted, ones)
+
+    def error(weights: HeadWeights) -> float:
+        with torch.no_grad():
+            shown = FoldedHead(weights)(torch.from_numpy(lessons.codes), dirs).numpy()
+        return float(np.mean((shown - wanted) ** 2))
+
+    before = error(weights)
+    assert error(refine(weights, lessons, 0, lambda done, of: None)) == pytest.approx(before, rel=1e-3)
+    assert error(refine(weights, lessons, 200, lambda done, of: None)) < before / 5
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
