@@ -10,4 +10,4 @@ from numba import config
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
-config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore[reportAttributeAccessIssue]
