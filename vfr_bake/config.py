@@ -127,8 +127,9 @@ def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
 class BakeConfig:
     """Settings of `vfr-bake`."""
 
-    resolution: int = 448
-    """Cells per axis of the baked grid; never more than the field's finest level has."""
+    resolution: int = 0
+    """Cells per axis of the baked grid, at most the field's finest level; 0: 1.25 cells for each pixel that
+    the training pictures see across the middle of the box."""
     n_channels: int = 16
     """Feature channels kept of the field's; the projection is folded into the head."""
     n_samples: int = 5
@@ -145,7 +146,12 @@ class BakeConfig:
     """Training views played from the written files and compared with the full model."""
 
     def __post_init__(self) -> None:
-        _check(8 <= self.resolution <= 2048, "resolution", "8 to 2048", self.resolution)
+        _check(
+            self.resolution == 0 or 8 <= self.resolution <= 2048,
+            "resolution",
+            "0 or 8 to 2048",
+            self.resolution,
+        )
         _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
         _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
         _check(0 <= self.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", self.refine_steps)

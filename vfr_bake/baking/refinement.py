@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from exporters.onnx_head import HeadWeights, Layer
+from player.errors import TrainingError
 from player.march_compiled import march
 from player.sparse_grid import SparseGrid
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
@@ -64,7 +65,10 @@ def collect_lessons(model: Model, grid: SparseGrid, n_samples: int) -> Lessons:
         features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[hits], rays_d[hits])
         colours = head_colours(model.field, features, rays_d[hits]) * opacity[:, None]
         parts.append((played.features, rays_d[hits], played.opacity[hits], colours, opacity))
-    order = random.permutation(sum(len(part[0]) for part in parts))
+    n_lessons = sum(len(part[0]) for part in parts)
+    if n_lessons == 0:
+        raise TrainingError("the baked grid shows nothing in any training view: train longer")
+    order = random.permutation(n_lessons)
     return Lessons(*(np.concatenate(columns)[order] for columns in zip(*parts, strict=True)))
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from player.cameras import Camera
 from player.errors import TrainingError
 from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.sampling import LIMITS
@@ -31,7 +30,7 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
     """
     visible = np.zeros((resolution,) * 3, np.uint8)
     cameras = model.model_cameras()
-    density = _ray_density(cameras, 2 / resolution)
+    density = _ray_density(pixel_footprints(model), 2 / resolution)
     # No cell between two samples may be missed: other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
@@ -50,10 +49,15 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
     return close_gaps(visible.view(bool))
 
 
-def _ray_density(cameras: list[Camera], cell: float) -> float:
+def pixel_footprints(model: Model) -> np.ndarray:
+    """[n_views] size of each training camera's pixels at the middle of the box, model units."""
+    cameras = model.model_cameras()
+    return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), 1e-6) / c.fx for c in cameras])
+
+
+def _ray_density(footprints: np.ndarray, cell: float) -> float:
     """Rays per pixel along each axis that let HITS rays meet each surface cell at the middle of the box."""
-    footprints = np.array([np.linalg.norm(camera.c2w[:3, 3]) / camera.fx for camera in cameras])
-    hits = VIEWS_OF_A_CELL * float(np.sum((cell / np.maximum(footprints, 1e-9)) ** 2))
+    hits = VIEWS_OF_A_CELL * float(np.sum((cell / footprints) ** 2))
     return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
 
 
