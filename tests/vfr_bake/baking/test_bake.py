@@ -18,7 +18,7 @@ from vfr_bake.baking.bake import bake
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.projection import code_scales, encode_features, project
 from vfr_bake.baking.refinement import FoldedHead, Lessons, refine
-from vfr_bake.baking.visibility import close_gaps, corner_vertices, visible_cells
+from vfr_bake.baking.visibility import close_gaps, corner_vertices, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig, FieldConfig, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
@@ -157,7 +157,7 @@ def test_refinement_brings_the_head_back_to_its_teacher() -> None:
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
-    settings = BakeConfig(mesh_resolution=64, n_channels=16, check_views=2)
+    settings = BakeConfig(resolution=96, mesh_resolution=64, n_channels=16, check_views=2)
     result = bake(model, tmp_path / "asset", settings, quiet)
     asset = Asset.open(tmp_path / "asset", verify=True)
     assert asset.manifest.n_channels == 16 and result.n_vertices == len(asset.arrays.density)
@@ -208,3 +208,15 @@ def test_a_low_floor_stores_more(model: Model) -> None:
         return int(visible_cells(model, 64, floor, lambda done, of: None).sum())
 
     assert count(0.001) > count(0.01) > count(0.2) > 0
+
+
+def test_the_grid_is_as_fine_as_the_pictures_and_never_finer_than_the_field(
+    model: Model, tmp_path: Path
+) -> None:
+    cell_of_a_pixel = 2 * 1.25 / float(np.median(pixel_footprints(model)))
+    assert 40 < cell_of_a_pixel < 96
+    bake(model, tmp_path / "a", BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1), quiet)
+    assert Asset.open(tmp_path / "a").manifest.resolution == round(cell_of_a_pixel)
+    finest = BakeConfig(resolution=500, mesh_resolution=16, refine_steps=0, check_views=1)
+    bake(model, tmp_path / "b", finest, quiet)
+    assert Asset.open(tmp_path / "b").manifest.resolution == 96
