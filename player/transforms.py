@@ -21,13 +21,14 @@ MAX_PIXELS_A_SIDE = 65536
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 
 
-def load_transforms(path: Path) -> dict[str, Any]:
+def load_transforms(path: str | Path) -> dict[str, Any]:
     """The JSON of a transforms.json, with `frames` checked to be a list of objects that each have a
     `file_path`.
 
     Raises FormatError: no such file, over 64 MB, not JSON (NaN and Infinity are not), no frames, not a
     pinhole model.
     """
+    path = Path(path)
     try:
         n_bytes = path.stat().st_size
         if n_bytes > MAX_FILE_BYTES:
@@ -72,7 +73,7 @@ def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
     return document
 
 
-def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
+def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> list[Camera]:
     """Read the cameras of a transforms.json, in the NeRF-synthetic, the instant-ngp or the nerfstudio form.
 
     `path`: the file. `size`: (width, height) in pixels for cameras that the file gives no `w`, `h`.

@@ -25,7 +25,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {
             *("--head-width", "24", "--occupancy-resolution", "32", "--batch-samples", "4096"),
         ],
     ),
-    "vfr-bake": (bake_main, ["--mesh-resolution", "32", "--check-views", "1"]),
+    "vfr-bake": (bake_main, ["--mesh-resolution", "32", "--check-views", "1", "--refine-steps", "50"]),
     "vfr-eval": (eval_main, []),
     "vfr-play": (play, ["--size", "24x24"]),
     "vfr-export": (export, []),

@@ -27,7 +27,14 @@ def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Model, asset and frames of a shortened run."""
     out = tmp_path_factory.mktemp("lego")
     assert train_main([str(lego_400), str(out / "model.pt"), *SHORT]) == 0
-    arguments = [str(out / "model.pt"), str(out / "asset"), "--mesh-resolution", "64", "--check-views", "1"]
+    arguments = [
+        str(out / "model.pt"),
+        str(out / "asset"),
+        "--mesh-resolution",
+        "64",
+        "--refine-steps",
+        "200",
+    ]
     assert bake_main(arguments) == 0
     cameras = str(lego_400 / "transforms_test.json")
     options = ["--frames", "0:200:100", "--json", str(out / "play.json")]
