@@ -93,16 +93,19 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> list[
     ...     [(c.name, c.width, c.fx) for c in read_cameras(path)]
     [('a.png', 8, 9.0)]
     """
-    return transforms_cameras(load_transforms(path), path, size)
+    document = load_transforms(path)
+    return transforms_cameras(document, path, [size] * len(document["frames"]))
 
 
 def transforms_cameras(
-    document: dict[str, Any], where: Path | str, size: tuple[int, int] | None = None
+    document: dict[str, Any], where: Path | str, sizes: Sequence[tuple[int, int] | None] | None = None
 ) -> list[Camera]:
-    """The cameras of what `load_transforms` returned; `where` is for the messages. Raises FormatError."""
+    """The cameras of what `load_transforms` returned; `where` is for the messages, `sizes` (width, height) of
+    the frames that give none. Raises FormatError."""
+    frames = document["frames"]
     return [
         _frame_camera(document, frame, f"{where}: frame {index} ({frame['file_path']})", size)
-        for index, frame in enumerate(document["frames"])
+        for index, (frame, size) in enumerate(zip(frames, sizes or [None] * len(frames), strict=True))
     ]
 
 

@@ -15,15 +15,32 @@ settings.load_profile("any_machine")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(scope="session")
-def lego_400() -> Path:
-    """The NeRF-synthetic lego 400x400, in `$VFR_DATA` (default `../shared/data`); missing, the test fails."""
+def _real_data(name: str, holds: str) -> Path:
+    """A data set in `$VFR_DATA` (default `../shared/data`); missing, the test fails."""
     data = os.environ.get("VFR_DATA")
     root = Path(data) if data else REPOSITORY.parent / "shared" / "data"
-    folder = root / "lego_400"
-    if not (folder / "transforms_train.json").is_file():
-        pytest.fail(f"{folder}: expected the lego_400 data set: set VFR_DATA to the folder that holds it")
+    folder = root / name
+    if not (folder / holds).is_file():
+        pytest.fail(f"{folder}: expected the {name} data set: set VFR_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture(scope="session")
+def lego_400() -> Path:
+    """The NeRF-synthetic lego at 400x400."""
+    return _real_data("lego_400", "transforms_train.json")
+
+
+@pytest.fixture(scope="session")
+def can() -> Path:
+    """71 phone pictures with a COLMAP model."""
+    return _real_data("can", "sparse/0/images.bin")
+
+
+@pytest.fixture(scope="session")
+def fox() -> Path:
+    """50 phone pictures with a transforms.json, lens distortion and surroundings without end."""
+    return _real_data("fox", "transforms.json")
 
 
 @pytest.fixture(scope="session")

@@ -72,55 +72,86 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
 
 
 def _train(options: Any) -> int:
-    check_target(options.model, options.force)
     from vfr_bake.data import load_scene
+    from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
+    from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
+    check_target(options.model, options.force)
     config = options.config
-    with _Bar("reading pictures") as bar:
-        scene = load_scene(options.data, bar.count)
-    trainer = Trainer(scene, config)
-    interrupted = False
+    processes = Processes.from_environment()
+    with _Bar("reading pictures", processes.first) as bar:
+        scene = load_scene(options.data, bar.count, downscale=config.downscale, kind=config.kind)
+    trainer = Trainer(scene, config, processes)
+    checkpoint = checkpoint_path(options.model)
+    if options.resume and checkpoint.exists():
+        load_checkpoint(checkpoint, trainer)
+        if processes.first:
+            print(f"vfr-train: going on after step {trainer.next_step}", file=sys.stderr)
+    figures = _train_steps(trainer, checkpoint)
+    interrupted = figures.pop("interrupted")
+    if processes.first:
+        if not interrupted and config.eval_views and scene.test.cameras:
+            figures |= _test_figures(trainer, scene, config.eval_views)
+        _save(options.model, trainer, scene, figures)
+        checkpoint.unlink(missing_ok=True)
+        _report_training(options, figures, interrupted)
+    processes.leave()
+    return 130 if interrupted else 0
+
+
+def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
+    """Train to the end or to Ctrl-C, with a checkpoint now and then; what it came to."""
+    from vfr_bake.training.checkpoint import save_checkpoint
+
     last = None
-    with _Bar("training") as bar:
-        error_sum, n_steps, rays = 0.0, 0, 0.0
+    interrupted = False
+    saved = time.monotonic()
+    with _Bar("training", trainer.processes.first) as bar:
+        error, n_steps, rays = 0.0, 0, 0.0
         try:
             for last in trainer.run():
                 weight = max(0.02, 1 / (n_steps + 1))
                 n_steps += 1
                 if last.loss == last.loss:  # a skipped step reports NaN
-                    error_sum += weight * (last.loss - error_sum)
+                    error += weight * (last.loss - error)
                     rays += weight * (last.n_rays - rays)
-                rate = rays * n_steps / max(last.seconds, 1e-9)
+                rate = rays * (last.step + 1) / max(last.seconds, 1e-9)
+                skipped = f"  {trainer.n_bad_steps} skipped" if trainer.n_bad_steps else ""
                 bar.share(
                     last.progress,
-                    f"loss {error_sum:.5f}  PSNR {_decibels(error_sum):.2f} dB  {rate:,.0f} rays/s",
+                    f"loss {error:.5f}  PSNR {_decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
                 )
+                due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
+                if due and trainer.processes.first:
+                    save_checkpoint(checkpoint, trainer)
+                    saved = time.monotonic()
         except KeyboardInterrupt:
             interrupted = True
-    if last is None:
+    if last is None and interrupted:
         raise KeyboardInterrupt
-    figures: dict[str, Any] = {
-        "steps": last.step + 1,
-        "seconds": round(last.seconds, 1),
+    return {
+        "steps": trainer.next_step,
+        "seconds": round(trainer.seconds, 1),
         "skipped_steps": trainer.n_bad_steps,
-        "training_psnr": round(_decibels(error_sum), 3),
+        "training_psnr": round(_decibels(error), 3),
+        "interrupted": interrupted,
     }
-    if not interrupted and config.eval_views and scene.test.cameras:
-        figures |= _test_figures(trainer, scene, config.eval_views)
-    _save(options.model, trainer, scene, figures)
+
+
+def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
     tested = (
         f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
         if "test_psnr" in figures
         else ""
     )
+    skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
     _result(
         options.json,
         figures | {"model": str(options.model)},
-        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{tested}"
+        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{skipped}{tested}"
         + (" (stopped early)" if interrupted else ""),
     )
-    return 130 if interrupted else 0
 
 
 def _decibels(error: float) -> float:
@@ -137,7 +168,7 @@ def _test_figures(trainer: Trainer, scene: Scene, n_views: int) -> dict[str, Any
     scores = []
     n_views = min(n_views, len(scene.test.cameras))
     with _Bar("test views") as bar:
-        for score in evaluate(trainer.field, trainer.occupancy, scene.test, np.ones(3), n_views):
+        for score in evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), n_views):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
     return {"test_psnr": float(np.mean(scores)), "test_views": len(scores)}
@@ -149,7 +180,7 @@ def _save(path: Path, trainer: Trainer, scene: Scene, figures: dict[str, Any]) -
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
     model = Model(
         field=trainer.field,
-        occupancy=trainer.occupancy,
+        sampler=trainer.sampler,
         world_from_model=scene.world_from_model,
         cameras=cameras,
         has_alpha=scene.has_alpha,
@@ -205,7 +236,7 @@ def _eval(options: Any) -> int:
     views = type(scene.test)([c.transformed(to_model) for c in cameras], scene.test.images)
     scores = []
     with _Bar("test views") as bar:
-        for score in evaluate(model.field, model.occupancy, views, model.background):
+        for score in evaluate(model.field, model.sampler, views, model.background):
             scores.append(score)
             bar.count(len(scores), len(cameras))
     mean = sum(score.psnr for score in scores) / len(scores)
@@ -240,8 +271,9 @@ def _result(target: Path | None, figures: dict[str, Any], sentence: str) -> None
 class _Bar:
     """A tqdm bar on stderr where that is a terminal, else a line now and then."""
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, shown: bool = True) -> None:
         self._title = title
+        self._shown = shown
         self._bar: Any = None
         self._last_line = time.monotonic()
         self._begin = self._last_line
@@ -259,6 +291,8 @@ class _Bar:
         self._show(share, text)
 
     def _show(self, share: float, text: str) -> None:
+        if not self._shown:
+            return
         if not sys.stderr.isatty():
             if time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
                 self._last_line = time.monotonic()

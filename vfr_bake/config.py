@@ -3,10 +3,29 @@ units."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
+
+SceneKind = Literal["auto", "object", "unbounded"]
+Compositing = Literal["features", "colour"]
+Activation = Literal["gelu", "relu"]
+ViewEncoding = Literal["sh-features", "sh"]
+CHOICES = {
+    "compositing": get_args(Compositing),
+    "activation": get_args(Activation),
+    "view_encoding": get_args(ViewEncoding),
+}
+UNBOUNDED_FIELD = {
+    "unbounded": True,
+    "n_levels": 32,
+    "max_resolution": 2048,
+    "density_width": 0,
+    "sh_degree": 7,
+    "n_sh_features": 8,
+}
+"""Settings of the paper's real-world scenes where they differ from those of objects (table 2)."""
 
 
 def _check(condition: bool, name: str, expected: str, got: Any) -> None:
@@ -18,18 +37,28 @@ def _check(condition: bool, name: str, expected: str, got: Any) -> None:
 class FieldConfig:
     """Architecture of a field (section 4 of the paper); stored in the model file."""
 
+    unbounded: bool = False
+    """Whether the grid covers all of space, contracted, or the box [-1, 1]^3 alone."""
     n_levels: int = 16
     """Levels of the hash grid."""
     base_resolution: int = 16
-    """Cells per axis of the coarsest level, over the scene box."""
+    """Cells per axis of the coarsest level, over the unit cube."""
     max_resolution: int = 512
     """Cells per axis of the finest level."""
     log2_table_size: int = 18
-    """A level with more vertices than two to this power shares entries by hashing (paper: 19)."""
+    """A level with more vertices than two to this power shares entries by hashing."""
     density_width: int = 64
     """Hidden width of the density network; 0 for a linear map."""
+    compositing: Compositing = "features"
+    """What is summed along a ray: features for one head (equation 3), or the head's colours (equation 2)."""
     head_width: int = 256
     """Width of every layer of the head, and of its bottleneck."""
+    n_directional_layers: int = 4
+    """Layers of the directional MLP behind the two spatial ones."""
+    activation: Activation = "gelu"
+    """Between the head's layers."""
+    view_encoding: ViewEncoding = "sh-features"
+    """How the head sees the direction: basis functions times predicted features (equation 4), or plain."""
     sh_degree: int = 4
     """Bands of spherical harmonics in the view encoding: degree 4 means l = 0..3, 16 basis functions."""
     n_sh_features: int = 4
@@ -47,8 +76,16 @@ class FieldConfig:
         _check(10 <= self.log2_table_size <= 24, "log2_table_size", "10 to 24", self.log2_table_size)
         _check(0 <= self.density_width <= 1024, "density_width", "0 to 1024", self.density_width)
         _check(4 <= self.head_width <= 1024, "head_width", "4 to 1024", self.head_width)
+        _check(
+            1 <= self.n_directional_layers <= 16,
+            "n_directional_layers",
+            "1 to 16",
+            self.n_directional_layers,
+        )
         _check(1 <= self.sh_degree <= 8, "sh_degree", "1 to 8", self.sh_degree)
         _check(1 <= self.n_sh_features <= 32, "n_sh_features", "1 to 32", self.n_sh_features)
+        for name, choices in CHOICES.items():
+            _check(getattr(self, name) in choices, name, f"one of {', '.join(choices)}", getattr(self, name))
 
     @property
     def n_channels(self) -> int:
@@ -56,42 +93,105 @@ class FieldConfig:
         return 2 * self.n_levels
 
 
+def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
+    """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
+    names and wrong kinds."""
+    defaults = asdict(FieldConfig())
+    _check(set(values) == set(defaults), where, f"the settings {sorted(defaults)}", sorted(values))
+    for name, value in values.items():
+        kind = type(defaults[name])
+        _check(type(value) is kind, f"{where}: {name}", f"a value of type {kind.__name__}", value)
+    return FieldConfig(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldOptions:
+    """Architecture as `vfr-train` takes it: what is not given follows from the kind of scene."""
+
+    n_levels: int | None = None
+    """Levels of the hash grid, two feature channels each; objects 16 and scenes 32, as in the paper."""
+    base_resolution: int | None = None
+    """Cells per axis of the coarsest level; 16."""
+    max_resolution: int | None = None
+    """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
+    log2_table_size: int | None = None
+    """A level with more vertices than two to this power shares entries by hashing; 18 (paper: 19, with
+    batches 16 times as large to fill it)."""
+    density_width: int | None = None
+    """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
+    compositing: Compositing = "features"
+    """Sum features along the ray and evaluate the head once a pixel (volume feature rendering), or evaluate
+    it at every sample and sum colours (standard volume rendering, the paper's baseline)."""
+    head_width: int = 256
+    """Width of every layer of the head, and of its bottleneck."""
+    n_directional_layers: int = 4
+    """Layers of the directional MLP behind the two spatial ones."""
+    activation: Activation = "gelu"
+    """Between the head's layers."""
+    view_encoding: ViewEncoding = "sh-features"
+    """Spherical harmonics times features that the head predicts (equation 4 of the paper), or plain."""
+    sh_degree: int | None = None
+    """Bands of spherical harmonics: degree 4 means l = 0..3, 16 basis functions; objects 4, scenes 7."""
+    n_sh_features: int | None = None
+    """Features that multiply each basis function; objects 4, scenes 8, as in the paper."""
+
+    def resolved(self, unbounded: bool) -> FieldConfig:
+        """With every open setting filled in. Raises ConfigError for a value out of range."""
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return FieldConfig(**((UNBOUNDED_FIELD if unbounded else {}) | given))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Settings of `vfr-train`. The defaults are made for two CPU cores; the paper's GPU figures stand beside
     them."""
 
+    kind: SceneKind = "auto"
+    """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted, sampled by
+    proposals. Auto: an object if the pictures have alpha or a plain background."""
+    downscale: int = 1
+    """Pictures are reduced by this factor along each side before training."""
     steps: int = 20_000
-    """Optimiser steps at most (paper: 20,000). Training ends here or when the minutes are over."""
-    minutes: float = 8.0
+    """Optimiser steps at most (paper: 20,000; 40,000 for scenes). Training ends here or when the minutes are
+    over."""
+    minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
-    further."""
+    further. Objects 9, scenes 14."""
     batch_samples: int = 16_384
-    """Samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in proportion
-    and quality after a few minutes depends on how many steps were taken."""
+    """Objects: samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in
+    proportion and quality after a few minutes depends on how many steps were taken."""
+    batch_rays: int = 1024
+    """Scenes: rays in a batch (paper: 8,192); smaller for the same reason."""
     max_rays: int = 16_384
-    """Rays in a batch at most, however few samples they need."""
+    """Objects: rays in a batch at most, however few samples they need."""
     grid_rate: float = 1e-2
-    """Adam learning rate of the hash grid."""
+    """Adam learning rate of the hash grids."""
     network_rate: float = 2e-3
-    """Adam learning rate of the density network and the head."""
+    """Adam learning rate of the density network and the head (paper: 0.01 for all)."""
     pilot_steps: int = 300
     """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
     paper)."""
     step_cells: float = 2.0
-    """Length of a march step, in cells of the finest level."""
+    """Objects: length of a march step, in cells of the finest level."""
     occupancy_resolution: int = 128
-    """Cells per axis of the occupancy grid."""
+    """Objects: cells per axis of the occupancy grid."""
+    distortion: float = 0.01
+    """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
     seed: int = 0
     """Seed of every random number."""
     eval_views: int = 25
     """Test views rendered at the end, spread evenly; 0 for none. `vfr-eval` renders them all."""
-    field: FieldConfig = field(default_factory=FieldConfig)
+    checkpoint_minutes: float = 2.0
+    """Minutes between two checkpoints, kept beside the model file until training is complete."""
+    field: FieldOptions = field(default_factory=FieldOptions)
 
     def __post_init__(self) -> None:
+        _check(self.kind in get_args(SceneKind), "kind", f"one of {get_args(SceneKind)}", self.kind)
+        _check(1 <= self.downscale <= 64, "downscale", "1 to 64", self.downscale)
         _check(self.steps >= 1, "steps", "at least 1", self.steps)
-        _check(self.minutes > 0, "minutes", "more than 0", self.minutes)
+        _check(self.minutes is None or self.minutes > 0, "minutes", "more than 0", self.minutes)
         _check(4096 <= self.batch_samples <= 2**22, "batch_samples", "4,096 to 4,194,304", self.batch_samples)
+        _check(64 <= self.batch_rays <= 2**17, "batch_rays", "64 to 131,072", self.batch_rays)
         _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
         _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)
         _check(0 < self.network_rate < 1, "network_rate", "between 0 and 1", self.network_rate)
@@ -103,24 +203,9 @@ class TrainConfig:
             "8 to 512",
             self.occupancy_resolution,
         )
+        _check(0 <= self.distortion < 1e3, "distortion", "0 to 1000", self.distortion)
         _check(self.eval_views >= 0, "eval_views", "at least 0", self.eval_views)
-
-    @property
-    def step(self) -> float:
-        """Length of a march step in model units; the box [-1, 1]^3 is 2 wide."""
-        return 2.0 * self.step_cells / self.field.max_resolution
-
-
-def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
-    """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
-    names."""
-    names = {f.name for f in fields(FieldConfig)}
-    _check(set(values) == names, where, f"the settings {sorted(names)}", sorted(values))
-    for name, value in values.items():
-        _check(
-            isinstance(value, int) and not isinstance(value, bool), f"{where}: {name}", "an integer", value
-        )
-    return FieldConfig(**values)
+        _check(self.checkpoint_minutes > 0, "checkpoint_minutes", "more than 0", self.checkpoint_minutes)
 
 
 @dataclass(frozen=True, kw_only=True)

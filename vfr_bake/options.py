@@ -19,13 +19,16 @@ class Train:
     """
 
     data: Positional[str]
-    """Folder with transforms_train.json (NeRF-synthetic) or transforms.json, or `demo` for the built-in
-    scene."""
+    """Folder with transforms_train.json (NeRF-synthetic), transforms.json or a COLMAP model (sparse/0), or
+    `demo` for the built-in scene; a folder of photographs or a video without cameras has them estimated
+    first."""
     model: Positional[Path]
     """The model file to write, for example model.pt."""
     config: TrainConfig = field(default_factory=TrainConfig)
     force: bool = False
     """Replace the model file if it exists."""
+    resume: bool = False
+    """Go on from the checkpoint that an interrupted run left beside the model file; without one, begin."""
     json: Path | None = None
     """Also write what was measured as JSON to this file; - for stdout."""
 

@@ -30,7 +30,7 @@ from vfr_bake.baking.projection import Projection, code_scales, encode_features,
 from vfr_bake.baking.refinement import collect_lessons, refine
 from vfr_bake.baking.visibility import corner_vertices, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
-from vfr_bake.rendering.render import composited_features, render_image
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr, to_8_bit
 from vfr_bake.training.model_file import Model
 
@@ -133,7 +133,7 @@ def _rendered_features(model: Model) -> np.ndarray:
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         rows = random.choice(len(rays_o), min(per_view, len(rays_o)), replace=False)
-        features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[rows], rays_d[rows])
+        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[rows], rays_d[rows])
         found.append(features[opacity > 0])
     return np.concatenate(found)
 

@@ -23,9 +23,12 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
     spatial, spatial_bias = layer(head.spatial[1])  # type: ignore[arg-type]
     first, first_bias = layer(head.directional[0])  # type: ignore[arg-type]
     from_bottleneck, from_sh = first[:width], first[width:]
+    to_sh = spatial[:, width:], spatial_bias[width:]
+    if head.plain_sh:  # one feature per basis function, which is always 1
+        to_sh = np.zeros((width, len(from_sh))), np.ones(len(from_sh))
     return HeadWeights(
         spatial=((first_layer.T, layer(head.spatial[0])[1]),),  # type: ignore[arg-type]
-        to_sh=(spatial[:, width:], spatial_bias[width:]),
+        to_sh=to_sh,
         directional_first=(
             spatial[:, :width] @ from_bottleneck,
             from_sh,

@@ -8,7 +8,7 @@ import numpy as np
 from exporters.mesh import TriangleMesh, take_faces
 from exporters.surface import extract_surface, remove_small_components
 from vfr_bake.baking.visibility import Progress
-from vfr_bake.rendering.render import composited_features, head_colours
+from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.metrics import to_8_bit
 from vfr_bake.training.model_file import Model
 
@@ -72,6 +72,6 @@ def _colours(model: Model, mesh: TriangleMesh, voxel: float) -> np.ndarray:
     """[n_vertices, 4] uint8 sRGB: the head's colour of a short ray down the normal onto each vertex."""
     rays_d = -mesh.normals.astype(np.float32)
     rays_o = mesh.vertices.astype(np.float32) - rays_d * np.float32(STAND_OFF * voxel)
-    features, opacity, _ = composited_features(model.field, model.occupancy, rays_o, rays_d)
+    features, opacity, _ = model.occupancy.composited_features(model.field, rays_o, rays_d)
     rgb = head_colours(model.field, features / np.maximum(opacity, 1e-3)[:, None], rays_d)
     return np.concatenate([to_8_bit(rgb), np.full((len(rgb), 1), 255, np.uint8)], axis=1)

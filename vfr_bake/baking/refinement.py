@@ -21,7 +21,7 @@ from player.errors import TrainingError
 from player.march_compiled import march
 from player.sparse_grid import SparseGrid
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
-from vfr_bake.rendering.render import composited_features, head_colours
+from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
 N_RAYS = 1_000_000
@@ -62,7 +62,7 @@ def collect_lessons(model: Model, grid: SparseGrid, n_samples: int) -> Lessons:
         rays_o, rays_d = rays_o[rows], rays_d[rows]
         played = march(grid, rays_o, rays_d, n_samples)
         hits = played.hits
-        features, opacity, _ = composited_features(model.field, model.occupancy, rays_o[hits], rays_d[hits])
+        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[hits], rays_d[hits])
         colours = head_colours(model.field, features, rays_d[hits]) * opacity[:, None]
         parts.append((played.features, rays_d[hits], played.opacity[hits], colours, opacity))
     n_lessons = sum(len(part[0]) for part in parts)

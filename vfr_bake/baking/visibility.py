@@ -8,7 +8,7 @@ import numpy as np
 
 from player.errors import TrainingError
 from vfr_bake.kernels.march import mark_visible_cells
-from vfr_bake.rendering.sampling import LIMITS
+from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
 HITS = 16

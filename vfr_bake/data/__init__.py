@@ -5,22 +5,46 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from vfr_bake.data.demo import demo_scene
-from vfr_bake.data.scene import PosedImages, Scene
-from vfr_bake.data.transforms import load_folder
+from player.errors import DataError
+from vfr_bake.config import SceneKind
+from vfr_bake.data.capture import Capture
+from vfr_bake.data.colmap import colmap_folder, load_colmap_folder
+from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.scene import PosedImages, Scene, build_scene
+from vfr_bake.data.transforms import has_transforms, load_transforms_folder
 
 __all__ = ["PosedImages", "Scene", "load_scene"]
 
+Progress = Callable[[int, int], object]
 
-def load_scene(data: str | Path, progress: Callable[[int, int], object] | None = None) -> Scene:
+
+def load_scene(
+    data: str | Path, progress: Progress | None = None, downscale: int = 1, kind: SceneKind = "auto"
+) -> Scene:
     """Load the posed pictures that `data` names.
 
-    `data`: a folder with `transforms_train.json` (NeRF-synthetic) or `transforms.json` (instant-ngp,
-    nerfstudio), or the word `demo` for the built-in scene (a folder of that name is `./demo`). `progress`:
-    called with the number of pictures done and to do.
+    `data`: a folder with `transforms_train.json` (NeRF-synthetic), `transforms.json` (instant-ngp,
+    nerfstudio) or a COLMAP model (`sparse/0`), or the word `demo` for the built-in scene (a folder of that
+    name is `./demo`). `progress`: called with the number of pictures done and to do. `downscale`: pictures
+    are reduced by this factor along each side. `kind`: object or unbounded, or found from the pictures.
 
     Raises DataError or FormatError in one line that names the file and what was expected.
     """
-    if str(data) == "demo":
-        return demo_scene(progress=progress)
-    return load_folder(Path(data), progress)
+    capture = demo_capture(progress=progress) if str(data) == "demo" else load_folder(Path(data), progress)
+    return build_scene(capture, kind, downscale)
+
+
+def load_folder(folder: Path, progress: Progress | None = None) -> Capture:
+    """The pictures and cameras in `folder`, in whichever form they are there. Raises as `load_scene`."""
+    if not folder.exists():
+        raise DataError(f"{folder}: no such folder: expected one with pictures and cameras, or the word demo")
+    if not folder.is_dir():
+        raise DataError(f"{folder}: expected a folder with a transforms.json or a COLMAP model, got a file")
+    if has_transforms(folder):
+        return load_transforms_folder(folder, progress)
+    if colmap_folder(folder):
+        return load_colmap_folder(folder, progress)
+    empty = "an empty folder" if not any(folder.iterdir()) else "neither"
+    raise DataError(
+        f"{folder}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got {empty}"
+    )

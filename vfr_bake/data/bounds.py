@@ -12,10 +12,12 @@ N_CELLS = 64
 MARGIN_CELLS = 1.5
 
 
-def scene_box(cameras: Sequence[Camera], alphas: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+def scene_box(
+    cameras: Sequence[Camera], alphas: Sequence[np.ndarray] | None = None
+) -> tuple[np.ndarray, float]:
     """The centre [3] and the half side of the scene's cube, in the cameras' frame.
 
-    `cameras`: at least one. `alphas`: [n_views, height, width], above 0 where the picture shows something of
+    `cameras`: at least one. `alphas`: [height, width] each, above 0 where the picture shows something of
     the scene; None if pictures do not tell.
 
     Without silhouettes: centred where the optical axes meet, as large as the cameras see around it. With
@@ -23,7 +25,7 @@ def scene_box(cameras: Sequence[Camera], alphas: np.ndarray | None = None) -> tu
 
     >>> from vfr_bake.data.demo import AABB, demo_views
     >>> train, _ = demo_views(size=32, n_train=12, n_test=0)
-    >>> centre, half = scene_box(train.cameras, train.images[..., 3])
+    >>> centre, half = scene_box(train.cameras, [image[..., 3] for image in train.images])
     >>> bool((centre - half < AABB[0]).all() and (centre + half > AABB[1]).all())
     True
     """
@@ -53,7 +55,7 @@ def _seen_box(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
 
 
 def _visual_hull(
-    cameras: Sequence[Camera], alphas: np.ndarray, centre: np.ndarray, half: float
+    cameras: Sequence[Camera], alphas: Sequence[np.ndarray], centre: np.ndarray, half: float
 ) -> np.ndarray:
     """The centres [n, 3] of the grid cells that no view sees past and at least one view sees."""
     cell = 2 * half / N_CELLS

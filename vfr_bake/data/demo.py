@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from player.cameras import Camera
+from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo_shading import shade
 from vfr_bake.data.demo_solids import (
     AABB,
@@ -36,7 +37,7 @@ from vfr_bake.data.demo_solids import (
     inverse,
     scene_distance,
 )
-from vfr_bake.data.scene import PosedImages, Scene, build_scene
+from vfr_bake.data.scene import Scene, build_scene
 
 __all__ = [
     "AABB",
@@ -49,6 +50,7 @@ __all__ = [
     "SCALE",
     "WIRE_RADIUS",
     "demo_cameras",
+    "demo_capture",
     "demo_scene",
     "demo_views",
     "signed_distance",
@@ -140,33 +142,42 @@ def demo_views(
     """Training and test pictures of `size` x `size` pixels, with their cameras in the world frame.
 
     >>> train, test = demo_views(size=8, n_train=2, n_test=1)
-    >>> train.images.shape, len(test.cameras)
-    ((2, 8, 8, 4), 1)
+    >>> len(train.images), train.images[0].shape, len(test.cameras)
+    (2, (8, 8, 4), 1)
     """
     train = demo_cameras(size, n_train)
     test = demo_cameras(size, n_test, phase=0.5, prefix="./test/r_")
     cameras = train + test
-    images = np.empty((len(cameras), size, size, 4), np.uint8)
+    images = []
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         for index, (rgba, _) in enumerate(pool.map(trace, cameras)):
-            images[index] = (rgba * 255 + 0.5).astype(np.uint8)
+            images.append((rgba * 255 + 0.5).astype(np.uint8))
             if progress is not None:
                 progress(index + 1, len(cameras))
     return PosedImages(train, images[:n_train]), PosedImages(test, images[n_train:])
 
 
-def demo_scene(
+def demo_capture(
     size: int = 256,
     n_train: int = 64,
     n_test: int = 16,
     progress: Callable[[int, int], object] | None = None,
-) -> Scene:
-    """The built-in scene as a data set would give it: its box is found from the pictures like any other's.
+) -> Capture:
+    """The built-in scene as a data set would give it, in its world.
 
-    >>> demo_scene(size=16, n_train=6, n_test=1).name
+    >>> demo_capture(size=16, n_train=6, n_test=1).name
     'demo'
     """
-    return build_scene("demo", *demo_views(size, n_train, n_test, progress))
+    return Capture("demo", *demo_views(size, n_train, n_test, progress))
+
+
+def demo_scene(size: int = 256, n_train: int = 64, n_test: int = 16) -> Scene:
+    """The built-in scene in the model frame: its box is found from the pictures like any other's.
+
+    >>> demo_scene(size=16, n_train=6, n_test=1).has_alpha
+    True
+    """
+    return build_scene(demo_capture(size, n_train, n_test))
 
 
 def _sample(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

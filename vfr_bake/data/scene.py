@@ -1,7 +1,7 @@
 """Posed pictures of one scene, in the frame that everything after the data set works in.
 
-The model frame puts the scene's cubic box at [-1, 1]³, whatever the scene's unit; `world_from_model` undoes
-it.
+The model frame puts an object's cubic box at [-1, 1]³ and the cameras of an unbounded scene into the unit
+ball around what they look at, whatever the scene's unit; `world_from_model` undoes it.
 """
 
 from __future__ import annotations
@@ -10,33 +10,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras import Camera
-from player.errors import DataError, ShapeError
+from player.cameras import Camera, focus_point
+from player.errors import DataError
+from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
+from vfr_bake.data.capture import Capture, PosedImages
+from vfr_bake.data.pictures import reduced
 
-
-@dataclass(frozen=True)
-class PosedImages:
-    """Pictures and where they were taken from."""
-
-    cameras: list[Camera]
-    """As many as there are pictures, of the pictures' size; in a `Scene`, in the model frame."""
-    images: np.ndarray
-    """[n_views, height, width, 4] uint8, sRGB and straight (not premultiplied) alpha."""
-
-    def __post_init__(self) -> None:
-        shape = self.images.shape
-        if len(shape) != 4 or shape[3] != 4 or shape[0] != len(self.cameras) or self.images.dtype != np.uint8:
-            raise ShapeError(
-                f"images: expected [{len(self.cameras)}, height, width, 4] uint8, "
-                f"got {list(shape)} {self.images.dtype}"
-            )
-        for camera in self.cameras:
-            if (camera.height, camera.width) != shape[1:3]:
-                raise ShapeError(
-                    f"{camera.name}: camera: expected {shape[2]}x{shape[1]} pixels as its picture has, "
-                    f"got {camera.width}x{camera.height}"
-                )
+BORDER = 2
+"""Pixels along a picture's edge that tell a plain background."""
+PLAIN_SHARE, PLAIN_LEVELS = 0.95, 8
+"""A background is plain if so large a share of the border pixels is within so many levels of one colour."""
+CAMERA_QUANTILE = 0.9
+"""This share of an unbounded scene's cameras lies in the unit ball: one that strayed must not shrink the
+rest."""
+NEAR_CAMERA = 0.05
+"""Matter begins at this distance from a camera, model units, where no points tell: nearer things than a
+twentieth of the way to the subject are out of focus in a photograph."""
+NEAR_QUANTILE, NEAR_SHARE = 0.01, 0.5
+"""Where points tell: half the depth that hardly any is in front of."""
 
 
 @dataclass(frozen=True)
@@ -50,33 +42,87 @@ class Scene:
     has_alpha: bool
     """Whether any picture has a pixel that is not opaque."""
     world_from_model: np.ndarray
-    """[4, 4] float64: uniform scale and translation; the model's [-1, 1]³ is the scene's box in the world."""
+    """[4, 4] float64: uniform scale and translation."""
+    unbounded: bool = False
+    """Whether the pictures show surroundings without end, or an object in a box."""
+    near: float = 0.0
+    """Unbounded: how near to a camera matter may begin, model units."""
 
 
-def build_scene(name: str, train: PosedImages, test: PosedImages) -> Scene:
-    """A `Scene` out of pictures with cameras in the world: finds the box and moves the cameras to the model
-    frame.
+def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) -> Scene:
+    """A `Scene` out of pictures with cameras in the world: finds its kind and moves the cameras to the model
+    frame, which the training views alone decide.
 
-    `train`, `test`: world frame. The box is found from the training views alone.
+    Raises DataError where depth is not to be had: fewer than two training views, or all from one place.
 
-    Raises DataError for fewer than two training views: depth is not to be had from one.
-
-    >>> from vfr_bake.data.demo import demo_views
-    >>> train, test = demo_views(size=16, n_train=4, n_test=1)
-    >>> scene = build_scene("tiny", train, test)
-    >>> scene.has_alpha, scene.train.images.shape
-    (True, (4, 16, 16, 4))
+    >>> from vfr_bake.data.demo import demo_capture
+    >>> scene = build_scene(demo_capture(size=16, n_train=4, n_test=1))
+    >>> scene.has_alpha, scene.unbounded, scene.train.images[0].shape
+    (True, False, (16, 16, 4))
     """
-    if len(train.cameras) < 2:
-        raise DataError(f"{name}: training views: expected at least 2, got {len(train.cameras)}")
-    has_alpha = any(bool((views.images[..., 3] < 255).any()) for views in (train, test))
-    centre, half = scene_box(train.cameras, train.images[..., 3] if has_alpha else None)
+    train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
+    _check_cameras(capture.name, train.cameras)
+    has_alpha = any(bool((image[..., 3] < 255).any()) for image in (*train.images, *test.images))
+    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(train.images))
+    if unbounded:
+        centre, half = _camera_ball(train.cameras)
+    else:
+        centre, half = scene_box(
+            train.cameras, [image[..., 3] for image in train.images] if has_alpha else None
+        )
     world_from_model = np.eye(4)
     world_from_model[:3, :3] *= half
     world_from_model[:3, 3] = centre
+    near = _near(train.cameras, capture.points, half) if unbounded else 0.0
     model_from_world = np.linalg.inv(world_from_model)
 
     def moved(views: PosedImages) -> PosedImages:
         return PosedImages([camera.transformed(model_from_world) for camera in views.cameras], views.images)
 
-    return Scene(name, moved(train), moved(test), has_alpha, world_from_model)
+    return Scene(capture.name, moved(train), moved(test), has_alpha, world_from_model, unbounded, near)
+
+
+def _check_cameras(name: str, cameras: list[Camera]) -> None:
+    if len(cameras) < 2:
+        raise DataError(f"{name}: training views: expected at least 2, got {len(cameras)}")
+    places = np.stack([camera.c2w[:3, 3] for camera in cameras])
+    spread = float(np.abs(places - places[0]).max())
+    if spread <= 1e-6 * float(np.abs(places).max()) or spread == 0:
+        raise DataError(
+            f"{name}: training views: all {len(cameras)} are taken from one place, which tells no depth: "
+            "move around the subject"
+        )
+
+
+def _plain_border(images: list[np.ndarray]) -> bool:
+    """Whether the pictures' edges show nothing but one colour."""
+    edges = [
+        strip.reshape(-1, 4)[:, :3]
+        for image in images
+        for strip in (image[:BORDER], image[-BORDER:], image[:, :BORDER], image[:, -BORDER:])
+    ]
+    pixels = np.concatenate(edges).astype(np.int16)
+    off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
+    return float((off <= PLAIN_LEVELS).mean()) >= PLAIN_SHARE
+
+
+def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius of the ball around what the cameras look at that holds (nearly all of) them."""
+    places = np.stack([camera.c2w[:3, 3] for camera in cameras])
+    middle = places.mean(axis=0)
+    spread = float(np.linalg.norm(places - middle, axis=1).max())
+    centre = focus_point(cameras)
+    if np.linalg.norm(centre - middle) > 20 * spread:
+        centre = middle  # nearly parallel views meet nowhere in particular
+    return centre, float(np.quantile(np.linalg.norm(places - centre, axis=1), CAMERA_QUANTILE))
+
+
+def _near(cameras: list[Camera], points: np.ndarray | None, unit: float) -> float:
+    """How near to a camera matter may begin, in units of `unit`."""
+    if points is None or len(points) == 0:
+        return NEAR_CAMERA
+    depths = np.concatenate([(camera.c2w[:3, 3] - points) @ camera.c2w[:3, 2] for camera in cameras])
+    ahead = depths[depths > 0]
+    if len(ahead) == 0:
+        return NEAR_CAMERA
+    return min(NEAR_CAMERA * 4, NEAR_SHARE * float(np.quantile(ahead, NEAR_QUANTILE)) / unit)

@@ -15,12 +15,12 @@ use."""
 
 
 class TruncatedExp(torch.autograd.Function):
-    """exp(min(x, 15)), with the gradient of the clamped value everywhere, so that a saturated density can
-    come down."""
+    """exp(x) with x clamped to [-15, 15], with the gradient of the clamped value everywhere, so that a
+    saturated density can come down and one that vanished can come back."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
-        y = x.clamp(max=LARGEST_LOGIT).exp()
+        y = x.clamp(-LARGEST_LOGIT, LARGEST_LOGIT).exp()
         ctx.save_for_backward(y)
         return y
 

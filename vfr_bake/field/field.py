@@ -25,7 +25,7 @@ class VfrField(nn.Module):
 
     def kernel_arguments(self) -> tuple[tuple, tuple]:
         """(grid, network) as the march kernels take them."""
-        return (self.grid.table.detach().numpy(), *self.grid.layout), self.density.arrays()
+        return self.grid.kernel_arguments(), self.density.arrays()
 
     @torch.no_grad()
     def log_densities(self, points: np.ndarray) -> np.ndarray:

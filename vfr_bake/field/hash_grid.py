@@ -16,16 +16,42 @@ from vfr_bake.config import FieldConfig
 from vfr_bake.kernels import hash_grid as kernels
 
 
-def level_resolutions(config: FieldConfig) -> list[int]:
+def level_resolutions(n_levels: int, base_resolution: int, max_resolution: int) -> list[int]:
     """Cells per axis of every level, geometric from base to max.
 
-    >>> level_resolutions(FieldConfig(n_levels=3, base_resolution=16, max_resolution=64))
+    >>> level_resolutions(3, 16, 64)
     [16, 32, 64]
     """
-    if config.n_levels == 1:
-        return [config.max_resolution]
-    growth = (config.max_resolution / config.base_resolution) ** (1 / (config.n_levels - 1))
-    return [int(np.floor(config.base_resolution * growth**level + 1e-6)) for level in range(config.n_levels)]
+    if n_levels == 1:
+        return [max_resolution]
+    growth = (max_resolution / base_resolution) ** (1 / (n_levels - 1))
+    return [int(np.floor(base_resolution * growth**level + 1e-6)) for level in range(n_levels)]
+
+
+class GridLayout:
+    """Which entries of a table belong to which level, and which of them are shared.
+
+    >>> GridLayout(n_levels=2, base_resolution=4, max_resolution=64, log2_table_size=10).n_entries
+    1149
+    """
+
+    def __init__(
+        self, n_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int
+    ) -> None:
+        self.resolutions = level_resolutions(n_levels, base_resolution, max_resolution)
+        size = 2**log2_table_size
+        vertices = [(n + 1) ** 3 for n in self.resolutions]
+        self.hashed = np.array([n > size for n in vertices])
+        self.offsets = np.concatenate([[0], np.cumsum([min(n, size) for n in vertices])]).astype(np.int64)
+        self.mask = size - 1
+
+    @property
+    def n_entries(self) -> int:
+        return int(self.offsets[-1])
+
+    def kernel_arguments(self, dtype: np.dtype | type) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """(scales, offsets, hashed, mask) as the kernels take them."""
+        return np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask
 
 
 class HashGrid(nn.Module):
@@ -38,22 +64,20 @@ class HashGrid(nn.Module):
 
     def __init__(self, config: FieldConfig) -> None:
         super().__init__()
-        self.resolutions = level_resolutions(config)
-        size = 2**config.log2_table_size
-        vertices = [(n + 1) ** 3 for n in self.resolutions]
-        self.hashed = np.array([n > size for n in vertices])
-        self.offsets = np.concatenate([[0], np.cumsum([min(n, size) for n in vertices])]).astype(np.int64)
-        self.mask = size - 1
+        self.layout = GridLayout(
+            config.n_levels, config.base_resolution, config.max_resolution, config.log2_table_size
+        )
+        self.touched = np.empty((0, 0), np.int64), np.empty(0, np.int64)
+        """Rows [n_levels, n] that the last backward pass wrote to, and how many of them at each level."""
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
         self.table = nn.Parameter(
-            torch.empty(int(self.offsets[-1]), kernels.N_CHANNELS).uniform_(-1e-4, 1e-4)
+            torch.empty(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4)
         )
 
-    @property
-    def layout(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """(scales, offsets, hashed, mask) as the kernels take them."""
-        dtype = torch.zeros((), dtype=self.table.dtype).numpy().dtype
-        return np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask
+    def kernel_arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+        """(table, scales, offsets, hashed, mask) as the kernels take them."""
+        table = self.table.detach().numpy()
+        return table, *self.layout.kernel_arguments(table.dtype)
 
     def forward(self, points: Tensor, features: Tensor | None = None) -> Tensor:
         """Features [n_points, n_channels] at `points` [n_points, 3] of the unit cube.
@@ -67,7 +91,7 @@ class HashGrid(nn.Module):
         """The same as `forward`, level by level in plain torch: slow, readable, differentiable by
         autograd."""
         outputs = []
-        for level, n in enumerate(self.resolutions):
+        for level, n in enumerate(self.layout.resolutions):
             position = points * n
             cell = position.floor().clamp(0, n - 1)
             inside = position - cell
@@ -81,12 +105,12 @@ class HashGrid(nn.Module):
 
     def _rows(self, vertex: Tensor, level: int) -> Tensor:
         x, y, z = vertex.unbind(-1)
-        if self.hashed[level]:
-            row = (x ^ (y * kernels.PRIME_Y) ^ (z * kernels.PRIME_Z)) & self.mask
+        if self.layout.hashed[level]:
+            row = (x ^ (y * kernels.PRIME_Y) ^ (z * kernels.PRIME_Z)) & self.layout.mask
         else:
-            side = self.resolutions[level] + 1
+            side = self.layout.resolutions[level] + 1
             row = (z * side + y) * side + x
-        return row + int(self.offsets[level])
+        return row + int(self.layout.offsets[level])
 
 
 class _Encode(torch.autograd.Function):
@@ -96,8 +120,9 @@ class _Encode(torch.autograd.Function):
         ctx.save_for_backward(points, table)
         if features is not None:
             return features
-        out = torch.empty(len(points), kernels.N_CHANNELS * len(grid.resolutions), dtype=table.dtype)
-        kernels.encode(points.detach().numpy(), table.detach().numpy(), *grid.layout, out.numpy())
+        n_channels = kernels.N_CHANNELS * len(grid.layout.resolutions)
+        out = torch.empty(len(points), n_channels, dtype=table.dtype)
+        kernels.encode(points.detach().numpy(), *grid.kernel_arguments(), out.numpy())
         return out
 
     @staticmethod
@@ -108,9 +133,12 @@ class _Encode(torch.autograd.Function):
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
         gradient = grads[0].contiguous().numpy()
-        scales, offsets, hashed, mask = ctx.grid.layout
-        n_threads = get_num_threads()
+        scales, offsets, hashed, mask = ctx.grid.layout.kernel_arguments(gradient.dtype)
+        rows = np.empty((len(scales), 8 * len(points)), np.int64)
+        counts = np.empty(len(scales), np.int64)
         kernels.scatter(
-            points.numpy(), gradient, scales, offsets, hashed, mask, n_threads, grad_table.numpy()
-        )
+            points.numpy(), gradient, scales, offsets, hashed, mask, get_num_threads(), grad_table.numpy(),
+            rows, counts,
+        )  # fmt: skip
+        ctx.grid.touched = rows, counts
         return None, None if in_place else grad_table, None, None

@@ -27,12 +27,10 @@ class Pilot(nn.Module):
         self.out = nn.Linear(width, 3)
         initialise(self.layers)
 
-    def forward(self, features: Tensor, dirs: Tensor, counts: Tensor) -> Tensor:
-        """Colours [n_samples, 3] of `features` [n_samples, n_channels]; ray r looks along `dirs[r]` and owns
-        the next
-        `counts[r]` samples."""
-        basis = self.harmonics(dirs).repeat_interleave(counts, dim=0)
-        h = torch.cat([features, basis], dim=-1)
+    def forward(self, features: Tensor, dirs: Tensor) -> Tensor:
+        """Colours [n_samples, 3] of `features` [n_samples, n_channels] seen along unit `dirs` [n_samples,
+        3]."""
+        h = torch.cat([features, self.harmonics(dirs)], dim=-1)
         for layer in self.layers:
             h = gelu(layer(h))
         return torch.sigmoid(self.out(h))

@@ -22,7 +22,7 @@ hidden."""
 
 
 @njit(inline="always")
-def _corner_rows(ix, iy, iz, side, offset, mask, hashed):
+def corner_rows(ix, iy, iz, side, offset, mask, hashed):
     """Rows of the eight corners, in the order 000 100 010 110 001 101 011 111 (x fastest)."""
     if hashed:
         y0 = iy * PRIME_Y
@@ -68,7 +68,7 @@ def encode_point(x, y, z, table, scales, offsets, hashed, mask, out):
         iz = min(max(np.int64(pz), 0), last)
         fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
         gx, gy, gz = one - fx, one - fy, one - fz
-        r0, r1, r2, r3, r4, r5, r6, r7 = _corner_rows(
+        r0, r1, r2, r3, r4, r5, r6, r7 = corner_rows(
             ix, iy, iz, last + 2, offsets[level], mask, hashed[level]
         )
         w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
@@ -89,13 +89,14 @@ def encode(points, table, scales, offsets, hashed, mask, out):
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, grad_table):
+def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, grad_table, rows, counts):
     """Add to `grad_table` [n_entries, 2] the gradient of `encode`, given `grad_features` [n_points, 2 *
     n_levels].
 
     One thread owns a level: no two threads write to one entry, and the sum has one order, so the result is
     the same in every run. Fine levels cost more than coarse ones, so neighbouring levels go to different
-    threads.
+    threads. Entries whose gradient was zero are listed in `rows[level, : counts[level]]`; `rows` has room for
+    8 a point.
     """
     kind = grad_table.dtype.type
     one = kind(1)
@@ -104,6 +105,7 @@ def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, gra
         for level in range(thread, n_levels, n_threads):
             scale = scales[level]
             last = np.int64(scale) - 1
+            n = 0
             for i in range(points.shape[0]):
                 g0, g1 = grad_features[i, 2 * level], grad_features[i, 2 * level + 1]
                 if g0 == 0 and g1 == 0:
@@ -114,7 +116,7 @@ def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, gra
                 iz = min(max(np.int64(pz), 0), last)
                 fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
                 gx, gy, gz = one - fx, one - fy, one - fz
-                rows = _corner_rows(ix, iy, iz, last + 2, offsets[level], mask, hashed[level])
+                corners = corner_rows(ix, iy, iz, last + 2, offsets[level], mask, hashed[level])
                 weights = (
                     gx * gy * gz,
                     fx * gy * gz,
@@ -126,5 +128,10 @@ def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, gra
                     fx * fy * fz,
                 )
                 for corner in range(8):
-                    grad_table[rows[corner], 0] += weights[corner] * g0
-                    grad_table[rows[corner], 1] += weights[corner] * g1
+                    row = corners[corner]
+                    if grad_table[row, 0] == 0 and grad_table[row, 1] == 0:
+                        rows[level, n] = row
+                        n += 1
+                    grad_table[row, 0] += weights[corner] * g0
+                    grad_table[row, 1] += weights[corner] * g1
+            counts[level] = n

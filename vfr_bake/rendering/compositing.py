@@ -10,61 +10,95 @@ from vfr_bake.kernels import compositing as kernels
 
 
 def composite(
-    sigmas: Tensor, features: Tensor, starts: Tensor, counts: Tensor, step: float
-) -> tuple[Tensor, Tensor]:
-    """Composited features [n_rays, n_channels] and opacity [n_rays].
+    sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Composited features [n_rays, n_channels], opacity [n_rays] and weights [n_samples].
 
-    `sigmas` [n_samples] >= 0, `features` [n_samples, n_channels]; ray r owns the rows `starts[r] : starts[r]
-    + counts[r]`. Optical depth is accumulated and exponentiated once; a product of (1 - alpha) would lose
-    thin samples.
+    `sigmas` [n_samples] >= 0, `features` [n_samples, n_channels], `deltas` [n_samples] lengths along the ray;
+    ray r owns the rows `starts[r] : starts[r] + counts[r]`. Optical depth is accumulated and exponentiated
+    once; a product of (1 - alpha) would lose thin samples.
 
-    >>> F, A = composite(torch.tensor([1.0]), torch.ones(1, 2), torch.tensor([0]), torch.tensor([1]), 1.0)
-    >>> round(float(A[0]), 4), round(float(F[0, 0]), 4)
-    (0.6321, 0.6321)
+    >>> one = torch.tensor([1.0])
+    >>> F, A, w = composite(one, torch.ones(1, 2), one, torch.tensor([0]), torch.tensor([1]))
+    >>> round(float(A[0]), 4), round(float(F[0, 0]), 4), round(float(w[0]), 4)
+    (0.6321, 0.6321, 0.6321)
     """
-    return _Composite.apply(sigmas, features, starts, counts, step)  # type: ignore[return-value]
+    return _Composite.apply(sigmas, features, deltas, starts, counts)  # type: ignore[return-value]
 
 
 def composite_reference(
-    sigmas: Tensor, features: Tensor, starts: Tensor, counts: Tensor, step: float
-) -> tuple[Tensor, Tensor]:
+    sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The same ray by ray in plain torch."""
-    out, opacity = [], []
+    out, opacity, all_weights = [], [], []
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-        delta = sigmas[start : start + count] * step
+        depth = (sigmas * deltas)[start : start + count]
         # The optical depth in front of each sample; a difference of sums would cancel behind a dense one.
-        before = torch.cumsum(torch.cat([delta.new_zeros(1), delta]), dim=0)[:-1]
-        weights = torch.exp(-before) * -torch.expm1(-delta)
+        before = torch.cumsum(torch.cat([depth.new_zeros(1), depth]), dim=0)[:-1]
+        weights = torch.exp(-before) * -torch.expm1(-depth)
         out.append((weights[:, None] * features[start : start + count]).sum(dim=0))
-        opacity.append(-torch.expm1(-delta.sum()))
-    return torch.stack(out), torch.stack(opacity)
+        opacity.append(-torch.expm1(-depth.sum()))
+        all_weights.append(weights)
+    return torch.stack(out), torch.stack(opacity), torch.cat(all_weights)
+
+
+def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:
+    """Distortion [n_rays] of the weights over intervals with ascending `mids` and `widths` [n_samples]:
+    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 b_i (mip-NeRF 360, eq. 15).
+
+    Differentiable with respect to `weights` alone. A single opaque interval of width b gives b / 3.
+
+    >>> one = torch.tensor([1.0])
+    >>> round(float(distortion(one, one, one, torch.tensor([0]), torch.tensor([1]))), 4)
+    0.3333
+    """
+    return _Distortion.apply(weights, mids, widths, starts, counts)  # type: ignore[return-value]
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, sigmas, features, starts, counts, step):
-        kind = sigmas.detach().numpy().dtype.type
-        weights, taus = torch.empty_like(sigmas), torch.empty_like(sigmas)
+    def forward(ctx, sigmas, features, deltas, starts, counts):
+        weights, taus = torch.zeros_like(sigmas), torch.empty_like(sigmas)
         out = torch.empty(len(starts), features.shape[1], dtype=features.dtype)
         opacity = torch.empty(len(starts), dtype=features.dtype)
         kernels.composite(
-            _array(sigmas), _array(features), starts.numpy(), counts.numpy(), kind(step),
+            _array(sigmas), _array(features), deltas.numpy(), starts.numpy(), counts.numpy(),
             weights.numpy(), taus.numpy(), out.numpy(), opacity.numpy(),
         )  # fmt: skip
-        ctx.save_for_backward(features, starts, counts, weights, taus)
-        ctx.step = kind(step)
-        return out, opacity
+        ctx.save_for_backward(features, deltas, starts, counts, weights, taus)
+        return out, opacity, weights
 
     @staticmethod
     def backward(ctx, *grads):
-        features, starts, counts, weights, taus = ctx.saved_tensors
+        features, deltas, starts, counts, weights, taus = ctx.saved_tensors
+        grad_out, grad_opacity, grad_weights = (_array(grad) for grad in grads)
         # Rows that belong to no ray (there are none in a march) would keep this zero.
         grad_sigmas, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
         kernels.composite_backward(
-            _array(features), starts.numpy(), counts.numpy(), ctx.step, weights.numpy(), taus.numpy(),
-            _array(grads[0]), _array(grads[1]), grad_sigmas.numpy(), grad_features.numpy(),
+            _array(features), deltas.numpy(), starts.numpy(), counts.numpy(), weights.numpy(), taus.numpy(),
+            grad_out, grad_opacity, grad_weights, grad_sigmas.numpy(), grad_features.numpy(),
         )  # fmt: skip
         return grad_sigmas, grad_features, None, None, None
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, weights, mids, widths, starts, counts):
+        losses = torch.empty(len(starts), dtype=weights.dtype)
+        grad = torch.zeros_like(weights)
+        kernels.distortion(
+            _array(weights), mids.numpy(), widths.numpy(), starts.numpy(), counts.numpy(), losses.numpy(),
+            grad.numpy(),
+        )  # fmt: skip
+        ctx.save_for_backward(grad, starts, counts)
+        return losses
+
+    @staticmethod
+    def backward(ctx, *grads):
+        grad, starts, counts = ctx.saved_tensors
+        # Packed without gaps, though not in the rays' order.
+        order = torch.argsort(starts, stable=True)
+        return grad * grads[0][order].repeat_interleave(counts[order]), None, None, None, None
 
 
 def _array(tensor: Tensor) -> np.ndarray:

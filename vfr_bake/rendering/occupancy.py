@@ -6,17 +6,22 @@ dense, and compared with a threshold on the opacity of one march step.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import torch
 
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels.march import chebyshev_distance
+from vfr_bake.kernels.march import chebyshev_distance, render_features
+from vfr_bake.rendering.samples import LIMITS, Samples
+from vfr_bake.rendering.sampling import march
 
 OPACITY_THRESHOLD = 0.01
 """A cell is empty when a whole march step through it is less opaque than this (nerfacc's default)."""
 DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
-SHARE = 32
+SHARE = 64
 """An update looks at one cell in this many at random, and at as many of the occupied ones."""
 
 
@@ -72,6 +77,41 @@ class OccupancyGrid:
         if not occupied.any():
             occupied = np.ones_like(occupied)  # nothing found yet: look everywhere rather than nowhere
         chebyshev_distance(occupied, self.distance)
+
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays]) of rays, every sample
+        used."""
+        features = np.zeros((len(rays_o), field.config.n_channels), np.float32)
+        opacity, depth = np.zeros((2, len(rays_o)), np.float32)
+        render_features(
+            rays_o, rays_d, np.float32(self.step), self.distance, *field.kernel_arguments(), LIMITS,
+            features, opacity, depth,
+        )  # fmt: skip
+        return features, opacity, depth
+
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+        """The samples of all rays, in the middle of their intervals."""
+        middle = torch.full((len(rays_o),), 0.5)
+        budget = len(rays_o) * (int(np.ceil(2 * 3**0.5 / self.step)) + 3)
+        return march(field, self, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle, budget)
+
+    def state(self) -> dict[str, Any]:
+        """All that the next update depends on, in tensors and plain values."""
+        return {
+            "densities": torch.from_numpy(self.densities),
+            "occupied": torch.from_numpy(self.occupied),
+            "n_updates": self.n_updates,
+            "random": self._random.bit_generator.state,
+        }
+
+    def restore_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave."""
+        self.densities[:] = state["densities"].numpy()
+        self.n_updates = state["n_updates"]
+        self._random.bit_generator.state = state["random"]
+        self._set_occupied(state["occupied"].numpy())
 
     def restore(self, occupied: np.ndarray) -> None:
         """Take `occupied` [n, n, n] bool from a model file."""

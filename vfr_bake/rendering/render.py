@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 import torch
 
 from player.cameras import Camera
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels import march as kernels
-from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.sampling import LIMITS
+from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.samples import Samples
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
+RAY_CHUNK = 1024
+"""Rays whose samples are held at once where the head is evaluated at each of them."""
 
 
-def composited_features(
-    field: VfrField, occupancy: OccupancyGrid, rays_o: np.ndarray, rays_d: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(features [n_rays, n_channels], opacity [n_rays], depth [n_rays]) of rays in the model frame, every
-    sample used."""
-    features = np.zeros((len(rays_o), field.config.n_channels), np.float32)
-    opacity = np.zeros(len(rays_o), np.float32)
-    depth = np.zeros(len(rays_o), np.float32)
-    kernels.render_features(
-        rays_o, rays_d, np.float32(occupancy.step), occupancy.distance, *field.kernel_arguments(), LIMITS,
-        features, opacity, depth,
-    )  # fmt: skip
-    return features, opacity, depth
+class Sampler(Protocol):
+    """Where to look a field up along rays: the occupancy grid of an object, the proposals of a scene."""
+
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays], 0 where nothing is)."""
+        ...
+
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+        """The visible samples of all rays, without jitter."""
+        ...
 
 
 @torch.no_grad()
@@ -40,14 +42,41 @@ def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.
     return out
 
 
-def render_image(
-    field: VfrField, occupancy: OccupancyGrid, camera: Camera, background: np.ndarray
-) -> np.ndarray:
+def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: np.ndarray) -> np.ndarray:
     """The full model's picture [height, width, 3] float32 in [0, 1] for a camera in the model frame."""
     rays_o, rays_d = camera.rays()
-    features, opacity, _ = composited_features(field, occupancy, rays_o, rays_d)
-    rgb = np.broadcast_to(background.astype(np.float32), (len(rays_o), 3)).copy()
-    hit = np.flatnonzero(opacity > 0)
-    alpha = opacity[hit, None]
-    rgb[hit] = head_colours(field, features[hit], rays_d[hit]) * alpha + rgb[hit] * (1 - alpha)
+    render = _composited_colours if field.config.compositing == "colour" else _colours_of_features
+    colours, opacity = render(field, sampler, rays_o, rays_d)
+    rgb = colours + (1 - opacity[:, None]) * background.astype(np.float32)
     return rgb.reshape(camera.height, camera.width, 3)
+
+
+def _colours_of_features(
+    field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Equation 3: (colours times opacity [n_rays, 3], opacity [n_rays]), one head a ray."""
+    features, opacity, _ = sampler.composited_features(field, rays_o, rays_d)
+    colours = np.zeros((len(rays_o), 3), np.float32)
+    hit = np.flatnonzero(opacity > 0)
+    colours[hit] = head_colours(field, features[hit], rays_d[hit]) * opacity[hit, None]
+    return colours, opacity
+
+
+@torch.no_grad()
+def _composited_colours(
+    field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Equation 2: the same of colours that the head gives at every sample."""
+    colours = np.empty((len(rays_o), 3), np.float32)
+    opacity = np.empty(len(rays_o), np.float32)
+    for start in range(0, len(rays_o), RAY_CHUNK):
+        rows = slice(start, start + RAY_CHUNK)
+        samples = sampler.sample_all(field, rays_o[rows], rays_d[rows])
+        sigmas = field.density(samples.features)
+        dirs = torch.from_numpy(rays_d[rows])
+        order = torch.argsort(samples.starts, stable=True)
+        rays = order.repeat_interleave(samples.counts[order])
+        values = field.head(samples.features, dirs[rays])
+        found = composite(sigmas, values, samples.deltas, samples.starts, samples.counts)
+        colours[rows], opacity[rows] = found[0].numpy(), found[1].numpy()
+    return colours, opacity

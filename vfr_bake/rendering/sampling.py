@@ -1,43 +1,22 @@
-"""Samples along rays: lattice points in occupied cells, up to where the ray is opaque.
+"""Samples of bounded scenes: lattice points in occupied cells, up to where the ray is opaque.
 
-Letters as in `vfr_bake.kernels.march`. The ray's samples are rows `starts[r] : starts[r] + counts[r]` of the
-flat arrays.
+Letters as in `vfr_bake.kernels.march`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.field.density import LARGEST_LOGIT
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import march as kernels
-from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.samples import LIMITS, OPAQUE_DEPTH, Samples
 
-OPAQUE_DEPTH = float(-np.log(1e-3))
-"""Optical depth at which a ray stops: what lies behind weighs less than 1e-3 in all."""
-LIMITS = (np.float32(LARGEST_LOGIT), np.float32(OPAQUE_DEPTH))
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Visible samples of a batch of rays."""
-
-    t_mid: Tensor
-    """[n_samples] distance along the ray in model units."""
-    points: Tensor
-    """[n_samples, 3] in the unit cube."""
-    features: Tensor
-    """[n_samples, n_channels], as the march has met them."""
-    rays: Tensor
-    """[n_served] indices of the rays that were served; rays past the sample budget are left out."""
-    starts: Tensor
-    """[n_served] first sample of each."""
-    counts: Tensor
-    """[n_served] number of samples of each, 0 where a ray meets nothing."""
+if TYPE_CHECKING:
+    from vfr_bake.rendering.occupancy import OccupancyGrid
 
 
 def march(
@@ -48,10 +27,12 @@ def march(
     jitter: Tensor,
     budget: int,
     n_chunks: int = 2,
+    weight_floor: float = 0.0,
 ) -> Samples:
     """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays] in [0, 1).
 
-    The budget is grown to hold at least one whole ray per chunk.
+    The budget is grown to hold at least one whole ray per chunk. Of samples that weigh less than
+    `weight_floor` only a few are kept.
     """
     step = occupancy.step
     longest = int(np.ceil(2 * 3**0.5 / step)) + 3
@@ -63,13 +44,15 @@ def march(
     counts = np.empty(len(rays_o), np.int64)
     starts = np.empty(len(rays_o), np.int64)
     used = kernels.march_samples(
-        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), occupancy.distance,
+        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), np.float32(weight_floor),
+        occupancy.distance,
         *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features,
     )  # fmt: skip
     first = np.concatenate([[0], np.cumsum(used)])
     served = np.flatnonzero(counts >= 0)
     return Samples(
         t_mid=torch.from_numpy(_join(t_mid, used)),
+        deltas=torch.full((int(first[-1]),), step),
         points=torch.from_numpy(_join(points, used)),
         features=torch.from_numpy(_join(features, used)),
         rays=torch.from_numpy(served),

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vfr_bake.data.scene import PosedImages
+from vfr_bake.data.capture import PosedImages
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.render import render_image
+from vfr_bake.rendering.render import Sampler, render_image
 from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 
 
@@ -24,7 +23,7 @@ class ViewScore:
 
 
 def evaluate(
-    field: VfrField, occupancy: OccupancyGrid, views: PosedImages, background: np.ndarray, n_views: int = 0
+    field: VfrField, sampler: Sampler, views: PosedImages, background: np.ndarray, n_views: int = 0
 ) -> Iterator[ViewScore]:
     """Render views (model frame) with the full model and compare; `n_views` of them spread evenly, 0 for
     all."""
@@ -33,6 +32,6 @@ def evaluate(
         chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
     for index in chosen:
         camera = views.cameras[index]
-        rgb = to_8_bit(render_image(field, occupancy, camera, background)) / 255
+        rgb = to_8_bit(render_image(field, sampler, camera, background)) / 255
         photograph = to_8_bit(over_background(views.images[index], background)) / 255
         yield ViewScore(camera.name, psnr(rgb, photograph))

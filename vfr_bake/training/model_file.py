@@ -2,9 +2,10 @@
 `weights_only=True`.
 
 Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
-the training, for the record), step (march step in model units), world_from_model [4, 4], has_alpha,
-background [3], cameras (training cameras in the WORLD frame, as transforms.json text), occupied (bits of the
-occupancy grid), occupancy_resolution, state (the field's tensors), figures (what training measured).
+the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
+frame, as transforms.json text), sampler (below), state (the field's tensors), figures (what training
+measured). The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits),
+resolution; that of an unbounded scene its proposals: near (model units), state (their tensors).
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from player.cameras import Camera
 from player.errors import ConfigError, FormatError, VersionError
 from player.files import write_bytes
 from player.transforms import parse_transforms, transforms_cameras, write_cameras
-from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.config import field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.proposals import FAR, ProposalSampler
 
 FORMAT = "vfr-model"
-VERSION = (1, 0)
+VERSION = (2, 0)
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,10 @@ class Model:
     """A trained field with its frame, its cameras and its occupancy grid."""
 
     field: VfrField
-    occupancy: OccupancyGrid
+    sampler: OccupancyGrid | ProposalSampler
     world_from_model: np.ndarray
-    """[4, 4] float64 similarity; the scene box is [-1, 1]^3 of the model frame."""
+    """[4, 4] float64 similarity; an object's box is [-1, 1]^3 of the model frame, a scene's cameras are in
+    its unit ball."""
     cameras: list[Camera]
     """Training cameras, WORLD frame."""
     has_alpha: bool
@@ -45,6 +49,16 @@ class Model:
     """Settings of the training, for the record."""
     figures: dict[str, Any]
     """What training measured, for the record."""
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
+        """The occupancy grid of an object. Raises ConfigError for an unbounded scene, which has none."""
+        if not isinstance(self.sampler, OccupancyGrid):
+            raise ConfigError(
+                "model: kind: expected an object, got an unbounded scene, which cannot be baked yet: "
+                "train with --kind object to bake what the cameras look at"
+            )
+        return self.sampler
 
     @property
     def background(self) -> np.ndarray:
@@ -66,12 +80,10 @@ def save_model(path: Path, model: Model) -> None:
             "version": list(VERSION),
             "field": asdict(model.field.config),
             "train": model.train,
-            "step": float(model.occupancy.step),
             "world_from_model": torch.from_numpy(np.asarray(model.world_from_model, np.float64)),
             "has_alpha": model.has_alpha,
             "cameras": write_cameras(model.cameras).decode(),
-            "occupied": torch.from_numpy(np.packbits(model.occupancy.occupied.reshape(-1))),
-            "occupancy_resolution": model.occupancy.resolution,
+            "sampler": _sampler_content(model.sampler),
             "state": model.field.state_dict(),
             "figures": model.figures,
         },
@@ -84,19 +96,14 @@ def load_model(path: Path) -> Model:
     """Read a model file. Raises FormatError (not a model, cut short, wrong shapes) or VersionError (too
     new)."""
     content = _read(path)
-    step = content["step"]
-    if not (isinstance(step, float) and 0 < step < 1):
-        raise FormatError(f"{path}: step: expected a number between 0 and 1, got {step}")
     try:
         config = field_config_from(content["field"], f"{path}: field")
     except ConfigError as error:
         raise FormatError(str(error)) from None
-    field = _restore_field(path, config, content["state"])
-    occupancy = OccupancyGrid(_resolution(path, content), step, seed=0)
-    bits = np.unpackbits(content["occupied"].numpy())[: occupancy.resolution**3]
-    if len(bits) != occupancy.resolution**3:
-        raise FormatError(f"{path}: occupied: expected {occupancy.resolution**3} bits, got {len(bits)}")
-    occupancy.restore(bits.astype(bool).reshape((occupancy.resolution,) * 3))
+    field = VfrField(config)
+    _restore(field, content["state"], f"{path}: state")
+    restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
+    sampler = restore_sampler(content["sampler"], f"{path}: sampler")
     world_from_model = content["world_from_model"].double().numpy()
     if world_from_model.shape != (4, 4) or not np.isfinite(world_from_model).all():
         raise FormatError(
@@ -105,7 +112,7 @@ def load_model(path: Path) -> Model:
     where = f"{path}: cameras"
     return Model(
         field=field,
-        occupancy=occupancy,
+        sampler=sampler,
         world_from_model=world_from_model,
         cameras=transforms_cameras(parse_transforms(content["cameras"].encode(), where), where),
         has_alpha=bool(content["has_alpha"]),
@@ -128,36 +135,63 @@ def _read(path: Path) -> dict[str, Any]:
         raise FormatError(f"{path}: version: expected two integers, got {version}")
     if version[0] != VERSION[0]:
         raise VersionError(
-            f"{path}: version: expected {VERSION[0]}.x, got {version[0]}.{version[1]}: update vfr-bake"
+            f"{path}: version: expected {VERSION[0]}.x, got {version[0]}.{version[1]}: "
+            + ("update vfr-bake" if version[0] > VERSION[0] else "train again")
         )
     kinds = {
-        "field": dict, "train": dict, "step": float, "world_from_model": torch.Tensor, "has_alpha": bool,
-        "cameras": str, "occupied": torch.Tensor, "occupancy_resolution": int, "state": dict, "figures": dict,
+        "field": dict, "train": dict, "world_from_model": torch.Tensor, "has_alpha": bool, "cameras": str,
+        "sampler": dict, "state": dict, "figures": dict,
     }  # fmt: skip
-    for key, kind in kinds.items():
-        if not isinstance(content.get(key), kind):
-            raise FormatError(
-                f"{path}: {key}: expected {kind.__name__}, got {type(content.get(key)).__name__}"
-            )
+    _check_kinds(content, kinds, str(path))
     return content
 
 
-def _resolution(path: Path, content: dict[str, Any]) -> int:
-    n = content["occupancy_resolution"]
-    if not 8 <= n <= 512:
-        raise FormatError(f"{path}: occupancy_resolution: expected 8 to 512, got {n}")
-    return n
+def _sampler_content(sampler: OccupancyGrid | ProposalSampler) -> dict[str, Any]:
+    if isinstance(sampler, ProposalSampler):
+        return {"near": sampler.near, "state": sampler.state_dict()}
+    bits = torch.from_numpy(np.packbits(sampler.occupied.reshape(-1)))
+    return {"step": sampler.step, "occupied": bits, "resolution": sampler.resolution}
 
 
-def _restore_field(path: Path, config: FieldConfig, state: dict[str, Any]) -> VfrField:
-    field = VfrField(config)
+def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
+    _check_kinds(content, {"step": float, "occupied": torch.Tensor, "resolution": int}, where)
+    step, resolution = content["step"], content["resolution"]
+    if not 0 < step < 1:
+        raise FormatError(f"{where}: step: expected a number between 0 and 1, got {step}")
+    if not 8 <= resolution <= 512:
+        raise FormatError(f"{where}: resolution: expected 8 to 512, got {resolution}")
+    bits = np.unpackbits(content["occupied"].numpy())[: resolution**3]
+    if len(bits) != resolution**3:
+        raise FormatError(f"{where}: occupied: expected {resolution**3} bits, got {len(bits)}")
+    occupancy = OccupancyGrid(resolution, step, seed=0)
+    occupancy.restore(bits.astype(bool).reshape((resolution,) * 3))
+    return occupancy
+
+
+def _restore_proposals(content: dict[str, Any], where: str) -> ProposalSampler:
+    _check_kinds(content, {"near": float, "state": dict}, where)
+    if not 0 <= content["near"] < FAR:
+        raise FormatError(f"{where}: near: expected 0 to {FAR}, got {content['near']}")
+    sampler = ProposalSampler(content["near"])
+    _restore(sampler, content["state"], where)
+    return sampler
+
+
+def _restore(module: nn.Module, state: dict[str, Any], where: str) -> None:
     try:
-        field.load_state_dict(state)
+        module.load_state_dict(state)
     except (RuntimeError, AttributeError) as error:
         raise FormatError(
-            f"{path}: state: the tensors do not fit the settings: {str(error).splitlines()[0]}"
+            f"{where}: the tensors do not fit the settings: {str(error).splitlines()[0]}"
         ) from error
-    for name, tensor in field.state_dict().items():
+    for name, tensor in module.state_dict().items():
         if not torch.isfinite(tensor).all():
-            raise FormatError(f"{path}: state: {name}: expected finite numbers, got NaN or infinity")
-    return field
+            raise FormatError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
+
+
+def _check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
+    for key, kind in kinds.items():
+        if not isinstance(content.get(key), kind):
+            raise FormatError(
+                f"{where}: {key}: expected {kind.__name__}, got {type(content.get(key)).__name__}"
+            )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
+from numba import get_num_threads
 from torch import Tensor
 
-from vfr_bake.kernels.adam import adam_step
+from vfr_bake.kernels.adam import adam_step, adam_step_rows
 
 WARMUP_STEPS = 100
 MILESTONES = (0.5, 0.75, 0.9)
@@ -27,28 +30,44 @@ def rate_factor(step: int, progress: float) -> float:
 
 
 class GridAdam:
-    """Adam on a hash table [n_entries, 2] whose gradient is mostly zero; it owns the gradient buffer."""
+    """Adam on a hash table [n_entries, n_channels] whose gradient is mostly zero; it owns that gradient's
+    buffer."""
 
     def __init__(
         self, table: Tensor, beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e-15
     ) -> None:
         self.table = table
         table.grad = torch.zeros_like(table)
-        self.mean, self.square = torch.zeros_like(table), torch.zeros_like(table)
+        self.moments = torch.zeros(len(table), 2 * table.shape[1])
         self.betas, self.epsilon = (beta1, beta2), epsilon
         self.n_steps = 0
 
-    def step(self, rate: float) -> None:
-        """Apply and clear the gradient."""
+    @property
+    def gradient(self) -> Tensor:
+        """The buffer [n_entries, n_channels] that gradients are added to."""
+        assert self.table.grad is not None
+        return self.table.grad
+
+    def step(self, rate: float, touched: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        """Apply and clear the gradient; `touched`, if known, are the rows that have one: [n_levels, n] and
+        how many at each level."""
         self.n_steps += 1
         beta1, beta2 = self.betas
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
-        assert self.table.grad is not None
-        arrays = (self.table.detach(), self.table.grad, self.mean, self.square)
-        scalars = (rate * correction, beta1, beta2, self.epsilon)
-        adam_step(*(a.numpy() for a in arrays), *(np.float32(s) for s in scalars))
+        arrays = [a.numpy() for a in (self.table.detach(), self.gradient, self.moments)]
+        scalars = [np.float32(s) for s in (rate * correction, beta1, beta2, self.epsilon)]
+        if touched is None:
+            adam_step(*arrays, *scalars)
+        else:
+            adam_step_rows(*touched, get_num_threads(), *arrays, *scalars)
+
+    def state(self) -> dict[str, Any]:
+        return {"moments": self.moments, "n_steps": self.n_steps}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.moments.copy_(state["moments"])
+        self.n_steps = state["n_steps"]
 
     def clear(self) -> None:
         """Drop the gradient of a step that is not to be taken."""
-        assert self.table.grad is not None
-        self.table.grad.zero_()
+        self.gradient.zero_()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.data.scene import PosedImages
+from vfr_bake.data.capture import PosedImages
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,14 @@ class RayBatch:
 
 
 class PixelSampler:
-    """Draws pixels uniformly from all training pictures."""
+    """Draws pixels uniformly from all training pictures, of whatever sizes."""
 
     def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        self.images = torch.from_numpy(views.images)
+        self._pixels = torch.from_numpy(np.concatenate([image.reshape(-1, 4) for image in views.images]))
+        sizes = torch.tensor([image.shape[0] * image.shape[1] for image in views.images])
+        self._ends = torch.cumsum(sizes, 0)
+        self._starts = self._ends - sizes
+        self._widths = torch.tensor([image.shape[1] for image in views.images])
         self._poses = torch.from_numpy(np.stack([c.c2w for c in views.cameras]).astype(np.float32))
         self._intrinsics = torch.tensor(
             [[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], dtype=torch.float32
@@ -35,9 +39,9 @@ class PixelSampler:
         self._generator = generator
 
     def draw(self, n_rays: int) -> RayBatch:
-        n_views, height, width, _ = self.images.shape
-        index = torch.randint(n_views * height * width, (n_rays,), generator=self._generator)
-        view, pixel = index // (height * width), index % (height * width)
+        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator)
+        view = torch.searchsorted(self._ends, index, right=True)
+        pixel, width = index - self._starts[view], self._widths[view]
         row, column = pixel // width, pixel % width
         fx, fy, cx, cy = self._intrinsics[view].unbind(-1)
         x, y = (column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy
@@ -46,5 +50,5 @@ class PixelSampler:
         return RayBatch(
             rays_o=poses[:, :3, 3].contiguous(),
             rays_d=torch.nn.functional.normalize(dirs, dim=-1),
-            rgba=self.images[view, row, column].float() / 255,
+            rgba=self._pixels[index].float() / 255,
         )

@@ -6,8 +6,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,21 +18,22 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.field.pilot import Pilot
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.sampling import Samples, march
+from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.samples import Samples
+from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.optimiser import GridAdam, rate_factor
-from vfr_bake.training.rays import PixelSampler, RayBatch
+from vfr_bake.training.processes import Processes
+from vfr_bake.training.rays import PixelSampler
 
-FOG_STEPS = 512
-"""First steps, in which empty space has to be found and the occupancy grid is updated often."""
-STEPS_PER_UPDATE = (16, 64)
-"""Steps between two looks of the occupancy grid at the field: at first, and later."""
+MINUTES = {False: 9.0, True: 14.0}
+"""Training time by whether the scene is unbounded, where none is asked for."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did."""
+    """What one step did, over all processes."""
 
     step: int
     progress: float
@@ -42,104 +43,205 @@ class StepReport:
     n_rays: int
     n_samples: int
     seconds: float
-    """Since training began."""
+    """Since training began, interruptions left out."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """This process' rays of one step."""
+
+    rays_o: Tensor
+    """[n_rays, 3] model frame."""
+    rays_d: Tensor
+    """[n_rays, 3] unit length."""
+    rgba: Tensor
+    """[n_rays, 4] in [0, 1], straight alpha, sRGB."""
+    jitter: Tensor
+    """[n_rays, 3] in [0, 1)."""
+    background: Tensor
+    """[n_rays, 3] in [0, 1]."""
 
 
 class Trainer:
-    """Trains a field on a scene; iterate over `run()` and use `field` and `occupancy` at any time."""
+    """Trains a field on a scene; iterate over `run()` and use `field` and `sampler` at any time.
 
-    def __init__(self, scene: Scene, config: TrainConfig) -> None:
+    In several processes every one makes the same Trainer and draws the same joint batch, of which it takes
+    its share.
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, processes: Processes | None = None) -> None:
         torch.manual_seed(config.seed)
         self.config = config
-        self.field = VfrField(config.field)
-        self.pilot = Pilot(config.field)
-        self.occupancy = OccupancyGrid(config.occupancy_resolution, config.step, config.seed)
+        self.processes = processes or Processes(0, 1)
+        self.field = VfrField(config.field.resolved(scene.unbounded))
+        self.pilot = Pilot(self.field.config)
         self.n_bad_steps = 0
+        self._minutes = config.minutes if config.minutes is not None else MINUTES[scene.unbounded]
+        self._next_step, self._seconds = 0, 0.0
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._sampler = PixelSampler(scene.train, self._generator)
-        self._random_background = scene.has_alpha
+        self._pixels = PixelSampler(scene.train, self._generator)
+        # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
+        self._random_background = scene.has_alpha or scene.unbounded
+        self._guide: Guide
+        if scene.unbounded:
+            self._guide = ProposalGuide(config, scene.near)
+        else:
+            step_length = 2.0 * config.step_cells / self.field.config.max_resolution
+            self._guide = OccupancyGuide(config, step_length)
         self._grid_adam = GridAdam(self.field.grid.table)
-        networks = [*self.field.network_parameters(), *self.pilot.parameters()]
+        self._parameters = [*self.field.network_parameters(), *self.pilot.parameters()]
+        # Buffers from the start: a process whose rays meet nothing must have something to add up.
+        for parameter in self._parameters:
+            parameter.grad = torch.zeros_like(parameter)
         self._adam = torch.optim.Adam(
-            networks, lr=config.network_rate, eps=1e-15, betas=(0.9, 0.99), fused=True
+            self._parameters, lr=config.network_rate, eps=1e-15, betas=(0.9, 0.99), fused=True
         )
-        self._samples_per_ray = 2 / config.step
+
+    @property
+    def next_step(self) -> int:
+        """How many steps are done."""
+        return self._next_step
+
+    @property
+    def seconds(self) -> float:
+        """Training time so far, interruptions left out."""
+        return self._seconds
+
+    @property
+    def sampler(self) -> OccupancyGrid | ProposalSampler:
+        """Where the field is to be looked up."""
+        return self._guide.sampler
 
     def run(self) -> Iterator[StepReport]:
         """Train until the steps or the minutes are over. Raises TrainingError when the loss stays NaN."""
-        begin = time.monotonic()
+        begin = time.monotonic() - self._seconds
         bad_in_a_row = 0
-        for step in range(self.config.steps):
-            seconds = time.monotonic() - begin
-            progress = max(step / self.config.steps, seconds / (60 * self.config.minutes))
+        for step in range(self._next_step, self.config.steps):
+            seconds = self.processes.agree(time.monotonic() - begin)
+            progress = max(step / self.config.steps, seconds / (60 * self._minutes))
             if progress >= 1:
                 return
-            if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
-                self.occupancy.update(self.field)
-            loss, batch_rays, n_samples = self._step(step, progress)
-            bad_in_a_row = 0 if np.isfinite(loss) else bad_in_a_row + 1
+            self._guide.prepare(step, self.field)
+            loss, n_rays, n_samples = self._step(step, progress)
+            bad_in_a_row = bad_in_a_row + 1 if loss != loss else 0
             if bad_in_a_row == MOST_BAD_STEPS:
                 raise TrainingError(
                     f"step {step}: loss: not a finite number for {MOST_BAD_STEPS} steps: "
                     f"lower --network-rate (now {self.config.network_rate}) "
                     f"or --grid-rate (now {self.config.grid_rate})"
                 )
-            yield StepReport(step, progress, loss, batch_rays, n_samples, time.monotonic() - begin)
+            self._next_step, self._seconds = step + 1, time.monotonic() - begin
+            yield StepReport(step, progress, loss, n_rays, n_samples, self._seconds)
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
-        config = self.config
-        pilot = step < config.pilot_steps
-        # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
-        budget = config.batch_samples // 2 if pilot else config.batch_samples
-        n_rays = int(min(config.max_rays, max(64, 1.1 * budget / self._samples_per_ray)))
-        batch = self._sampler.draw(n_rays)
-        jitter = torch.rand(n_rays, generator=self._generator)
-        samples = march(
-            self.field,
-            self.occupancy,
-            batch.rays_o,
-            batch.rays_d,
-            jitter,
-            budget,
-            torch.get_num_threads(),
+        """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
+        # Where colours are composited anyway the head needs no pilot.
+        pilot = step < self.config.pilot_steps and self.field.config.compositing == "features"
+        batch = self._draw(self._guide.n_rays(pilot))
+        samples = self._guide.sample(
+            self.field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
         )
-        n_served, n_samples = len(samples.rays), len(samples.t_mid)
-        per_ray = max(n_samples / max(n_served, 1), 1.0)
-        self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
+        totals = self.processes.total(len(samples.rays), len(samples.t_mid))
+        n_rays, n_samples = int(totals[0]), int(totals[1])
+        self._guide.observe(n_rays, n_samples)
+        error, weights = self._error(batch, samples, pilot)
+        regulariser = self._guide.regulariser(samples, weights)
+        value = self.processes.total(float(error.detach()))[0] / (3 * max(n_rays, 1))
+        loss = error / (3 * max(n_rays, 1))
+        if regulariser is not None:
+            loss = loss + regulariser / max(n_rays, 1)
+        # A batch that met nothing (seen by no process) has nothing to teach.
+        if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays):
+            return value if n_samples == 0 else float("nan"), n_rays, n_samples
         factor = rate_factor(step, progress)
-        loss = self._loss(batch, samples, pilot)
-        value = float(loss.detach())
-        self._adam.zero_grad(set_to_none=True)
-        if loss.requires_grad and np.isfinite(value):
-            loss.backward()
-            for group in self._adam.param_groups:
-                group["lr"] = config.network_rate * factor
-            self._adam.step()
-            self._grid_adam.step(config.grid_rate * factor)
-        elif not np.isfinite(value):
-            self.n_bad_steps += 1
-        return value, n_served, n_samples
+        for group in self._adam.param_groups:
+            group["lr"] = self.config.network_rate * factor
+        self._adam.step()
+        rate = self.config.grid_rate * factor
+        # Another process' rows are in the sum, but not in this one's list.
+        self._grid_adam.step(rate, self.field.grid.touched if self.processes.size == 1 else None)
+        for table in self._guide.tables():
+            table.step(rate)
+        return value, n_rays, n_samples
 
-    def _loss(self, batch: RayBatch, samples: Samples, pilot: bool) -> Tensor:
-        """Mean squared error of the served rays over a random (pictures with alpha) or white background."""
-        rgba = batch.rgba[samples.rays]
+    def _draw(self, n_rays: int) -> Batch:
+        """This process' share of a joint batch, drawn alike in all of them."""
+        rays = self._pixels.draw(n_rays)
+        jitter = torch.rand(n_rays, 3, generator=self._generator)
         if self._random_background:
-            background = torch.rand(len(rgba), 3, generator=self._generator)
+            background = torch.rand(n_rays, 3, generator=self._generator)
         else:
-            background = torch.ones(len(rgba), 3)
+            background = torch.ones(n_rays, 3)
+        share = self.processes.share
+        return Batch(*(share(rows) for rows in (rays.rays_o, rays.rays_d, rays.rgba, jitter, background)))
+
+    def _error(self, batch: Batch, samples: Samples, pilot: bool) -> tuple[Tensor, Tensor]:
+        """(Squared error of the served rays, summed over rays and channels; weights [n_samples])."""
+        rgba, background = batch.rgba[samples.rays], batch.background[samples.rays]
         target = rgba[:, :3] * rgba[:, 3:] + background * (1 - rgba[:, 3:])
         # Rays that meet nothing show the background; only the others need the field.
         hit = samples.counts > 0
         missed_error = ((background[~hit] - target[~hit]) ** 2).sum()
+        dirs = batch.rays_d[samples.rays[hit]]
+        colours, opacity, weights = self._colours(
+            samples, samples.starts[hit], samples.counts[hit], dirs, pilot
+        )
+        rgb = colours + background[hit] * (1 - opacity[:, None])
+        return ((rgb - target[hit]) ** 2).sum() + missed_error, weights
+
+    def _colours(
+        self, samples: Samples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(Colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of the rays that hit."""
         features = self.field.grid(samples.points, samples.features)
         sigmas = self.field.density(features)
-        dirs = batch.rays_d[samples.rays[hit]]
-        starts, counts = samples.starts[hit], samples.counts[hit]
-        if pilot:
-            values = self.pilot(features, dirs, counts)
-            colours, opacity = composite(sigmas, values, starts, counts, self.config.step)
-        else:
-            composited, opacity = composite(sigmas, features, starts, counts, self.config.step)
-            colours = self.field.head(composited, dirs) * opacity[:, None]
-        rgb = colours + background[hit] * (1 - opacity[:, None])
-        return (((rgb - target[hit]) ** 2).sum() + missed_error) / (3 * max(len(rgba), 1))
+        if pilot or self.field.config.compositing == "colour":
+            network = self.pilot if pilot else self.field.head
+            # Rays of several chunks: the samples' order is that of the starts.
+            order = torch.argsort(starts)
+            values = network(features, dirs[order.repeat_interleave(counts[order])])
+            return composite(sigmas, values, samples.deltas, starts, counts)
+        composited, opacity, weights = composite(sigmas, features, samples.deltas, starts, counts)
+        return self.field.head(composited, dirs) * opacity[:, None], opacity, weights
+
+    def _backward(self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int) -> bool:
+        """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
+        self._adam.zero_grad(set_to_none=False)
+        tables = [self._grid_adam, *self._guide.tables()]
+        if value == value and abs(value) != float("inf"):
+            if loss.requires_grad:
+                loss.backward()
+            self._guide.add_gradients(samples, weights, n_rays)
+            gradients = [gradient for p in self._parameters if (gradient := p.grad) is not None]
+            self.processes.add_up([*gradients, *(table.gradient for table in tables)])
+            if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+                return True
+        self.n_bad_steps += 1
+        for table in tables:
+            table.clear()
+        return False
+
+    def state(self) -> dict[str, Any]:
+        """All that the steps to come depend on, in tensors and plain values."""
+        return {
+            "step": self._next_step,
+            "seconds": self._seconds,
+            "n_bad_steps": self.n_bad_steps,
+            "generator": self._generator.get_state(),
+            "field": self.field.state_dict(),
+            "pilot": self.pilot.state_dict(),
+            "adam": self._adam.state_dict(),
+            "grid_adam": self._grid_adam.state(),
+            "guide": self._guide.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` gave, as if nothing had happened in between."""
+        self._next_step, self._seconds = state["step"], state["seconds"]
+        self.n_bad_steps = state["n_bad_steps"]
+        self._generator.set_state(state["generator"])
+        self.field.load_state_dict(state["field"])
+        self.pilot.load_state_dict(state["pilot"])
+        self._adam.load_state_dict(state["adam"])
+        self._grid_adam.restore(state["grid_adam"])
+        self._guide.restore(state["guide"])

@@ -19,10 +19,10 @@ from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.projection import code_scales, encode_features, project
 from vfr_bake.baking.refinement import FoldedHead, Lessons, refine
 from vfr_bake.baking.visibility import close_gaps, corner_vertices, pixel_footprints, visible_cells
-from vfr_bake.config import BakeConfig, FieldConfig, TrainConfig
+from vfr_bake.config import BakeConfig, FieldConfig, FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
-from vfr_bake.rendering.render import composited_features, render_image
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.trainer import Trainer
@@ -35,13 +35,13 @@ def quiet(stage: str, done: int, of: int) -> None:
 @pytest.fixture(scope="module")
 def model() -> Model:
     scene = demo.demo_scene(size=64, n_train=24, n_test=2)
-    field = FieldConfig(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
+    field = FieldOptions(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
     config = TrainConfig(field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48)
     trainer = Trainer(scene, config)
     for _ in trainer.run():
         pass
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.occupancy, scene.world_from_model, cameras, True, {}, {})
+    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})
 
 
 def test_projection_is_the_best_of_its_rank() -> None:
@@ -96,7 +96,7 @@ def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Pa
     bake(model, tmp_path / "asset", BakeConfig(resolution=96, mesh_resolution=16, check_views=1), quiet)
     large = camera.resized(256, 256)
     played = render(Asset.open(tmp_path / "asset"), large, n_samples=0)
-    _, opacity, _ = composited_features(model.field, model.occupancy, *in_model.resized(256, 256).rays())
+    _, opacity, _ = model.occupancy.composited_features(model.field, *in_model.resized(256, 256).rays())
     solid = opacity.reshape(256, 256) > 0.95
     assert solid.mean() > 0.1
     assert (played.opacity[solid] < 0.5).mean() < 0.002
@@ -186,12 +186,10 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path
 
 
 def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
-    empty = Trainer(
-        demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(field=model.field.config, steps=1)
-    )
+    empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(steps=1))
     with torch.no_grad():
         empty.field.density.out.bias.fill_(-30)
-    hollow = Model(empty.field, empty.occupancy, np.eye(4), model.cameras, True, {}, {})
+    hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
     with pytest.raises(TrainingError, match="empty or a thin fog"):
         bake(hollow, tmp_path / "asset", BakeConfig(), quiet)
     assert list(tmp_path.iterdir()) == []

@@ -19,6 +19,7 @@ from vfr_bake.data.demo import (
     SCALE,
     WIRE_RADIUS,
     demo_cameras,
+    demo_capture,
     demo_scene,
     demo_views,
     signed_distance,
@@ -231,5 +232,6 @@ def test_the_scene_box_holds_the_scene_closely():
 
 
 def test_the_word_demo_loads_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("vfr_bake.data.demo_scene", lambda progress: ("the demo", progress))
-    assert load_scene("demo") == ("the demo", None)
+    small = demo_capture(size=16, n_train=4, n_test=1)
+    monkeypatch.setattr("vfr_bake.data.demo_capture", lambda progress: small)
+    assert load_scene("demo").name == "demo"

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from player.errors import DataError, ShapeError
+from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
-from vfr_bake.data.scene import PosedImages, build_scene
+from vfr_bake.data.scene import NEAR_CAMERA, build_scene
 
 
 def test_rays_are_the_same_rays_in_both_frames():
     train, test = demo_views(24, 10, 2)
-    scene = build_scene("a", train, test)
+    scene = build_scene(Capture("a", train, test))
     for views, moved in ((train, scene.train), (test, scene.test)):
         for before, after in zip(views.cameras, moved.cameras, strict=True):
             origin, direction = before.rays()
@@ -34,7 +35,7 @@ def test_the_model_frame_does_not_know_the_unit(scale: float):
         PosedImages([c.transformed(similarity) for c in views.cameras], views.images)
         for views in (train, test)
     ]
-    one, two = build_scene("a", train, test), build_scene("a", *scaled)
+    one, two = build_scene(Capture("a", train, test)), build_scene(Capture("a", *scaled))
     for a, b in zip(one.train.cameras, two.train.cameras, strict=True):
         np.testing.assert_allclose(a.c2w, b.c2w, atol=1e-5)  # float32 hull grids may differ by their rounding
     np.testing.assert_allclose(
@@ -45,15 +46,85 @@ def test_the_model_frame_does_not_know_the_unit(scale: float):
 def test_too_few_views():
     train, test = demo_views(8, 1, 1)
     with pytest.raises(DataError, match="a: training views: expected at least 2, got 1"):
-        build_scene("a", train, test)
+        build_scene(Capture("a", train, test))
 
 
 def test_pictures_must_fit_their_cameras():
     cameras = demo_cameras(8, 2)
-    good = np.zeros((2, 8, 8, 4), np.uint8)
+    good = [np.zeros((8, 8, 4), np.uint8)] * 2
     assert PosedImages(cameras, good).images is good
-    for bad in (good[:1], good[..., :3], good.astype(np.float32), good[0]):
-        with pytest.raises(ShapeError, match=r"images: expected \[2, height, width, 4\] uint8"):
-            PosedImages(cameras, bad)
+    with pytest.raises(ShapeError, match="images: expected 2, one a camera, got 1"):
+        PosedImages(cameras, good[:1])
+    for bad in (good[0][..., :3], good[0].astype(np.float32), good[0][0]):
+        with pytest.raises(ShapeError, match=r"image: expected \[height, width, 4\] uint8"):
+            PosedImages(cameras, [good[0], bad])
     with pytest.raises(ShapeError, match="camera: expected 8x8 pixels as its picture has, got 9x8"):
         PosedImages([cameras[0], replace(cameras[1], width=9)], good)
+
+
+def opaque(views: PosedImages, colour: list[int] | None) -> PosedImages:
+    """The views over a colour, or over a sky full of detail."""
+    random = np.random.default_rng(0)
+    images = []
+    for image in views.images:
+        sky = random.integers(0, 255, image.shape, np.uint8) if colour is None else np.array([*colour, 255])
+        images.append(
+            np.where(image[..., 3:] > 0, image, sky).astype(np.uint8) | np.array([0, 0, 0, 255], np.uint8)
+        )
+    return PosedImages(views.cameras, images)
+
+
+def test_the_kind_of_scene_is_seen_and_can_be_overruled():
+    train, test = demo_views(24, 10, 2)
+    assert not build_scene(Capture("alpha", train, test)).unbounded
+    for colour in ([0, 0, 0], [255, 255, 255]):
+        assert not build_scene(Capture("plain", opaque(train, colour), opaque(test, colour))).unbounded
+    around = Capture("around", opaque(train, None), opaque(test, None))
+    assert build_scene(around).unbounded
+    assert not build_scene(around, "object").unbounded
+    assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
+
+
+def test_an_unbounded_scene_has_its_cameras_in_the_unit_ball():
+    train, test = demo_views(24, 10, 2)
+    scene = build_scene(Capture("a", train, test), "unbounded")
+    distances = [np.linalg.norm(camera.c2w[:3, 3]) for camera in scene.train.cameras]
+    assert 0.9 < max(distances) < 1.2
+    assert scene.near == NEAR_CAMERA
+    eye = train.cameras[0].c2w
+    points = np.stack([eye[:3, 3] - eye[:3, 2] * depth for depth in (0.2, 0.3)])
+    near = build_scene(Capture("a", train, test, points=points), "unbounded").near
+    assert 0.05 < near * scene.world_from_model[0, 0] < 0.2  # half of the least depths, 0.2 and 0.3
+
+
+def test_views_from_one_place_tell_no_depth():
+    train, test = demo_views(8, 4, 1)
+    same = PosedImages([replace(c, c2w=train.cameras[0].c2w) for c in train.cameras], train.images)
+    with pytest.raises(DataError, match="all 4 are taken from one place"):
+        build_scene(Capture("a", same, test))
+
+
+def test_parallel_views_still_have_a_frame():
+    train, test = demo_views(8, 4, 1)
+    cameras = []
+    for index, camera in enumerate(train.cameras):
+        c2w = np.eye(4)
+        c2w[0, 3] = index
+        cameras.append(replace(camera, c2w=c2w))
+    scene = build_scene(Capture("a", PosedImages(cameras, train.images), test), "unbounded")
+    assert np.isfinite(scene.world_from_model).all()
+    assert max(np.linalg.norm(c.c2w[:3, 3]) for c in scene.train.cameras) < 2
+
+
+def test_downscaled_pictures_show_the_same_through_the_same_lens():
+    train, test = demo_views(25, 3, 1)
+    scene = build_scene(Capture("a", train, test), downscale=2)
+    camera, image = scene.train.cameras[0], scene.train.images[0]
+    assert (camera.width, camera.height) == (12, 12) == image.shape[:2]
+    assert camera.fx == train.cameras[0].fx / 2 and camera.cx == train.cameras[0].cx / 2
+    block = train.images[0][4:6, 6:8].reshape(-1, 4).astype(float)
+    alpha = block[:, 3].mean()
+    rgb = (block[:, :3] * block[:, 3:]).sum(axis=0) / max(block[:, 3].sum(), 1)
+    np.testing.assert_allclose(image[2, 3], [*rgb, alpha], atol=1)
+    with pytest.raises(DataError, match="downscale: expected at most 25, got 26"):
+        build_scene(Capture("a", train, test), downscale=26)

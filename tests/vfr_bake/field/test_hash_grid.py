@@ -8,7 +8,7 @@ import torch
 
 from tests.reference import hash_grid_feature
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.hash_grid import HashGrid, level_resolutions
+from vfr_bake.field.hash_grid import GridLayout, HashGrid, level_resolutions
 
 SMALL = FieldConfig(n_levels=5, base_resolution=3, max_resolution=40, log2_table_size=10)
 
@@ -41,7 +41,10 @@ def test_kernel_and_twin_match_the_equation(dtype: torch.dtype, tolerance: float
     points = torch.cat([HARD_POINTS, torch.rand(50, 3, dtype=torch.float64)]).to(dtype)
     table = grid.table.detach().double().numpy()
     expected = np.stack(
-        [hash_grid_feature(p, table, grid.resolutions, grid.offsets, 2**10) for p in points.double().numpy()]
+        [
+            hash_grid_feature(p, table, grid.layout.resolutions, grid.layout.offsets, 2**10)
+            for p in points.double().numpy()
+        ]
     )
     np.testing.assert_allclose(grid(points).detach().numpy(), expected, rtol=0, atol=tolerance)
     np.testing.assert_allclose(grid.reference(points).detach().numpy(), expected, rtol=0, atol=tolerance)
@@ -82,6 +85,29 @@ def test_scatter_is_the_same_in_every_run() -> None:
     assert first.sum().item() == pytest.approx(20_000 * SMALL.n_channels, rel=1e-4)
 
 
+def test_the_rows_that_a_backward_pass_wrote_are_listed() -> None:
+    grid = small_grid(torch.float32)
+    grid.table.grad = torch.zeros_like(grid.table)
+    grid(torch.rand(50, 3)).sum().backward()
+    rows, counts = grid.touched
+    listed = np.concatenate([rows[level, :n] for level, n in enumerate(counts)])
+    written = torch.nonzero(grid.table.grad.any(dim=1))[:, 0].numpy()
+    assert len(written) > 100
+    assert np.array_equal(np.unique(listed), written)
+
+
+@pytest.mark.parametrize(
+    ("n_levels", "millions"),
+    [(16, 13), (32, 34)],  # table 2 of the paper
+)
+def test_the_papers_parameter_counts(n_levels: int, millions: int) -> None:
+    scene = n_levels == 32
+    # 34 M is "the number of levels x the number of voxels each level x the number of feature channels".
+    layout = GridLayout(n_levels, 16, 4096, 19)
+    count = n_levels * 2**19 * 2 if scene else layout.n_entries * 2
+    assert round(count / 1e6) == millions
+
+
 def test_no_point_at_all() -> None:
     assert small_grid(torch.float32)(torch.zeros(0, 3)).shape == (0, SMALL.n_channels)
 
@@ -96,6 +122,6 @@ def test_given_features_are_kept_and_still_send_their_gradient() -> None:
 
 
 def test_resolutions_are_geometric_and_end_at_the_finest() -> None:
-    resolutions = level_resolutions(FieldConfig())
+    resolutions = level_resolutions(16, 16, 512)
     assert (resolutions[0], resolutions[-1], len(resolutions)) == (16, 512, 16)
     assert resolutions == sorted(set(resolutions))

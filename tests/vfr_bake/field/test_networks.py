@@ -21,6 +21,7 @@ def test_density_is_bounded_and_its_gradient_never_dies() -> None:
     y = TruncatedExp.apply(x)
     y.sum().backward()
     assert torch.isfinite(y).all() and (y >= 0).all()
+    assert y[0].item() == pytest.approx(np.exp(-LARGEST_LOGIT), rel=1e-6)
     assert y[-1].item() == pytest.approx(np.exp(LARGEST_LOGIT), rel=1e-6)
     assert torch.equal(x.grad, y.detach())
 
@@ -45,6 +46,13 @@ def test_head_has_the_papers_shape() -> None:
     assert sum(rows * columns for rows, columns in shapes) == 369_408
 
 
+def test_plain_encoding_predicts_no_features() -> None:
+    head = Head(FieldConfig(view_encoding="sh", activation="relu", n_directional_layers=2, head_width=64))
+    shapes = [tuple(layer.weight.shape) for layer in (*head.spatial, *head.directional, head.out)]
+    assert shapes == [(64, 32), (64, 64), (64, 80), (64, 64), (3, 64)]
+    assert head.activation is torch.nn.functional.relu
+
+
 def test_head_depends_on_the_direction_through_the_basis_alone() -> None:
     torch.manual_seed(0)
     head = Head(FieldConfig(n_levels=2, head_width=32, sh_degree=1))
@@ -66,8 +74,8 @@ def test_pilot_sees_every_sample_along_its_own_ray() -> None:
     torch.manual_seed(0)
     pilot = Pilot(FieldConfig(n_levels=2))
     features, dirs = torch.randn(3, 4), torch.nn.functional.normalize(torch.randn(2, 3), dim=-1)
-    together = pilot(features, dirs, torch.tensor([2, 1]))
-    alone = pilot(features[2:], dirs[1:], torch.tensor([1]))
+    together = pilot(features, dirs[[0, 0, 1]])
+    alone = pilot(features[2:], dirs[1:])
     torch.testing.assert_close(together[2:], alone)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.reference import composite_ray
-from vfr_bake.rendering.compositing import composite, composite_reference
+from vfr_bake.rendering.compositing import composite, composite_reference, distortion
 
 STEP = 0.25
 RAYS = {
@@ -27,32 +27,35 @@ def packed(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
     sigmas = torch.tensor([s for ray in RAYS.values() for s in ray], dtype=dtype)
     counts = torch.tensor([len(ray) for ray in RAYS.values()])
     starts = torch.cumsum(counts, 0) - counts
-    return sigmas, torch.randn(len(sigmas), 5, dtype=dtype), starts, counts
+    deltas = torch.full_like(sigmas, STEP)
+    return sigmas, torch.randn(len(sigmas), 5, dtype=dtype), deltas, starts, counts
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 3e-6)])
 def test_kernel_and_twin_match_the_equation(dtype: torch.dtype, tolerance: float) -> None:
-    sigmas, features, starts, counts = packed(dtype)
+    sigmas, features, deltas, starts, counts = packed(dtype)
     for function in (composite, composite_reference):
-        out, opacity = function(sigmas, features, starts, counts, STEP)
+        out, opacity, weights = function(sigmas, features, deltas, starts, counts)
         for ray, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
             rows = slice(start, start + count)
             expected, alpha = composite_ray(sigmas[rows].numpy(), features[rows].numpy(), STEP)
             np.testing.assert_allclose(out[ray].numpy(), expected, rtol=0, atol=tolerance)
             assert opacity[ray].item() == pytest.approx(alpha, abs=tolerance, rel=1e-5)
+            assert weights[rows].sum().item() == pytest.approx(alpha, abs=tolerance, rel=1e-5)
 
 
 def test_thin_samples_are_not_lost() -> None:
     # A product of (1 - alpha) in float32 would find no opacity at all here.
     n = 10_000
     sigmas, features = torch.full((n,), 1e-9), torch.ones(n, 1)
-    _, opacity = composite(sigmas, features, torch.tensor([0]), torch.tensor([n]), 1.0)
+    _, opacity, _ = composite(sigmas, features, torch.ones(n), torch.tensor([0]), torch.tensor([n]))
     assert opacity.item() == pytest.approx(1e-5, rel=1e-3)
 
 
 def test_weights_sum_to_the_opacity() -> None:
-    sigmas, _, starts, counts = packed(torch.float64)
-    out, opacity = composite(sigmas, torch.ones(len(sigmas), 1, dtype=torch.float64), starts, counts, STEP)
+    sigmas, _, deltas, starts, counts = packed(torch.float64)
+    ones = torch.ones(len(sigmas), 1, dtype=torch.float64)
+    out, opacity, _ = composite(sigmas, ones, deltas, starts, counts)
     torch.testing.assert_close(out[:, 0], opacity, rtol=1e-12, atol=0)
 
 
@@ -61,20 +64,62 @@ def test_gradients_match_finite_differences() -> None:
     sigmas = (torch.rand(9, dtype=torch.float64) * 4).requires_grad_()
     features = torch.randn(9, 3, dtype=torch.float64, requires_grad=True)
     starts, counts = torch.tensor([0, 4, 4]), torch.tensor([4, 0, 5])
-    assert torch.autograd.gradcheck(composite, (sigmas, features, starts, counts, STEP))
+    deltas = torch.rand(9, dtype=torch.float64)
+    assert torch.autograd.gradcheck(composite, (sigmas, features, deltas, starts, counts))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_gradients_match_autograd_on_hard_inputs(dtype: torch.dtype) -> None:
-    sigmas, features, starts, counts = packed(dtype)
+    sigmas, features, deltas, starts, counts = packed(dtype)
     gradients = []
     for function in (composite, composite_reference):
         s, f = sigmas.clone().requires_grad_(), features.clone().requires_grad_()
-        out, opacity = function(s, f, starts, counts, STEP)
+        outputs = function(s, f, deltas, starts, counts)
         torch.manual_seed(5)
-        (out * torch.randn_like(out)).sum().add((opacity * torch.randn_like(opacity)).sum()).backward()
+        sum((out * torch.randn_like(out)).sum() for out in outputs).backward()
         gradients.append((s.grad, f.grad))
     tolerance = 1e-12 if dtype == torch.float64 else 3e-5
     for ours, twin in zip(*gradients, strict=True):
         assert torch.isfinite(ours).all()
         torch.testing.assert_close(ours, twin, rtol=1e-4, atol=tolerance)
+
+
+def naive_distortion(weights: np.ndarray, mids: np.ndarray, widths: np.ndarray) -> float:
+    """Mip-NeRF 360, equation 15, pair by pair."""
+    pairs = sum(
+        weights[i] * weights[j] * abs(mids[i] - mids[j]) for i in range(len(mids)) for j in range(len(mids))
+    )
+    return pairs + float((weights**2 * widths).sum()) / 3
+
+
+def intervals(counts: list[int]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(1)
+    edges = [torch.sort(torch.rand(n + 1, dtype=torch.float64)).values for n in counts]
+    mids = torch.cat([(e[1:] + e[:-1]) / 2 for e in edges])
+    widths = torch.cat([e[1:] - e[:-1] for e in edges])
+    lengths = torch.tensor(counts)
+    return mids, widths, torch.cumsum(lengths, 0) - lengths, lengths
+
+
+def test_distortion_is_the_sum_over_pairs() -> None:
+    mids, widths, starts, counts = intervals([5, 0, 1, 12])
+    weights = torch.rand(len(mids), dtype=torch.float64)
+    losses = distortion(weights, mids, widths, starts, counts)
+    for ray, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
+        rows = slice(start, start + count)
+        expected = naive_distortion(weights[rows].numpy(), mids[rows].numpy(), widths[rows].numpy())
+        assert losses[ray].item() == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+def test_distortion_gradient_matches_finite_differences() -> None:
+    mids, widths, starts, counts = intervals([4, 0, 5])
+    weights = torch.rand(len(mids), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w: distortion(w, mids, widths, starts, counts), (weights,))
+
+
+def test_distortion_gradient_reaches_rays_out_of_order() -> None:
+    mids, widths, starts, counts = intervals([3, 2])
+    weights = torch.rand(5, dtype=torch.float64, requires_grad=True)
+    backwards = distortion(weights, mids, widths, starts.flip(0), counts.flip(0))
+    (gradient,) = torch.autograd.grad(backwards[1], weights)
+    assert (gradient[:3] != 0).all() and (gradient[3:] == 0).all()

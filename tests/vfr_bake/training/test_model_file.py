@@ -40,6 +40,11 @@ def change(path: Path, **values: object) -> None:
     torch.save(torch.load(path, weights_only=True) | values, path)
 
 
+def sampler(**values: object) -> dict:
+    whole = {"step": 0.01, "occupied": torch.zeros(512, dtype=torch.uint8), "resolution": 16}
+    return whole | values
+
+
 def test_round_trip(model: Model, saved: Path) -> None:
     again = load_model(saved)
     for name, tensor in model.field.state_dict().items():
@@ -85,12 +90,14 @@ def test_cut_short(saved: Path, share: float) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"version": [2, 0]}, "expected 1.x, got 2.0"),
+        ({"version": [3, 0]}, "expected 2.x, got 3.0: update vfr-bake"),
+        ({"version": [1, 0]}, "expected 2.x, got 1.0: train again"),
         ({"version": "1"}, "version: expected two integers"),
-        ({"step": float("nan")}, "step: expected a number"),
+        ({"sampler": {}}, "sampler: step: expected float"),
+        ({"sampler": sampler(step=float("nan"))}, "step: expected a number"),
         ({"field": {"n_levels": 2}}, "expected the settings"),
-        ({"occupied": torch.zeros(3, dtype=torch.uint8)}, "occupied: expected 4096 bits"),
-        ({"occupancy_resolution": 10**6}, "occupancy_resolution: expected 8 to 512"),
+        ({"sampler": sampler(occupied=torch.zeros(3, dtype=torch.uint8))}, "occupied: expected 4096 bits"),
+        ({"sampler": sampler(resolution=10**6)}, "resolution: expected 8 to 512"),
         ({"world_from_model": torch.zeros(3, 3)}, "world_from_model: expected 4 x 4"),
         ({"cameras": "{}"}, "cameras: frames"),
         ({"state": {}}, "the tensors do not fit"),
@@ -98,7 +105,7 @@ def test_cut_short(saved: Path, share: float) -> None:
 )
 def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:
     change(saved, **values)
-    with pytest.raises(VersionError if "1.x" in message else FormatError, match=message):
+    with pytest.raises(VersionError if "2.x" in message else FormatError, match=message):
         load_model(saved)
 
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from player.errors import TrainingError
-from vfr_bake.config import FieldConfig, TrainConfig
+from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.trainer import Trainer
 
-FIELD = FieldConfig(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
+FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
 
 
 def config(**changes: object) -> TrainConfig:
@@ -37,9 +37,9 @@ def scene() -> Scene:
 def test_it_learns_the_scene(scene: Scene) -> None:
     trainer = Trainer(scene, config())
     white = np.ones(3)
-    before = np.mean([s.psnr for s in evaluate(trainer.field, trainer.occupancy, scene.test, white)])
+    before = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
     reports = list(trainer.run())
-    after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.occupancy, scene.test, white)])
+    after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
     assert len(reports) == 220 and trainer.n_bad_steps == 0
     assert after > before + 6 and after > 18
 
@@ -74,8 +74,7 @@ def test_a_step_without_a_finite_loss_changes_nothing_and_many_stop(scene: Scene
 
 
 def test_pictures_without_alpha_train_over_their_own_background(scene: Scene) -> None:
-    opaque = scene.train.images.copy()
-    opaque[..., 3] = 255
+    opaque = [image | np.array([0, 0, 0, 255], np.uint8) for image in scene.train.images]
     views = type(scene.train)(scene.train.cameras, opaque)
     photographs = Scene(scene.name, views, scene.test, False, scene.world_from_model)
     assert len(list(Trainer(photographs, config(steps=5)).run())) == 5

@@ -1,0 +1,196 @@
+"""Proposal sampling: contraction, spacing, resampling and the interlevel loss against readable float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reference import composite_ray
+from vfr_bake.config import FieldOptions
+from vfr_bake.field.field import VfrField
+from vfr_bake.kernels import proposals as kernels
+from vfr_bake.kernels.contraction import contracted_unit
+from vfr_bake.rendering.proposals import FAR, N_FINAL, N_PROPOSED, ProposalSampler
+from vfr_bake.training.optimiser import GridAdam
+
+ONE = np.float32(1)
+
+
+def contract(point: np.ndarray) -> np.ndarray:
+    """Mip-NeRF 360, equation 10, in float64."""
+    norm = np.linalg.norm(point)
+    return point if norm <= 1 else (2 - 1 / norm) * point / norm
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 0.3, 0.999, 1.0, 1.001, 2.0, 1e3, 1e10, 1e30, 3e38])
+def test_contraction_is_equation_10(size: float) -> None:
+    for direction in ([1, 0, 0], [0, -1, 0], [0.6, 0.0, -0.8], [0.5773, -0.5773, 0.5773]):
+        point = np.array(direction) * size
+        x, y, z = (np.float32(value) for value in point)
+        ours = np.array(contracted_unit(x, y, z, ONE))
+        with np.errstate(over="ignore"):
+            expected = (contract(np.array([x, y, z], np.float64)) + 2) / 4
+        np.testing.assert_allclose(ours, expected, rtol=0, atol=3e-7)
+
+
+def test_contraction_has_no_seam_at_the_unit_sphere() -> None:
+    inside, outside = np.nextafter(ONE, np.float32(0)), np.nextafter(ONE, np.float32(2))
+    values = [contracted_unit(x, np.float32(0), np.float32(0), ONE)[0] for x in (inside, ONE, outside)]
+    assert values == sorted(values) and values[2] - values[0] < 2e-7
+
+
+def test_spacing_and_distance_are_inverse() -> None:
+    for t in (0.0, 1e-6, 0.5, 1 - 1e-7, 1.0, 1 + 1e-6, 7.0, FAR):
+        s = kernels.spacing(np.float64(t))
+        assert 0 <= s < 1
+        assert kernels.distance(s) == pytest.approx(t, rel=1e-12, abs=1e-15)
+
+
+def naive_resample(edges: np.ndarray, weights: np.ndarray, m: int, jitter: float) -> np.ndarray:
+    """Borders of m intervals around the inverse of the distribution function."""
+    mass = weights + kernels.PADDING
+    cdf = np.concatenate([[0], np.cumsum(mass)]) / mass.sum()
+    centres = np.interp((np.arange(m) + jitter) / m, cdf, edges)
+    inner = (centres[1:] + centres[:-1]) / 2
+    first = max(edges[0], 2 * centres[0] - inner[0])
+    last = min(edges[-1], 2 * centres[-1] - inner[-1])
+    return np.concatenate([[first], inner, [last]])
+
+
+HISTOGRAMS = {
+    "flat": np.ones(16),
+    "nothing": np.zeros(16),
+    "one surface": np.eye(16)[5],
+    "first": np.eye(16)[0],
+    "last": np.eye(16)[15],
+    "two": np.eye(16)[3] * 0.5 + np.eye(16)[12] * 0.5,
+    "subnormal": np.full(16, 1e-40),
+    "tail": 0.5 ** np.arange(16),
+}
+
+
+@pytest.mark.parametrize("name", HISTOGRAMS)
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 0.999])
+def test_resampling_inverts_the_distribution(name: str, jitter: float) -> None:
+    weights = HISTOGRAMS[name]
+    edges = np.sort(np.random.default_rng(0).random(17))
+    out, centres = np.empty(9), np.empty(8)
+    kernels.resample(edges, weights, np.float64(1), np.float64(jitter), centres, out)
+    np.testing.assert_allclose(out, naive_resample(edges, weights, 8, jitter), rtol=0, atol=1e-9)
+    assert (np.diff(out) >= 0).all() and out[0] >= edges[0] and out[-1] <= edges[-1]
+    single, zero = (a.astype(np.float32) for a in (edges, weights))
+    ours = np.empty(9, np.float32)
+    kernels.resample(single, zero, ONE, np.float32(jitter), np.empty(8, np.float32), ours)
+    np.testing.assert_allclose(ours, out, rtol=0, atol=2e-5)
+
+
+def naive_interlevel(
+    edges: np.ndarray, weights: np.ndarray, p_edges: np.ndarray, p_weights: np.ndarray
+) -> float:
+    """Mip-NeRF 360, equation 13, interval by interval."""
+    total = 0.0
+    for i, w in enumerate(weights):
+        overlaps = (p_edges[:-1] < edges[i + 1]) & (p_edges[1:] > edges[i])
+        total += max(0.0, w - p_weights[overlaps].sum()) ** 2 / (w + 1e-7)
+    return total
+
+
+def test_interlevel_loss_and_its_gradient() -> None:
+    random = np.random.default_rng(1)
+    n, m = 7, 5
+    edges = np.sort(random.random((1, m + 1)))
+    weights = random.random(m) * 0.4
+    p_edges = np.concatenate([[0.0], np.sort(random.random(n - 1)), [0.999]])[None]
+    lengths = np.diff([kernels.distance(s) for s in p_edges[0]])
+    starts, counts = np.array([0]), np.array([m])
+
+    def proposal(logits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        depths = np.exp(logits) * lengths
+        before = np.cumsum(depths) - depths
+        return depths, np.exp(-before) * -np.expm1(-depths)
+
+    logits = random.normal(size=n)
+    depths, p_weights = proposal(logits)
+    losses, gradient = np.empty(1), np.empty((1, n))
+    kernels.interlevel(
+        edges, starts, counts, weights, p_edges, p_weights[None], depths[None], losses, gradient
+    )
+    assert losses[0] == pytest.approx(naive_interlevel(edges[0], weights, p_edges[0], p_weights), rel=1e-12)
+    assert losses[0] > 0
+    for j in range(n):
+        shifted = [logits + np.eye(n)[j] * h for h in (1e-6, -1e-6)]
+        up, down = (naive_interlevel(edges[0], weights, p_edges[0], proposal(s)[1]) for s in shifted)
+        assert gradient[0, j] == pytest.approx((up - down) / 2e-6, rel=1e-5, abs=1e-8)
+
+
+def make(seed: int = 0) -> tuple[VfrField, ProposalSampler, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(seed)
+    config = FieldOptions(n_levels=4, max_resolution=64, log2_table_size=12, head_width=16).resolved(True)
+    field, sampler = VfrField(config), ProposalSampler(0.05)
+    torch.nn.init.uniform_(field.grid.table, -1, 1)
+    for grid in sampler.grids:
+        torch.nn.init.uniform_(grid.table, -2, 2)
+    rays_o = torch.rand(40, 3) - 0.5
+    rays_d = torch.nn.functional.normalize(torch.randn(40, 3), dim=-1)
+    return field, sampler, rays_o, rays_d
+
+
+def test_samples_lie_where_they_say() -> None:
+    field, sampler, rays_o, rays_d = make()
+    samples, edges, rounds = sampler.sample_rounds(field, rays_o, rays_d, torch.rand(40, 3))
+    assert [r.edges.shape for r in rounds] == [(40, N_PROPOSED + 1)] * 2 and edges.shape == (40, N_FINAL + 1)
+    assert int(samples.counts.sum()) == len(samples.t_mid) and int(samples.counts.min()) >= 1
+    owner = torch.arange(40).repeat_interleave(samples.counts)
+    points = (rays_o[owner] + samples.t_mid[:, None] * rays_d[owner]).double().numpy()
+    expected = np.stack([(contract(point) + 2) / 4 for point in points])
+    np.testing.assert_allclose(samples.points.numpy(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(samples.features, field.grid.reference(samples.points), rtol=0, atol=1e-5)
+    for found in rounds:
+        before = np.cumsum(found.depths.astype(np.float64), axis=1) - found.depths
+        weights = np.exp(-before) * -np.expm1(-found.depths.astype(np.float64))
+        seen = found.depths > 0
+        np.testing.assert_allclose(found.weights[seen], weights[seen], rtol=1e-3, atol=1e-6)
+
+
+def test_nothing_is_looked_up_behind_an_opaque_sample() -> None:
+    field, sampler, rays_o, rays_d = make()
+    with torch.no_grad():
+        field.density.out.bias.fill_(20)
+    samples = sampler.sample_all(field, rays_o.numpy(), rays_d.numpy())
+    whole = (samples.deltas > 1e-4)[samples.starts]  # a first interval of some length is opaque
+    assert (samples.counts[whole] == 1).all()
+
+
+def test_rendering_is_the_equation_over_the_samples() -> None:
+    field, sampler, rays_o, rays_d = make()
+    features, opacity, depth = sampler.composited_features(field, rays_o.numpy(), rays_d.numpy())
+    samples = sampler.sample_all(field, rays_o.numpy(), rays_d.numpy())
+    with torch.no_grad():
+        sigmas = field.density(samples.features) * samples.deltas
+    for ray in range(0, 40, 7):
+        rows = slice(samples.starts[ray], samples.starts[ray] + samples.counts[ray])
+        out, alpha = composite_ray(sigmas[rows].numpy(), samples.features[rows].numpy(), 1.0)
+        np.testing.assert_allclose(features[ray], out, rtol=0, atol=2e-6)
+        assert opacity[ray] == pytest.approx(alpha, abs=2e-6)
+        assert (
+            samples.t_mid[rows].min() <= depth[ray] * 1.0001
+            and depth[ray] <= samples.t_mid[rows].max() * 1.0001
+        )
+
+
+def test_proposals_learn_where_the_field_has_its_weight() -> None:
+    field, sampler, rays_o, rays_d = make()
+    adams = [GridAdam(grid.table) for grid in sampler.grids]
+    losses = []
+    for step in range(60):
+        jitter = torch.rand(40, 3, generator=torch.Generator().manual_seed(step))
+        samples, edges, rounds = sampler.sample_rounds(field, rays_o, rays_d, jitter)
+        with torch.no_grad():
+            sigmas = field.density(samples.features) * samples.deltas
+        before = torch.cat([torch.cumsum(s, 0) - s for s in torch.split(sigmas, samples.counts.tolist())])
+        weights = torch.exp(-before) * -torch.expm1(-sigmas)
+        losses.append(sampler.add_gradients(rounds, edges, samples, weights, 40))
+        for adam in adams:
+            adam.step(0.05)
+    assert np.mean(losses[-5:]) < 0.3 * np.mean(losses[:5])

@@ -1,0 +1,78 @@
+"""What a data set holds, in its own world: posed pictures, those to train on and those held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.cameras import Camera
+from player.errors import ShapeError
+
+HOLD_OUT_EVERY = 8
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """Pictures and where they were taken from; each may have its own size."""
+
+    cameras: list[Camera]
+    """As many as there are pictures, of the pictures' sizes; in a `Scene`, in the model frame."""
+    images: list[np.ndarray]
+    """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha."""
+
+    def __post_init__(self) -> None:
+        if len(self.images) != len(self.cameras):
+            raise ShapeError(f"images: expected {len(self.cameras)}, one a camera, got {len(self.images)}")
+        for camera, image in zip(self.cameras, self.images, strict=True):
+            shape = image.shape
+            if len(shape) != 3 or shape[2] != 4 or image.dtype != np.uint8:
+                raise ShapeError(
+                    f"{camera.name}: image: expected [height, width, 4] uint8, "
+                    f"got {list(shape)} {image.dtype}"
+                )
+            if (camera.height, camera.width) != shape[:2]:
+                raise ShapeError(
+                    f"{camera.name}: camera: expected {shape[1]}x{shape[0]} pixels as its picture has, "
+                    f"got {camera.width}x{camera.height}"
+                )
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Posed pictures in the world frame."""
+
+    name: str
+    train: PosedImages
+    test: PosedImages
+    """Views that training never sees; none when there are too few to spare one."""
+    points: np.ndarray | None = None
+    """[n_points, 3] points of the scene, world frame, where the data set knows some."""
+
+
+def held_out(views: PosedImages) -> tuple[PosedImages, PosedImages]:
+    """(train, test): every eighth view is held out, the first one included; fewer than eight are all
+    trained on."""
+    held = np.zeros(len(views.cameras), bool)
+    if len(held) >= HOLD_OUT_EVERY:
+        held[::HOLD_OUT_EVERY] = True
+    return _subset(views, ~held), _subset(views, held)
+
+
+def _subset(views: PosedImages, which: np.ndarray) -> PosedImages:
+    chosen = np.flatnonzero(which)
+    return PosedImages([views.cameras[i] for i in chosen], [views.images[i] for i in chosen])
+
+
+def counter(of: int, progress: Callable[[int, int], object] | None) -> Callable[[object], None]:
+    """A function that reports one more of `of` things done to `progress` at every call."""
+    done = 0
+
+    def count(_: object) -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, of)
+
+    return count

@@ -1,0 +1,193 @@
+"""Picture files: read whole, lens distortion undone, made smaller."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from player.cameras import Camera
+from player.errors import DataError, MissingExtraError
+from vfr_bake.data.capture import PosedImages
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def read_pictures(
+    paths: Sequence[Path],
+    cameras: Sequence[Camera],
+    distortions: Sequence[dict[str, float]],
+    count: Callable[[object], None],
+) -> PosedImages:
+    """The pictures with the pinhole cameras that would have taken them; `count` is called after each.
+
+    A camera that speaks of another size than its picture has is scaled to it. `distortions`: keyword
+    arguments of `undistort`. Raises DataError.
+    """
+    results: list[tuple[Camera, np.ndarray]] = []
+
+    def load(index: int) -> tuple[Camera, np.ndarray]:
+        image = read_picture(paths[index])
+        camera = cameras[index].resized(image.shape[1], image.shape[0])
+        if any(distortions[index].values()):
+            image = undistort(image, camera, **distortions[index])
+        return camera, image
+
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        futures = [pool.submit(load, index) for index in range(len(paths))]
+        try:
+            for future in futures:
+                results.append(future.result())
+                count(None)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return PosedImages([camera for camera, _ in results], [image for _, image in results])
+
+
+def reduced(views: PosedImages, factor: int) -> PosedImages:
+    """The views with pixels `factor` times as large along each side, each the mean of those it replaces.
+
+    Rows and columns that do not fill a pixel are cut off at the right and below. Raises DataError where
+    nothing would be left.
+    """
+    if factor == 1:
+        return views
+    cameras, images = [], []
+    for camera, image in zip(views.cameras, views.images, strict=True):
+        height, width = image.shape[0] // factor, image.shape[1] // factor
+        if min(height, width) < 1:
+            raise DataError(
+                f"{camera.name}: downscale: expected at most {min(image.shape[:2])}, got {factor}"
+            )
+        images.append(_reduced(image[: height * factor, : width * factor], factor))
+        cut = replace(camera, width=width * factor, height=height * factor)
+        cameras.append(cut.resized(width, height))
+    return PosedImages(cameras, images)
+
+
+def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    if (image[..., 3] == 255).all():
+        return np.asarray(Image.fromarray(image).reduce(factor))
+    # Colours under zero alpha mean nothing, so it is the premultiplied picture that has a mean.
+    weighted = image.astype(np.float32)
+    weighted[..., :3] *= weighted[..., 3:] / 255
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    mean = weighted.reshape(height, factor, width, factor, 4).mean(axis=(1, 3))
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6) / 255
+    return (mean + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """A picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures too.
+
+    Raises DataError for what Pillow cannot read to its end, and for floating-point pictures.
+    """
+    try:
+        if _is_16_bit_colour(path):
+            return _read_16_bit_colour(path)
+        with Image.open(path) as file:
+            file.load()
+            if file.mode == "I" or file.mode.startswith("I;16"):
+                # Pillow's own conversion clips 16-bit greys at 255.
+                grey = np.asarray(file.convert("I"), np.int64).clip(0, 65535)
+                rgba = np.full((*grey.shape, 4), 255, np.uint8)
+                rgba[..., :3] = ((grey * 255 + 32767) // 65535)[..., None]
+                return rgba
+            if file.mode == "F":
+                raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
+            return np.asarray(file.convert("RGBA"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path}: picture: cannot be read to its end: {first_line(error)}") from error
+
+
+def _is_16_bit_colour(path: Path) -> bool:
+    """Whether a PNG has 16-bit colour channels, of which Pillow would drop the lower halves."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    return (
+        header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:25] == b"\x10" and header[25:26] in b"\x02\x04\x06"
+    )
+
+
+def _read_16_bit_colour(path: Path) -> np.ndarray:
+    cv2 = _opencv(f"{path}: 16-bit picture: expected OpenCV to read it")
+    values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None or values.dtype != np.uint16:
+        raise DataError(f"{path}: picture: cannot be read to its end")
+    values = ((values.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    if values.ndim == 2:
+        values = values[..., None].repeat(3, axis=-1)
+    if values.shape[2] == 2:  # grey and alpha
+        values = values[..., [0, 0, 0, 1]]
+    rgba = np.full((*values.shape[:2], 4), 255, np.uint8)
+    rgba[..., :3] = values[..., 2::-1]  # OpenCV has blue first
+    if values.shape[2] == 4:
+        rgba[..., 3] = values[..., 3]
+    return rgba
+
+
+def _opencv(wanted: str):
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError(f"{wanted}: pip install 'vfr-bake[train]'") from error
+    return cv2
+
+
+def undistort(
+    image: np.ndarray,
+    camera: Camera,
+    k1: float = 0.0,
+    k2: float = 0.0,
+    k3: float = 0.0,
+    k4: float = 0.0,
+    p1: float = 0.0,
+    p2: float = 0.0,
+) -> np.ndarray:
+    """The picture that `camera` would have taken without lens distortion; same size, same intrinsics.
+
+    The lens model is OpenCV's with nerfstudio's fourth radial term: with r² = x² + y² at x, y = ray / depth,
+    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²), y' the like with p1, p2 exchanged.
+    (`cv2.undistort` has no k4 of this meaning.) Pixels that the lens never saw repeat the picture's edge.
+
+    `image`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
+    """
+    cv2 = _opencv(f"{camera.name}: lens distortion: expected OpenCV to undo it")
+    x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    column = camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx - 0.5
+    row = camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy - 0.5
+    # Colours under zero alpha mean nothing, so it is the premultiplied picture that can be interpolated.
+    weighted = image.astype(np.float32)
+    weighted[..., :3] *= weighted[..., 3:] / 255
+    result = cv2.remap(
+        weighted,
+        column.clip(-1e6, 1e6).astype(np.float32),
+        row.clip(-1e6, 1e6).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    result[..., :3] /= np.maximum(result[..., 3:], 1e-6) / 255
+    return (result + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    try:
+        with Image.open(path) as file:
+            return file.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: picture: expected a PNG or JPEG file: {first_line(error)}") from error
+
+
+def first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,30 @@
+"""Scene contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10): all of space into the ball of radius 2.
+
+c(x) = x inside the unit ball, (2 - 1 / |x|) x / |x| outside; u = (c + 2) / 4 puts it into the unit cube of
+the hash grids. Points are contracted where they are looked up; a contracted point is never turned back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from vfr_bake.kernels.hash_grid import FLAGS
+
+
+@njit(fastmath=FLAGS, error_model="numpy")
+def contracted_unit(x, y, z, one):
+    """The point of the unit cube for x, y, z of the model frame; `one` is 1 in their type. Any finite input
+    is served."""
+    two = one + one
+    # Divided by the largest coordinate first: the square of 1e30 is beyond float32.
+    largest = max(abs(x), max(abs(y), abs(z)))
+    scale = one
+    if largest * two > one:
+        a, b, c = x / largest, y / largest, z / largest
+        norm = largest * np.sqrt(a * a + b * b + c * c)
+        if norm > one:
+            scale = (two - one / norm) / norm
+    half = one / two
+    scale *= half * half
+    return x * scale + half, y * scale + half, z * scale + half

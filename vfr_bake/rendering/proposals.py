@@ -1,0 +1,168 @@
+"""Proposal sampling of unbounded scenes: two small density fields find where on a ray matter lies.
+
+As in mip-NeRF 360 (Barron et al. 2022) and section 4 of the paper: two rounds of 64 samples, 32 final ones,
+distances spaced uniformly up to one model unit and by disparity beyond, positions contracted. Letters as in
+`vfr_bake.kernels.proposals`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numba import get_num_threads
+from torch import Tensor, nn
+
+from vfr_bake.field.field import VfrField
+from vfr_bake.field.hash_grid import GridLayout
+from vfr_bake.kernels import proposals as kernels
+from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.samples import LIMITS, Samples
+
+N_PROPOSED = 64
+"""Intervals of each of the two rounds."""
+N_FINAL = 32
+"""Intervals in which the field itself is looked up."""
+FAR = 1e3
+"""Where rays end, model units: the farthest camera is at 1."""
+RESOLUTIONS = (128, 512)
+"""Finest level of each round's grid, cells per axis over contracted space; both have 10 levels from 16 on."""
+N_LEVELS = 10
+LOG2_TABLE_SIZE = 17
+RAY_CHUNK = 4096
+"""Rays whose samples are held at once when pictures are rendered: 35 MB of features at most."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round of proposals found."""
+
+    edges: np.ndarray
+    """[n_rays, N_PROPOSED + 1] in s."""
+    depths: np.ndarray
+    """[n_rays, N_PROPOSED] optical depth of each interval."""
+    points: np.ndarray
+    """[n_rays, N_PROPOSED, 3] of the unit cube; undefined behind an opaque interval."""
+    weights: np.ndarray
+    """[n_rays, N_PROPOSED]."""
+
+
+class ProposalGrid(nn.Module):
+    """Log-density as the sum over levels of one interpolated channel."""
+
+    def __init__(self, max_resolution: int) -> None:
+        super().__init__()
+        self.layout = GridLayout(N_LEVELS, 16, max_resolution, LOG2_TABLE_SIZE)
+        self.table = nn.Parameter(torch.zeros(self.layout.n_entries, 1))
+
+    def kernel_arguments(self) -> tuple:
+        return (self.table.detach().numpy(), *self.layout.kernel_arguments(np.float32))
+
+
+class ProposalSampler(nn.Module):
+    """Where to look a field up along the rays of an unbounded scene.
+
+    `near`: how near to a camera matter may begin, model units.
+    """
+
+    def __init__(self, near: float) -> None:
+        super().__init__()
+        self.near = near
+        self.grids = nn.ModuleList(ProposalGrid(resolution) for resolution in RESOLUTIONS)
+        self.exponent = 1.0
+        """Weights are raised to it before they are drawn from: less than 1 early in training."""
+
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+        """The samples of all rays [n_rays, 3], in the middle of their intervals."""
+        middle = torch.full((len(rays_o), 3), 0.5)
+        return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
+
+    @torch.no_grad()
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays]) of rays, every sample
+        used."""
+        features = np.empty((len(rays_o), field.config.n_channels), np.float32)
+        opacity, depth = np.empty((2, len(rays_o)), np.float32)
+        for start in range(0, len(rays_o), RAY_CHUNK):
+            rows = slice(start, start + RAY_CHUNK)
+            samples = self.sample_all(field, rays_o[rows], rays_d[rows])
+            values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
+            sigmas = field.density(samples.features)
+            out, alpha, _ = composite(sigmas, values, samples.deltas, samples.starts, samples.counts)
+            features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
+            depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
+        return features, opacity, depth
+
+    def sample_rounds(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor
+    ) -> tuple[Samples, np.ndarray, list[Round]]:
+        """Samples, the borders [n_rays, N_FINAL + 1] of their intervals in s, and what the rounds found."""
+        n_rays = len(rays_o)
+        rounds = [_empty_round(n_rays) for _ in RESOLUTIONS]
+        edges = np.empty((n_rays, N_FINAL + 1), np.float32)
+        near = np.float32(self.near)
+        borders = (kernels.spacing(near), kernels.spacing(np.float32(FAR)))
+        first, second = rounds
+        grids = [grid.kernel_arguments() for grid in self.grids]  # type: ignore[operator]
+        kernels.propose(
+            rays_o.numpy(), rays_d.numpy(), jitter.numpy(), borders, np.float32(self.exponent),
+            grids[0], grids[1], LIMITS, first.edges, first.depths, first.points, first.weights,
+            second.edges, second.depths, second.points, second.weights, edges,
+        )  # fmt: skip
+        return self._field_samples(field, rays_o, rays_d, edges), edges, rounds
+
+    def _field_samples(self, field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: np.ndarray) -> Samples:
+        n_rays, n_samples = len(rays_o), len(rays_o) * N_FINAL
+        counts = np.empty(n_rays, np.int64)
+        t_mid, deltas = np.empty(n_samples, np.float32), np.empty(n_samples, np.float32)
+        points = np.empty((n_samples, 3), np.float32)
+        features = np.empty((n_samples, field.config.n_channels), np.float32)
+        kernels.field_samples(
+            rays_o.numpy(), rays_d.numpy(), edges, *field.kernel_arguments(), LIMITS,
+            counts, t_mid, deltas, points, features,
+        )  # fmt: skip
+        kept = (np.arange(N_FINAL) < counts[:, None]).reshape(-1)
+        return Samples(
+            t_mid=torch.from_numpy(t_mid[kept]),
+            deltas=torch.from_numpy(deltas[kept]),
+            points=torch.from_numpy(points[kept]),
+            features=torch.from_numpy(features[kept]),
+            rays=torch.arange(n_rays),
+            starts=torch.from_numpy(np.cumsum(counts) - counts),
+            counts=torch.from_numpy(counts),
+        )
+
+    def add_gradients(
+        self, rounds: list[Round], edges: np.ndarray, samples: Samples, weights: Tensor, n_rays: int
+    ) -> float:
+        """Add the interlevel loss's gradient to the tables' `.grad`; returns the loss, both a mean over
+        `n_rays`."""
+        total = 0.0
+        starts, counts = samples.starts.numpy(), samples.counts.numpy()
+        for grid, found in zip(self.grids, rounds, strict=True):
+            losses = np.empty(len(edges), np.float32)
+            grad_logits = np.empty_like(found.weights)
+            kernels.interlevel(
+                edges, starts, counts, weights.detach().numpy(), found.edges, found.weights, found.depths,
+                losses, grad_logits,
+            )  # fmt: skip
+            grad_logits /= n_rays
+            scales, offsets, hashed, mask = grid.layout.kernel_arguments(np.float32)  # type: ignore[union-attr]
+            kernels.scatter_logits(
+                found.points.reshape(-1, 3), grad_logits.reshape(-1), scales, offsets, hashed, mask,
+                get_num_threads(), grid.table.grad.numpy(),  # type: ignore[union-attr]
+            )  # fmt: skip
+            total += float(losses.sum()) / n_rays
+        return total
+
+
+def _empty_round(n_rays: int) -> Round:
+    return Round(
+        edges=np.empty((n_rays, N_PROPOSED + 1), np.float32),
+        depths=np.empty((n_rays, N_PROPOSED), np.float32),
+        points=np.empty((n_rays, N_PROPOSED, 3), np.float32),
+        weights=np.empty((n_rays, N_PROPOSED), np.float32),
+    )

@@ -1,0 +1,70 @@
+"""What `vfr-train --resume` goes on from: all of a trainer's state, beside the model file until that is
+written.
+
+Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), state (`Trainer.state`).
+Tensors and plain values only; loads with `weights_only=True`.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from player.errors import ConfigError, FormatError
+from player.files import write_bytes
+from vfr_bake.training.trainer import Trainer
+
+FORMAT = "vfr-checkpoint"
+VERSION = [1, 0]
+LENGTH_SETTINGS = {"steps", "minutes", "eval_views", "checkpoint_minutes"}
+"""Settings that may differ between the run that was interrupted and the one that goes on."""
+
+
+def checkpoint_path(model: Path) -> Path:
+    """Where the checkpoints of the training of `model` are.
+
+    >>> checkpoint_path(Path("a/model.pt")).name
+    'model.pt.checkpoint'
+    """
+    return model.with_name(model.name + ".checkpoint")
+
+
+def save_checkpoint(path: Path, trainer: Trainer) -> None:
+    """Write beside `path` and rename into place, so that there is always a whole one."""
+    buffer = io.BytesIO()
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "settings": asdict(trainer.config),
+        "state": trainer.state(),
+    }
+    torch.save(content, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path, trainer: Trainer) -> None:
+    """Put `trainer` where the checkpoint was.
+
+    Raises FormatError (not a checkpoint, cut short) or ConfigError (of a run with other settings).
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load has no documented set of errors for bad bytes
+        raise FormatError(f"{path}: not a checkpoint written by vfr-train, or cut short") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
+        raise FormatError(
+            f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"
+        )
+    then, now = content["settings"], asdict(trainer.config)
+    for name in sorted(set(then) | set(now)):
+        if name not in LENGTH_SETTINGS and then.get(name) != now.get(name):
+            raise ConfigError(
+                f"{path}: {name}: expected {then.get(name)} as in the interrupted run, got {now.get(name)}"
+            )
+    try:
+        trainer.restore(content["state"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise FormatError(f"{path}: state: does not fit this data set: {error}") from error
