@@ -19,7 +19,7 @@ MAX_LINES = 400
 FORBIDDEN = {
     "player": {"exporters", "vfr_bake", "torch", "triton", "scipy", "cv2", "skimage", "onnx", "tqdm", "tyro"},
     "exporters": {"vfr_bake", "torch", "triton", "cv2", "tqdm", "tyro", "trimesh", "open3d"},
-    "vfr_bake": {"trimesh", "open3d"},
+    "vfr_bake": {"trimesh", "open3d", "lpips", "torchvision"},
 }
 # At the top level, where importing the package alone would need them.
 LAZY = {

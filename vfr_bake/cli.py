@@ -222,10 +222,16 @@ def _bake(options: Any) -> int:
 
 
 def _eval(options: Any) -> int:
+    from player.images import write_png
+    from player.transforms import frame_names
     from vfr_bake.data import load_scene
-    from vfr_bake.training.evaluation import evaluate
+    from vfr_bake.training.comparison import comparison
+    from vfr_bake.training.evaluation import render_views
+    from vfr_bake.training.lpips import Lpips
+    from vfr_bake.training.metrics import mean_scores, score_view
     from vfr_bake.training.model_file import load_model
 
+    lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model)
     with _Bar("reading pictures") as bar:
         scene = load_scene(options.data, bar.count)
@@ -234,21 +240,38 @@ def _eval(options: Any) -> int:
     cameras = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
     to_model = _inverse(model.world_from_model)
     views = type(scene.test)([c.transformed(to_model) for c in cameras], scene.test.images)
+    names = frame_names(views.cameras)
     scores = []
     with _Bar("test views") as bar:
-        for score in evaluate(model.field, model.sampler, views, model.background):
-            scores.append(score)
+        for view in render_views(model.field, model.sampler, views, model.background):
+            if options.pictures is not None:
+                picture = comparison(view.photograph, view.rgb)
+                write_png(options.pictures / f"{names[len(scores)]}.png", picture)
+            scores.append(score_view(view.name, view.rgb, view.photograph, lpips))
             bar.count(len(scores), len(cameras))
-    mean = sum(score.psnr for score in scores) / len(scores)
-    figures = {
-        "psnr": mean,
-        "per_view": [asdict(score) for score in scores],
+    means = mean_scores(scores)
+    figures = _finite(means) | {
+        "per_view": [_finite(asdict(score)) for score in scores],
         "n_views": len(scores),
         "background": model.background.tolist(),
         "bits": 8,
+        "lpips_network": options.lpips,
     }
-    _result(options.json, figures, f"{options.model}: {mean:.2f} dB mean PSNR over {len(scores)} test views")
+    perceptual = "" if lpips is None else f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
+    _result(
+        options.json,
+        figures,
+        f"{options.model}: {means['psnr']:.2f} dB mean PSNR, SSIM {means['ssim']:.4f}{perceptual} "
+        f"over {len(scores)} test views",
+    )
     return 0
+
+
+def _finite(figures: dict[str, Any]) -> dict[str, Any]:
+    """None for infinite figures: the PSNR of equal pictures has no number in JSON."""
+    from math import inf
+
+    return {key: None if value == inf else value for key, value in figures.items()}
 
 
 def _inverse(matrix: Any) -> Any:

@@ -151,22 +151,23 @@ class TrainConfig:
     proposals. Auto: an object if the pictures have alpha or a plain background."""
     downscale: int = 1
     """Pictures are reduced by this factor along each side before training."""
-    steps: int = 20_000
-    """Optimiser steps at most (paper: 20,000; 40,000 for scenes). Training ends here or when the minutes are
-    over."""
+    steps: int = 60_000
+    """Optimiser steps at most (paper: 20,000 of 64 times as many samples; 40,000 for scenes). Training ends
+    here or when the minutes are over."""
     minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
     further. Objects 9, scenes 14."""
-    batch_samples: int = 16_384
-    """Objects: samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in
-    proportion and quality after a few minutes depends on how many steps were taken."""
+    batch_samples: int = 4096
+    """Objects: samples along rays in a batch (paper: 262,144). A CPU step costs time in proportion, and a few
+    minutes are better spent on many small steps: the same 25 million samples gave lego 26.3 dB in steps of
+    16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096."""
     batch_rays: int = 1024
     """Scenes: rays in a batch (paper: 8,192); smaller for the same reason."""
     max_rays: int = 16_384
     """Objects: rays in a batch at most, however few samples they need."""
     grid_rate: float = 1e-2
     """Adam learning rate of the hash grids."""
-    network_rate: float = 2e-3
+    network_rate: float = 4e-3
     """Adam learning rate of the density network and the head (paper: 0.01 for all)."""
     pilot_steps: int = 300
     """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
@@ -190,7 +191,7 @@ class TrainConfig:
         _check(1 <= self.downscale <= 64, "downscale", "1 to 64", self.downscale)
         _check(self.steps >= 1, "steps", "at least 1", self.steps)
         _check(self.minutes is None or self.minutes > 0, "minutes", "more than 0", self.minutes)
-        _check(4096 <= self.batch_samples <= 2**22, "batch_samples", "4,096 to 4,194,304", self.batch_samples)
+        _check(1024 <= self.batch_samples <= 2**22, "batch_samples", "1,024 to 4,194,304", self.batch_samples)
         _check(64 <= self.batch_rays <= 2**17, "batch_rays", "64 to 131,072", self.batch_rays)
         _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
         _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)

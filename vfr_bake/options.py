@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -61,4 +62,10 @@ class Eval:
     data: Positional[str]
     """The data set, as for vfr-train."""
     json: Path | None = None
-    """Write psnr (mean, dB) and per_view as JSON to this file; - for stdout."""
+    """Write the means (psnr in dB, ssim, lpips; of 8-bit pictures; psnr_float and ssim_float unrounded) and
+    per_view as JSON to this file; - for stdout. A PSNR without bound is null."""
+    lpips: Literal["alex", "vgg"] | None = None
+    """Also measure LPIPS with this network, whose weights have to be on this machine."""
+    pictures: Path | None = None
+    """Also write photograph | rendered | error map of every view to this folder, replacing files of equal
+    name. The error map is black for none, white for a difference of a quarter of the range or more."""

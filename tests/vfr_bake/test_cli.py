@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from vfr_bake.cli import bake_main, eval_main, train_main
+from vfr_bake.data.scene import PosedImages
+from vfr_bake.training.evaluation import RenderedView
+from vfr_bake.training.metrics import over_background, to_8_bit
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -53,6 +58,73 @@ def test_eval_has_the_mean_and_every_view(model: Path, small_data: Path, tmp_pat
     assert [view["name"] for view in figures["per_view"]] == ["./test/r_0", "./test/r_1"]
     assert figures["psnr"] == pytest.approx(np.mean([view["psnr"] for view in figures["per_view"]]))
     assert figures["psnr"] > 12
+    for key in ("ssim", "psnr_float", "ssim_float"):
+        assert figures[key] == pytest.approx(np.mean([view[key] for view in figures["per_view"]]))
+    assert 0.2 < figures["ssim"] < 1 and abs(figures["ssim"] - figures["ssim_float"]) < 0.01
+    assert figures["lpips"] is None and figures["lpips_network"] is None
+    assert (figures["n_views"], figures["background"], figures["bits"]) == (2, [1, 1, 1], 8)
+
+
+def test_eval_says_the_means_and_shows_the_views(
+    model: Path, small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = tmp_path / "pictures"
+    for _ in range(2):  # what an earlier run wrote is replaced
+        assert eval_main([str(model), str(small_data), "--pictures", str(pictures)]) == 0
+        assert re.search(r" dB mean PSNR, SSIM 0\.\d{4} over 2 test views\n$", capsys.readouterr().out)
+    assert sorted(path.name for path in pictures.iterdir()) == ["r_0.png", "r_1.png"]
+    with Image.open(pictures / "r_0.png") as file, Image.open(small_data / "test" / "r_0.png") as photograph:
+        assert file.size == (3 * 32, 32)
+        white = over_background(np.asarray(photograph), np.ones(3))
+        assert np.array_equal(np.asarray(file)[:, :32], to_8_bit(white))
+
+
+def test_eval_measures_lpips(
+    model: Path,
+    small_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With a distance of our own, as the weights are large and not ours to keep."""
+
+    class Distance:
+        def __init__(self, network: str) -> None:
+            self.network = network
+
+        def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
+            return 0.125
+
+    monkeypatch.setattr("vfr_bake.training.lpips.Lpips", Distance)
+    target = tmp_path / "eval.json"
+    assert eval_main([str(model), str(small_data), "--lpips", "vgg", "--json", str(target)]) == 0
+    figures = json.loads(target.read_text())
+    assert (figures["lpips"], figures["lpips_network"]) == (0.125, "vgg")
+    assert [view["lpips"] for view in figures["per_view"]] == [0.125, 0.125]
+    assert ", LPIPS (vgg) 0.1250 over 2 test views" in capsys.readouterr().out
+
+
+def test_eval_says_what_lpips_lacks_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vfr_bake.training.lpips.find_spec", lambda name: None)
+    assert eval_main([str(tmp_path / "none.pt"), "nowhere", "--lpips", "alex"]) == 1
+    one_error(capsys, "lpips is not installed", "pip install vfr-bake[lpips]")
+
+
+def test_a_view_without_error_is_null_in_json(
+    model: Path, small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def perfect(field: object, occupancy: object, views: PosedImages, background: np.ndarray):
+        for camera, image in zip(views.cameras, views.images, strict=True):
+            rgb = over_background(image, background)
+            yield RenderedView(camera.name, rgb, rgb)
+
+    monkeypatch.setattr("vfr_bake.training.evaluation.render_views", perfect)
+    target = tmp_path / "eval.json"
+    assert eval_main([str(model), str(small_data), "--json", str(target)]) == 0
+    figures = json.loads(target.read_text(), parse_constant=pytest.fail)
+    assert figures["psnr"] is None and figures["per_view"][0]["psnr_float"] is None and figures["ssim"] == 1
 
 
 def test_bake_needs_no_data_set_and_refuses_to_replace(

@@ -13,9 +13,6 @@ from numba import njit, prange
 
 from vfr_bake.kernels.hash_grid import FLAGS, encode_point
 
-FAINT_SHARE = 8
-"""Of the faint samples one in so many is kept (see `march_samples`)."""
-
 
 @njit(inline="always")
 def ray_box(rays_o, rays_d, ray):
@@ -118,7 +115,7 @@ def density_logits(points, grid, network, out):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def march_samples(
-    rays_o, rays_d, jitter, step, weight_floor, distance, grid, network, limits, counts, starts, t_mid,
+    rays_o, rays_d, jitter, step, distance, grid, network, limits, counts, starts, t_mid,
     points, features,
 ):  # fmt: skip
     """Visible samples of as many rays as fit, in one pass: what is counted is what is written.
@@ -127,14 +124,12 @@ def march_samples(
     n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only if the
     most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever written
     past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the first
-    sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops). Of the samples
-    that weigh less than `weight_floor` one in FAINT_SHARE is kept, so that matter can still appear there.
+    sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops).
     """
     table, scales, offsets, hashed, mask = grid
     w1, b1, w2, b2 = network
     largest_logit, opaque = limits
     kind = table.dtype.type
-    golden = kind(0.6180339887)
     n_chunks, capacity = t_mid.shape
     n_rays = rays_o.shape[0]
     used = np.zeros(n_chunks, np.int64)
@@ -163,20 +158,13 @@ def march_samples(
                 feature = features[chunk, k]
                 encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
                 logit = density_logit(feature, w1, b1, w2, b2, hidden)
-                delta = np.exp(min(logit, largest_logit)) * step
-                kept = True
-                if delta < weight_floor or -np.exp(-tau) * np.expm1(-delta) < weight_floor:
-                    # The jitter is as good a die as any, and the golden ratio never repeats itself.
-                    die = (jitter[ray] + kind(i) * golden) * kind(FAINT_SHARE)
-                    kept = np.int64(die) % FAINT_SHARE == 0
-                if kept:
-                    t_mid[chunk, k] = t
-                    points[chunk, k, 0] = ux
-                    points[chunk, k, 1] = uy
-                    points[chunk, k, 2] = uz
-                    k += 1
+                t_mid[chunk, k] = t
+                points[chunk, k, 0] = ux
+                points[chunk, k, 1] = uy
+                points[chunk, k, 2] = uz
+                k += 1
                 i += 1
-                tau += delta
+                tau += np.exp(min(logit, largest_logit)) * step
             counts[ray] = k - starts[ray]
         used[chunk] = k
     return used

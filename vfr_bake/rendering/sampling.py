@@ -27,12 +27,10 @@ def march(
     jitter: Tensor,
     budget: int,
     n_chunks: int = 2,
-    weight_floor: float = 0.0,
 ) -> Samples:
     """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays] in [0, 1).
 
-    The budget is grown to hold at least one whole ray per chunk. Of samples that weigh less than
-    `weight_floor` only a few are kept.
+    The budget is grown to hold at least one whole ray per chunk.
     """
     step = occupancy.step
     longest = int(np.ceil(2 * 3**0.5 / step)) + 3
@@ -44,7 +42,7 @@ def march(
     counts = np.empty(len(rays_o), np.int64)
     starts = np.empty(len(rays_o), np.int64)
     used = kernels.march_samples(
-        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), np.float32(weight_floor),
+        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step),
         occupancy.distance,
         *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features,
     )  # fmt: skip

@@ -10,28 +10,45 @@ import numpy as np
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.render import Sampler, render_image
-from vfr_bake.training.metrics import over_background, psnr, to_8_bit
+from vfr_bake.training.metrics import Distance, ViewScore, over_background, score_view
 
 
 @dataclass(frozen=True)
-class ViewScore:
-    """One view's agreement with its photograph."""
+class RenderedView:
+    """The full model's picture of a view, and the photograph."""
 
     name: str
-    psnr: float
-    """dB, on 8-bit pictures over the background."""
+    """The camera's."""
+    rgb: np.ndarray
+    """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
+    photograph: np.ndarray
+    """As `rgb`."""
 
 
-def evaluate(
+def render_views(
     field: VfrField, sampler: Sampler, views: PosedImages, background: np.ndarray, n_views: int = 0
-) -> Iterator[ViewScore]:
-    """Render views (model frame) with the full model and compare; `n_views` of them spread evenly, 0 for
-    all."""
+) -> Iterator[RenderedView]:
+    """Views (model frame) rendered with the full model; `n_views` of them spread evenly, 0 for all."""
     chosen = np.arange(len(views.cameras))
     if 0 < n_views < len(chosen):
         chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
     for index in chosen:
         camera = views.cameras[index]
-        rgb = to_8_bit(render_image(field, sampler, camera, background)) / 255
-        photograph = to_8_bit(over_background(views.images[index], background)) / 255
-        yield ViewScore(camera.name, psnr(rgb, photograph))
+        rgb = render_image(field, sampler, camera, background)
+        yield RenderedView(camera.name, rgb, over_background(views.images[index], background))
+
+
+def evaluate(
+    field: VfrField,
+    sampler: Sampler,
+    views: PosedImages,
+    background: np.ndarray,
+    n_views: int = 0,
+    lpips: Distance | None = None,
+) -> Iterator[ViewScore]:
+    """The scores of `render_views`' pictures; with `lpips`, that distance as well.
+
+    Raises ShapeError: a picture is smaller than SSIM's window.
+    """
+    for view in render_views(field, sampler, views, background, n_views):
+        yield score_view(view.name, view.rgb, view.photograph, lpips)

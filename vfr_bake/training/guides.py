@@ -27,8 +27,6 @@ FOG_STEPS = 512
 """First steps, in which empty space has to be found and the occupancy grid is updated often."""
 STEPS_PER_UPDATE = (16, 128)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
-WEIGHT_FLOOR = 1e-3
-"""Once space is sorted out half of the samples in occupied cells weigh less; most of these are left out."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 (mip-NeRF 360,
 section C)."""
@@ -85,7 +83,6 @@ class OccupancyGuide:
         self._config = config
         self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
         self._samples_per_ray = 2 / step_length
-        self._weight_floor = 0.0
 
     def n_rays(self, pilot: bool) -> int:
         wanted = 1.1 * self._budget(pilot) / self._samples_per_ray
@@ -96,9 +93,7 @@ class OccupancyGuide:
         return self._config.batch_samples // 2 if pilot else self._config.batch_samples
 
     def prepare(self, step: int, field: VfrField) -> None:
-        foggy = step < FOG_STEPS
-        self._weight_floor = 0.0 if foggy else WEIGHT_FLOOR
-        if step % STEPS_PER_UPDATE[not foggy] == 0:
+        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             self.sampler.update(field)
 
     def sample(
@@ -106,7 +101,7 @@ class OccupancyGuide:
     ) -> Samples:
         first = jitter[:, 0].contiguous()
         budget, n_chunks = int(self._budget(pilot) * share), torch.get_num_threads()
-        return march(field, self.sampler, rays_o, rays_d, first, budget, n_chunks, self._weight_floor)
+        return march(field, self.sampler, rays_o, rays_d, first, budget, n_chunks)
 
     def observe(self, n_rays: int, n_samples: int) -> None:
         per_ray = max(n_samples / max(n_rays, 1), 1.0)

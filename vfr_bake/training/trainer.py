@@ -90,9 +90,6 @@ class Trainer:
             self._guide = OccupancyGuide(config, step_length)
         self._grid_adam = GridAdam(self.field.grid.table)
         self._parameters = [*self.field.network_parameters(), *self.pilot.parameters()]
-        # Buffers from the start: a process whose rays meet nothing must have something to add up.
-        for parameter in self._parameters:
-            parameter.grad = torch.zeros_like(parameter)
         self._adam = torch.optim.Adam(
             self._parameters, lr=config.network_rate, eps=1e-15, betas=(0.9, 0.99), fused=True
         )
@@ -151,6 +148,7 @@ class Trainer:
         if regulariser is not None:
             loss = loss + regulariser / max(n_rays, 1)
         # A batch that met nothing (seen by no process) has nothing to teach.
+        self._clear_gradients(pilot)
         if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays):
             return value if n_samples == 0 else float("nan"), n_rays, n_samples
         factor = rate_factor(step, progress)
@@ -204,9 +202,16 @@ class Trainer:
         composited, opacity, weights = composite(sigmas, features, samples.deltas, starts, counts)
         return self.field.head(composited, dirs) * opacity[:, None], opacity, weights
 
+    def _clear_gradients(self, pilot: bool) -> None:
+        """Zero for the networks that learn in this step, so that a process whose rays meet nothing has
+        something to add up; none for the others, which Adam then leaves alone."""
+        self._adam.zero_grad(set_to_none=True)
+        network = self.pilot if pilot else self.field.head
+        for parameter in (*self.field.density.parameters(), *network.parameters()):
+            parameter.grad = torch.zeros_like(parameter)
+
     def _backward(self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int) -> bool:
         """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
-        self._adam.zero_grad(set_to_none=False)
         tables = [self._grid_adam, *self._guide.tables()]
         if value == value and abs(value) != float("inf"):
             if loss.requires_grad:

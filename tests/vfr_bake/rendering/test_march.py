@@ -8,7 +8,7 @@ import torch
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels.march import FAINT_SHARE, chebyshev_distance
+from vfr_bake.kernels.march import chebyshev_distance
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.sampling import march, march_reference
@@ -98,26 +98,6 @@ def test_rendering_without_stored_samples_equals_rendering_with_them() -> None:
     np.testing.assert_allclose(features, out.numpy(), rtol=0, atol=2e-5)
     np.testing.assert_allclose(alpha, opacity.numpy(), rtol=0, atol=2e-6)
     assert (depth[alpha > 0] > 0).all()
-
-
-def test_of_faint_samples_a_share_is_kept_and_all_others() -> None:
-    field, occupancy = field_of_density(1.0), OccupancyGrid(16, STEP, seed=0)
-    rays_o, rays_d = rays(400)
-    jitter = torch.rand(len(rays_o), generator=torch.Generator().manual_seed(4))
-    whole = march(field, occupancy, rays_o, rays_d, jitter, 10**6)
-    with torch.no_grad():
-        sigmas = field.density(whole.features)
-        _, _, weights = composite(sigmas, whole.features, whole.deltas, whole.starts, whole.counts)
-    floor = float(weights.median())
-    kept = march(field, occupancy, rays_o, rays_d, jitter, 10**6, weight_floor=floor)
-    for ray in range(len(rays_o)):
-        rows = slice(whole.starts[ray], whole.starts[ray] + whole.counts[ray])
-        wanted = whole.t_mid[rows][weights[rows] > floor * 1.001].tolist()
-        start = kept.starts[ray]
-        assert set(wanted) <= set(kept.t_mid[start : start + kept.counts[ray]].tolist())
-    n_faint = int((weights <= floor).sum())
-    share = (len(kept.t_mid) - int((weights > floor).sum())) / n_faint
-    assert share == pytest.approx(1 / FAINT_SHARE, rel=0.25)
 
 
 def test_an_opaque_field_stops_at_its_first_samples() -> None:

@@ -1,0 +1,158 @@
+"""LPIPS: the distance of two pictures in the features of a network trained to recognise things.
+
+Zhang, Isola, Efros, Shechtman and Wang, "The unreasonable effectiveness of deep features as a perceptual
+metric", 2018, version 0.1: d = sum over layers l of mean over pixels of sum_c w_lc (f_lc - g_lc)^2, with f, g
+the two pictures' activations, of unit length at every pixel, and w the layer's learned weights.
+
+Of the package `lpips` only the weights w are read. Its code needs torchvision, whose build has to fit torch's
+in version and GPU, for two lists of convolutions; they are written down here instead. The weights of the
+convolutions are torchvision's, from where torch keeps what was downloaded. Nothing is downloaded here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from player.errors import ConfigError, DataError, MissingExtraError, ShapeError
+
+MEAN = (-0.030, -0.088, -0.188)
+DEVIATION = (0.458, 0.448, 0.450)
+"""What the networks' inputs were normalised by, for values in [-1, 1]."""
+
+
+class Lpips:
+    """The distance of pictures by one network; 0 for equal ones. Loads the weights once."""
+
+    def __init__(self, network: str = "alex") -> None:
+        """`network`: "alex" (AlexNet, what papers report most) or "vgg" (VGG-16).
+
+        Raises MissingExtraError: no package `lpips`; DataError: a file of weights is missing or broken.
+        """
+        if network not in _NETWORKS:
+            raise ConfigError(f"lpips: network: expected one of {', '.join(_NETWORKS)}, got {network}")
+        self.network = network
+        self._settings = _NETWORKS[network]
+        self._layers = self._settings.layers()
+        self._weights = _layer_weights(network, self._n_channels())
+        _load_layers(self._layers, self._settings.checkpoint)
+
+    @torch.no_grad()
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
+        """The distance of two pictures [height, width, 3] with values in [0, 1].
+
+        Raises ShapeError: not of one shape, or so small that the deepest layer has no pixel.
+        """
+        size = self._settings.min_size
+        if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3 or min(a.shape[:2]) < size:
+            raise ShapeError(
+                f"lpips: expected [height, width, 3] twice, of at least {size} x {size} pixels, "
+                f"got {list(a.shape)} and {list(b.shape)}"
+            )
+        layers = zip(self._weights, self._activations(a), self._activations(b), strict=True)
+        return sum(float((w * (f - g) ** 2).sum(dim=1).mean()) for w, f, g in layers)
+
+    def _activations(self, rgb: np.ndarray) -> list[torch.Tensor]:
+        """One tensor [1, n_channels, h, w] a layer, of unit length over the channels."""
+        values = (2 * np.asarray(rgb, np.float32) - 1 - np.array(MEAN)) / np.array(DEVIATION)
+        x = torch.from_numpy(values).float().permute(2, 0, 1)[None].contiguous()
+        taken = []
+        for index, layer in enumerate(self._layers):
+            x = layer(x)
+            if index in self._settings.taken:
+                taken.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+        return taken
+
+    def _n_channels(self) -> list[int]:
+        """Channels of every layer that is compared; the layer before each is its convolution."""
+        convolutions = [self._layers[index - 1] for index in self._settings.taken]
+        return [layer.out_channels for layer in convolutions if isinstance(layer, nn.Conv2d)]
+
+
+def _alexnet() -> nn.Sequential:
+    """The convolutions of AlexNet, numbered as torchvision's `alexnet().features`."""
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()),
+    )
+
+
+def _vgg16() -> nn.Sequential:
+    """The convolutions of VGG-16, numbered as torchvision's `vgg16().features`."""
+    layers: list[nn.Module] = []
+    n_in = 3
+    for n_convolutions, n_out in ((2, 64), (2, 128), (3, 256), (3, 512), (3, 512)):
+        if layers:
+            layers.append(nn.MaxPool2d(2, 2))
+        for _ in range(n_convolutions):
+            layers += [nn.Conv2d(n_in, n_out, 3, padding=1), nn.ReLU()]
+            n_in = n_out
+    return nn.Sequential(*layers)
+
+
+@dataclass(frozen=True)
+class _Network:
+    layers: Callable[[], nn.Sequential]
+    checkpoint: str
+    """Its file's name, as torchvision's address has it and torch hub keeps it."""
+    taken: tuple[int, ...]
+    """The layers whose activations are compared."""
+    min_size: int
+    """Pixels: a picture that is narrower or lower has nothing left at the deepest layer."""
+
+
+_NETWORKS = {
+    "alex": _Network(_alexnet, "alexnet-owt-7be5be79.pth", (1, 4, 7, 9, 11), 31),
+    "vgg": _Network(_vgg16, "vgg16-397923af.pth", (3, 8, 15, 22, 29), 16),
+}
+
+
+def _load_layers(layers: nn.Sequential, checkpoint: str) -> None:
+    path = Path(torch.hub.get_dir()) / "checkpoints" / checkpoint
+    address = f"https://download.pytorch.org/models/{checkpoint}"
+    state = _read(path, f"download {address} and put it there, or set TORCH_HOME to where torch/hub has it")
+    prefix = "features."
+    features = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+    try:
+        layers.load_state_dict(features)
+    except RuntimeError as error:
+        raise DataError(f"{path}: the tensors do not fit the network: download {address} again") from error
+    layers.eval().requires_grad_(False)
+
+
+def _layer_weights(network: str, n_channels: list[int]) -> list[torch.Tensor]:
+    """One tensor [1, n_channels, 1, 1] a layer, out of the package `lpips`, which is not imported."""
+    package = find_spec("lpips")
+    if package is None or not package.submodule_search_locations:
+        raise MissingExtraError(
+            "lpips is not installed: --lpips needs: pip install vfr-bake[lpips], or, without torchvision, "
+            "pip install --no-deps lpips"
+        )
+    path = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / f"{network}.pth"
+    state = _read(path, "install lpips again")
+    weights = [state.get(f"lin{layer}.model.1.weight") for layer in range(len(n_channels))]
+    shapes = [None if w is None else tuple(w.shape) for w in weights]
+    if shapes != [(1, n, 1, 1) for n in n_channels]:
+        raise DataError(f"{path}: the tensors do not fit the network: install lpips again")
+    return [w for w in weights if w is not None]
+
+
+def _read(path: Path, hint: str) -> dict[str, torch.Tensor]:
+    if not path.is_file():
+        raise DataError(f"{path}: no such file: expected weights of a network: {hint}")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load has no documented set of errors for bad bytes
+        raise DataError(f"{path}: not a file of weights, or cut short: {hint}") from error
+    if not isinstance(state, dict):
+        raise DataError(f"{path}: expected the weights of a network, got {type(state).__name__}: {hint}")
+    return state
