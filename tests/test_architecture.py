@@ -25,7 +25,7 @@ FORBIDDEN = {
 LAZY = {
     "player": {"numba", "PIL", "onnxruntime"},
     "exporters": {"onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL"},
-    "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton"},
+    "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton", "pycolmap"},
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
 TOP_LEVEL_EXCEPTIONS = {("player/march_compiled.py", "numba"), ("vfr_bake/options.py", "tyro")}

@@ -234,7 +234,7 @@ def _eval(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model)
     with _Bar("reading pictures") as bar:
-        scene = load_scene(options.data, bar.count)
+        scene = load_scene(options.data, bar.count, downscale=model.train.get("downscale", 1))
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
     cameras = [c.transformed(scene.world_from_model) for c in scene.test.cameras]

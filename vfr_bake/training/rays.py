@@ -24,31 +24,34 @@ class RayBatch:
 
 
 class PixelSampler:
-    """Draws pixels uniformly from all training pictures, of whatever sizes."""
+    """Draws pixels uniformly from all pixels of all training pictures, which may differ in size.
+
+    In NumPy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
+    the step itself.
+    """
 
     def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        self._pixels = torch.from_numpy(np.concatenate([image.reshape(-1, 4) for image in views.images]))
-        sizes = torch.tensor([image.shape[0] * image.shape[1] for image in views.images])
-        self._ends = torch.cumsum(sizes, 0)
-        self._starts = self._ends - sizes
-        self._widths = torch.tensor([image.shape[1] for image in views.images])
-        self._poses = torch.from_numpy(np.stack([c.c2w for c in views.cameras]).astype(np.float32))
-        self._intrinsics = torch.tensor(
-            [[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], dtype=torch.float32
-        )
+        n_pixels = np.array([camera.width * camera.height for camera in views.cameras])
+        self._pixels = np.concatenate([image.reshape(-1, 4) for image in views.images])
+        self._ends = np.cumsum(n_pixels)
+        self._starts = self._ends - n_pixels
+        self._widths = np.array([camera.width for camera in views.cameras])
+        self._poses = np.stack([c.c2w[:3] for c in views.cameras]).astype(np.float32)
+        self._intrinsics = np.array([[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], np.float32)
         self._generator = generator
 
     def draw(self, n_rays: int) -> RayBatch:
-        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator)
-        view = torch.searchsorted(self._ends, index, right=True)
-        pixel, width = index - self._starts[view], self._widths[view]
-        row, column = pixel // width, pixel % width
-        fx, fy, cx, cy = self._intrinsics[view].unbind(-1)
-        x, y = (column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy
+        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator).numpy()
+        view = np.searchsorted(self._ends, index, side="right")
+        row, column = np.divmod(index - self._starts[view], self._widths[view])
+        fx, fy, cx, cy = self._intrinsics[view].T
+        x = (column.astype(np.float32) + np.float32(0.5) - cx) / fx
+        y = (cy - row.astype(np.float32) - np.float32(0.5)) / fy
         poses = self._poses[view]
-        dirs = torch.einsum("nij,nj->ni", poses[:, :3, :3], torch.stack([x, y, -torch.ones_like(x)], dim=-1))
+        rays_d = x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
+        rays_d /= np.sqrt((rays_d * rays_d).sum(axis=-1, keepdims=True))
         return RayBatch(
-            rays_o=poses[:, :3, 3].contiguous(),
-            rays_d=torch.nn.functional.normalize(dirs, dim=-1),
-            rgba=self._pixels[index].float() / 255,
+            rays_o=torch.from_numpy(poses[:, :, 3].copy()),
+            rays_d=torch.from_numpy(rays_d),
+            rgba=torch.from_numpy(self._pixels[index] * np.float32(1 / 255)),
         )

@@ -1,0 +1,49 @@
+"""Random pixels: the right rays, the right colours, every pixel as often as any other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.demo import demo_cameras
+from vfr_bake.training.rays import PixelSampler
+
+
+def mixed_views() -> PosedImages:
+    """Three pictures of different sizes; no two pixels have one colour."""
+    sizes = [(4, 3), (7, 5), (2, 6)]
+    cameras = [
+        replace(camera, width=width, height=height, cx=width / 2 + 0.3, fy=9.0 + index)
+        for index, (camera, (width, height)) in enumerate(zip(demo_cameras(8, 3), sizes, strict=True))
+    ]
+    numbers = np.arange(4 * 3 + 7 * 5 + 2 * 6, dtype=np.uint8)
+    pixels = np.stack([numbers, numbers + 60, numbers + 120, 255 - numbers], axis=-1)
+    images = [
+        part.reshape(height, width, 4)
+        for part, (width, height) in zip(np.split(pixels, [12, 47]), sizes, strict=True)
+    ]
+    return PosedImages(cameras, images)
+
+
+def test_rays_and_colours_are_those_of_the_pixels_of_pictures_of_mixed_sizes() -> None:
+    views = mixed_views()
+    batch = PixelSampler(views, torch.Generator().manual_seed(0)).draw(4000)
+    rays = [camera.rays() for camera in views.cameras]
+    rays_o = np.concatenate([o for o, _ in rays])
+    rays_d = np.concatenate([d for _, d in rays])
+    number = (batch.rgba[:, 0] * 255).round().long().numpy()
+    assert set(number.tolist()) == set(range(59))
+    np.testing.assert_allclose(batch.rays_o.numpy(), rays_o[number], atol=1e-6)
+    np.testing.assert_allclose(batch.rays_d.numpy(), rays_d[number], atol=1e-6)
+    np.testing.assert_allclose(batch.rgba[:, 3].numpy() * 255, 255 - number, atol=1e-4)
+
+
+def test_every_pixel_is_as_likely_as_any_other() -> None:
+    n_rays = 59_000
+    batch = PixelSampler(mixed_views(), torch.Generator().manual_seed(1)).draw(n_rays)
+    counts = np.bincount((batch.rgba[:, 0] * 255).round().long().numpy(), minlength=59)
+    # 1000 expected, standard deviation 31: five of them, for 59 pixels.
+    assert np.abs(counts - 1000).max() < 5 * 31.4
