@@ -18,8 +18,10 @@ from player.errors import MissingExtraError
 MAX_SIDE = 1600
 """Pictures are reduced to this many pixels before features are looked for: beyond it, a photograph's finest
 grain is noise and sharpening, which no other picture repeats, and time grows with the pixels."""
-MAX_FEATURES = 4096
+MAX_FEATURES = 3072
+"""Matching takes time in proportion to the square of it."""
 N_COARSE = 256
+"""The largest features, which tell whether two pictures share anything."""
 N_PARTNERS = 16
 N_NEIGHBOURS = 3
 MAX_RATIO = 0.8

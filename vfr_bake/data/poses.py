@@ -60,7 +60,7 @@ class PoseReport:
     n_registered: int
     """The pictures that have got a camera."""
     mean_error: float
-    """Pixels: mean distance of a point's projection from where the picture shows it."""
+    """Pixels: mean over the points of how far their projections are from where the pictures show them."""
     mean_track_length: float
     """Pictures a point is seen in, on average."""
 
@@ -99,7 +99,7 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     `features`, `matches`, `cameras`), how much of it is done and how much there is.
 
     Pictures of one size, and of one maker, model and focal length where EXIF tells, share one camera (model
-    OPENCV), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
+    RADIAL), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
     do not tell them.
 
     Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
@@ -165,7 +165,8 @@ def _other_kinds(folder: Path) -> str:
         for place in (folder, folder / "images")
         if place.is_dir()
         for path in place.iterdir()
-        if path.suffix.lower() in (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".dng", ".bmp", ".gif")
+        if path.suffix.lower()
+        in (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".dng", ".bmp", ".gif")
     }
     return f"; there are {', '.join(sorted(kinds))} files: save them as JPEG" if kinds else ""
 
@@ -195,7 +196,7 @@ def _look_at(
     if n_good < _n_needed(len(pictures)):
         raise DataError(
             f"{photos}: pictures with something to recognise (at least {MIN_FEATURES} features): expected at "
-            f"least {_n_needed(len(pictures))} of {len(pictures)}, got {n_good}: the others are blank, out of "
+            f"least {_n_needed(len(pictures))} of {len(pictures)}, got {n_good}: the rest are blank, out of "
             f"focus or blurred: {ADVICE}"
         )
     if all(np.abs(thumbnail - thumbnails[0]).mean() < SAME for thumbnail in thumbnails):
@@ -257,9 +258,9 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
             error, length = struct.unpack_from("<dQ", points, at + 35)
             at += 51 + 8 * length
             n_seen += length
-            error_sum += error * length
+            error_sum += error
     except struct.error as error:
         raise FormatError(f"{model}: cut short: remove it to estimate the cameras anew") from error
     return PoseReport(
-        folder, n_pictures, n_registered, error_sum / max(n_seen, 1), n_seen / max(n_points, 1)
+        folder, n_pictures, n_registered, error_sum / max(n_points, 1), n_seen / max(n_points, 1)
     )
