@@ -59,7 +59,7 @@ def find_features(rgba: np.ndarray) -> Features:
         mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
     # Half of OpenCV's contrast threshold: dim and smooth things need features too, and the limit on their
     # number keeps the strongest.
-    sift = cv2.SIFT_create(nfeatures=MAX_FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))

@@ -138,7 +138,11 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
             lambda done, of: progress("cameras", done, of),
         )
     n_registered = result.num_reg_images() if result is not None else 0
-    _check_registered(photos, n_registered, len(pictures))
+    if result is None or n_registered < _n_needed(len(pictures)):
+        raise DataError(
+            f"{photos}: cameras: expected to find those of at least {_n_needed(len(pictures))} of "
+            f"{len(pictures)} pictures, got {n_registered}: {ADVICE}"
+        )
     with new_folder(model) as new:
         result.write_binary(str(new))
     return _read_report(model, photos, len(pictures))
@@ -233,14 +237,6 @@ def _n_needed(n_pictures: int) -> int:
     return max(int(np.ceil(MIN_SHARE * n_pictures)), min(MIN_REGISTERED, n_pictures))
 
 
-def _check_registered(photos: Path, n_registered: int, n_pictures: int) -> None:
-    if n_registered < _n_needed(n_pictures):
-        raise DataError(
-            f"{photos}: cameras: expected to find those of at least {_n_needed(n_pictures)} of {n_pictures} "
-            f"pictures, got {n_registered}: {ADVICE}"
-        )
-
-
 def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
     """What the files of a COLMAP model say of themselves (its scene/reconstruction_io.cc has the format)."""
     for name in MODEL_FILES:
@@ -249,18 +245,22 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
                 f"{model}: {name}: expected a complete COLMAP model, got no such file: "
                 f"remove {model} to estimate the cameras anew"
             )
+    points = (model / "points3D.bin").read_bytes()
+    n_registered = n_points = n_seen = 0
+    error_sum = 0.0
     try:
         (n_registered,) = struct.unpack_from("<Q", (model / "images.bin").read_bytes())
-        points = (model / "points3D.bin").read_bytes()
         (n_points,) = struct.unpack_from("<Q", points)
-        at, n_seen, error_sum = 8, 0, 0.0
+        at = 8
         for _ in range(n_points):
             error, length = struct.unpack_from("<dQ", points, at + 35)
             at += 51 + 8 * length
             n_seen += length
             error_sum += error
-    except struct.error as error:
-        raise FormatError(f"{model}: cut short: remove it to estimate the cameras anew") from error
+    except struct.error:
+        at = -1
+    if at != len(points):
+        raise FormatError(f"{model}: cut short: remove {model} to estimate the cameras anew")
     return PoseReport(
         folder, n_pictures, n_registered, error_sum / max(n_points, 1), n_seen / max(n_points, 1)
     )

@@ -72,9 +72,11 @@ def test_the_cameras_are_those_that_are_known(can):
     off = np.linalg.norm(scale * (a - a.mean(axis=0)) @ rotation.T - (b - b.mean(axis=0)), axis=1)
     # The given cameras are themselves an estimate, each with its own focal length, which vary by 2 %.
     assert np.sqrt((off**2).mean()) < 0.01 * np.ptp(b, axis=0).max()
-    for name in names:
-        turn = found_rotations[name] @ rotation.T @ given_rotations[name].T
-        assert np.degrees(np.arccos(min(1, (np.trace(turn) - 1) / 2))) < 2
+    # Turned onto each other by themselves: the centres lie on a short arc and hardly tell a turn about it.
+    turns = [found_rotations[name].T @ given_rotations[name] for name in names]
+    u, _, vt = np.linalg.svd(sum(turns))
+    for turn in turns:
+        assert np.degrees(np.arccos(min(1, (np.trace(turn.T @ u @ vt) - 1) / 2))) < 1
     assert report.n_pictures == report.n_registered == N_CAN and report.folder == folder
 
 
