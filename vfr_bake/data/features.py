@@ -25,7 +25,7 @@ N_COARSE = 256
 N_PARTNERS = 16
 N_NEIGHBOURS = 3
 MAX_RATIO = 0.8
-_ROWS_AT_ONCE = 256
+_ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     nearest = np.empty(len(a), np.intp)
     best, second = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
     best_of_b = np.full(len(b), -np.inf, np.float32)
-    # In blocks that stay in the cache: everything after the product is bound by memory.
+    # In blocks, for memory; not smaller ones, for BLAS wakes its threads for each.
     for start in range(0, len(a), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
         cosines = a[rows] @ b.T
@@ -111,11 +111,14 @@ def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
     sequence, which in a video overlap even where nothing large is seen.
     """
     n = len(features)
+    coarse = np.zeros((n, N_COARSE, 128), np.float32)
+    for picture, rows in zip(features, coarse, strict=True):
+        largest = picture.descriptors[:N_COARSE]
+        rows[: len(largest)] = largest
     shared = np.zeros((n, n), np.int64)
-    coarse = [picture.descriptors[:N_COARSE] for picture in features]
-    for i in range(n):
-        for j in range(i + 1, n):
-            shared[i, j] = shared[j, i] = len(match(coarse[i], coarse[j]))
+    for i in range(n - 1):
+        shared[i, i + 1 :] = _n_matches(coarse[i], coarse[i + 1 :])
+    shared += shared.T
     near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= N_NEIGHBOURS
     chosen = near.copy()
     for i in range(n):
@@ -123,3 +126,16 @@ def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
         chosen[i, partners] = True
     chosen |= chosen.T
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(chosen, 1))]
+
+
+def _n_matches(a: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """As many matches as `match` finds of `a` [n, 128] in each of `others` [n_others, m, 128]; rows of zeros
+    match nothing."""
+    cosines = (a @ others.reshape(-1, 128).T).reshape(len(a), *others.shape[:2])
+    best_of_others = cosines.max(axis=0)
+    nearest = cosines.argmax(axis=2)
+    best = cosines.max(axis=2)
+    np.put_along_axis(cosines, nearest[..., None], -np.inf, axis=2)
+    distinct = (1 - best) < MAX_RATIO**2 * (1 - cosines.max(axis=2))
+    mutual = best >= best_of_others[np.arange(len(others)), nearest]
+    return (distinct & mutual).sum(axis=0)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import mapping, poses, video
-from vfr_bake.data.features import find_features, match, pairs_to_match
+from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
 
 N_CAN = 10
@@ -46,6 +46,21 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1, 1, np.linalg.det(u @ vt)])
     return float((s * sign).sum() / (a**2).sum()), u @ np.diag(sign) @ vt
+
+
+def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixture[str]):
+    """From points without noise, seen by cameras whose centre is believed 6 pixels off."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 24
+    options.num_points3D = 200
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    (camera,) = model.cameras.values()
+    truth = camera.principal_point_x
+    camera.principal_point_x = truth + 6
+    mapping._refine_principal_points(model)
+    assert model.camera(camera.camera_id).principal_point_x == pytest.approx(truth, abs=0.1)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +270,8 @@ def test_match_is_what_loops_say():
         if distances[j] < 0.8 * distances[second] and np.linalg.norm(a - b[j], axis=1).argmin() == i:
             expected.append([i, j])
     assert 20 < len(expected) and match(a, b).tolist() == expected
+    stacked = np.stack([b[:120], b[120:]])
+    assert _n_matches(a, stacked).tolist() == [len(match(a, half)) for half in stacked]
     assert match(a[:0], b).shape == match(a, b[:1]).shape == (0, 2)
 
 
