@@ -100,7 +100,8 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
 
     Pictures of one size, and of one maker, model and focal length where EXIF tells, share one camera (model
     RADIAL), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
-    do not tell them.
+    do not tell them. A subject that looks the same from two sides may be folded into one, as if walked around
+    half: nothing here tells, and surroundings in the pictures prevent it.
 
     Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
     `sparse/0`), OutputError, MissingExtraError.
