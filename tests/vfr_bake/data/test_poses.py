@@ -1,0 +1,364 @@
+"""Cameras estimated from pictures alone: against known cameras, and everything that can be missing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from player.errors import DataError, FormatError, MissingExtraError
+from vfr_bake.data import mapping, poses, video
+from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
+from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
+
+N_CAN = 10
+
+
+def real_pictures(name: str) -> Path:
+    root = os.environ.get("VFR_DATA")
+    folder = (Path(root) if root else Path(__file__).resolve().parents[4] / "shared" / "data") / name
+    if not (folder / "images").is_dir():
+        pytest.fail(f"{folder}: expected the data set: set VFR_DATA to the folder that holds it")
+    return folder
+
+
+def quiet(stage: str, done: int, of: int) -> None:
+    assert 0 <= done <= of, stage
+
+
+def centres(model: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Camera centres [3] and rotations [3, 3], world to camera, by the names of the pictures."""
+    images = [image for image in pycolmap.Reconstruction(model).images.values() if image.has_pose]
+    rotations = {image.name: image.cam_from_world().rotation.matrix() for image in images}
+    return {image.name: image.projection_center() for image in images}, rotations
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale and rotation [3, 3] that bring the points `a` [n, 3] nearest to `b` (Umeyama, PAMI 1991)."""
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, 1, np.linalg.det(u @ vt)])
+    return float((s * sign).sum() / (a**2).sum()), u @ np.diag(sign) @ vt
+
+
+def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixture[str]):
+    """From points without noise, seen by cameras whose centre is believed 6 pixels off."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 24
+    options.num_points3D = 200
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    (camera,) = model.cameras.values()
+    truth = camera.principal_point_x
+    camera.principal_point_x = truth + 6
+    mapping._refine_principal_points(model)
+    assert model.camera(camera.camera_id).principal_point_x == pytest.approx(truth, abs=0.1)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.fixture(scope="module")
+def can(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, poses.PoseReport, list[tuple[str, int, int]]]:
+    """Ten neighbouring pictures of the can at half their size, in the folder itself, with cameras."""
+    folder = tmp_path_factory.mktemp("can")
+    for path in sorted((real_pictures("can") / "images").iterdir())[:N_CAN]:
+        with Image.open(path) as file:
+            file.reduce(2).save(folder / path.name, quality=95)
+    calls: list[tuple[str, int, int]] = []
+    return folder, estimate_cameras(folder, lambda *call: calls.append(call)), calls
+
+
+def test_the_cameras_are_those_that_are_known(can):
+    folder, report, _ = can
+    found, found_rotations = centres(folder / "sparse" / "0")
+    given, given_rotations = centres(real_pictures("can") / "sparse" / "0")
+    names = sorted(found)
+    assert names == [f"{i:04d}.jpg" for i in range(N_CAN)]
+    a, b = (np.array([c[name] for name in names]) for c in (found, given))
+    scale, rotation = similarity(a, b)
+    off = np.linalg.norm(scale * (a - a.mean(axis=0)) @ rotation.T - (b - b.mean(axis=0)), axis=1)
+    # The given cameras are themselves an estimate, each with its own focal length, which vary by 2 %.
+    assert np.sqrt((off**2).mean()) < 0.01 * np.ptp(b, axis=0).max()
+    # Turned onto each other by themselves: the centres lie on a short arc and hardly tell a turn about it.
+    turns = [found_rotations[name].T @ given_rotations[name] for name in names]
+    u, _, vt = np.linalg.svd(sum(turns))
+    for turn in turns:
+        assert np.degrees(np.arccos(min(1, (np.trace(turn.T @ u @ vt) - 1) / 2))) < 1
+    assert report.n_pictures == report.n_registered == N_CAN and report.folder == folder
+
+
+def test_the_report_is_what_colmap_says_of_its_model(can):
+    folder, report, _ = can
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    assert report.mean_error == pytest.approx(model.compute_mean_reprojection_error())
+    assert report.mean_track_length == pytest.approx(model.compute_mean_track_length())
+    assert report.mean_error < 1 and report.mean_track_length > 3
+    (camera,) = model.cameras.values()
+    assert camera.model_name == "RADIAL" and (camera.width, camera.height) == (360, 640)
+    assert f"cameras of {N_CAN} of {N_CAN} pictures" in report.summary()
+
+
+def test_progress_goes_forward_to_the_end_of_every_stage(can):
+    _, _, calls = can
+    stages = list(dict.fromkeys(stage for stage, _, _ in calls))
+    assert stages == ["features", "matches", "cameras"]
+    for stage in stages:
+        counts = [(done, of) for name, done, of in calls if name == stage]
+        assert counts == sorted(counts) and counts[-1][0] == counts[-1][1]
+
+
+def test_cameras_are_estimated_once(can, monkeypatch: pytest.MonkeyPatch):
+    folder, report, _ = can
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert estimate_cameras(folder, quiet) == report
+
+
+def test_a_cut_model_is_named(can, tmp_path: Path):
+    shutil.copytree(can[0], tmp_path / "a")
+    model = tmp_path / "a" / "sparse" / "0"
+    points = model / "points3D.bin"
+    points.write_bytes(points.read_bytes()[:-9])
+    with pytest.raises(FormatError, match="cut short: remove"):
+        estimate_cameras(tmp_path / "a", quiet)
+    points.unlink()
+    with pytest.raises(FormatError, match=r"points3D\.bin: expected a complete COLMAP model"):
+        estimate_cameras(tmp_path / "a", quiet)
+
+
+@pytest.mark.parametrize("where", ["features", "matches", "cameras"])
+def test_interruption_leaves_nothing(can, tmp_path: Path, where: str):
+    for path in sorted(can[0].glob("*.jpg"))[:4]:
+        shutil.copy(path, tmp_path)
+
+    def interrupt(stage: str, done: int, of: int) -> None:
+        if stage == where:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_cameras(tmp_path, interrupt)
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_model_that_cannot_be_finished_leaves_none(can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for path in sorted(can[0].glob("*.jpg"))[:4]:
+        shutil.copy(path, tmp_path)
+
+    class HalfWritten:
+        def num_reg_images(self) -> int:
+            return 4
+
+        def write_binary(self, folder: str) -> None:
+            Path(folder, "cameras.bin").write_bytes(b"x")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(poses, "map_pictures", lambda *_: HalfWritten())
+    with pytest.raises(KeyboardInterrupt):
+        estimate_cameras(tmp_path, quiet)
+    assert not list((tmp_path / "sparse").iterdir())
+
+
+# --- what cannot be used ---
+
+
+def textured(seed: int, width: int = 160, height: int = 120) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    small = Image.fromarray(rng.integers(0, 256, (height // 8, width // 8, 3), np.uint8))
+    return np.asarray(small.resize((width, height), Image.Resampling.BICUBIC))
+
+
+def save(folder: Path, pictures: list[np.ndarray]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, pixels in enumerate(pictures):
+        Image.fromarray(pixels).save(folder / f"{index:03d}.png")
+    return folder
+
+
+def message(photos: Path) -> str:
+    with pytest.raises(DataError) as raised:
+        estimate_cameras(photos, quiet)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def test_too_few_pictures(tmp_path: Path):
+    assert "expected at least 3, got 2" in message(save(tmp_path, [textured(0), textured(1)]))
+
+
+def test_pictures_of_another_kind_are_named(tmp_path: Path):
+    (tmp_path / "a.HEIC").write_bytes(b"")
+    (tmp_path / "._a.jpg").write_bytes(b"")
+    assert message(tmp_path).endswith("got 0; there are .heic files: save them as JPEG")
+    assert not has_pictures(tmp_path)
+
+
+def test_nothing_there_and_a_file_of_another_kind(tmp_path: Path):
+    assert "expected a folder of pictures or a video, got nothing" in message(tmp_path / "a")
+    (tmp_path / "a.txt").write_text("x")
+    assert "got a file of another kind" in message(tmp_path / "a.txt")
+
+
+def test_blank_pictures(tmp_path: Path):
+    text = message(save(tmp_path, [np.full((60, 80, 3), 200, np.uint8)] * 5))
+    assert "expected at least 5 of 5, got 0" in text and "blank" in text
+
+
+def test_the_same_picture_again_and_again(tmp_path: Path):
+    assert "got 6 times the same" in message(save(tmp_path, [textured(0)] * 6))
+
+
+def test_pictures_that_have_nothing_in_common(tmp_path: Path):
+    text = message(save(tmp_path / "images", [textured(seed) for seed in range(6)]))
+    assert "of at least 6 of 6 pictures, got 0" in text and "more overlap" in text
+
+
+def test_an_unreadable_picture(tmp_path: Path):
+    save(tmp_path, [textured(seed) for seed in range(4)])
+    (tmp_path / "002.png").write_bytes(b"no picture")
+    assert str(tmp_path / "002.png") in message(tmp_path)
+
+
+def test_how_many_are_needed():
+    assert [poses._n_needed(n) for n in (3, 8, 10, 13, 14, 100)] == [3, 8, 8, 8, 9, 60]
+
+
+def test_without_pycolmap_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[poses\]'"):
+        estimate_cameras(save(tmp_path, [textured(seed) for seed in range(3)]), quiet)
+
+
+# --- features, sensors ---
+
+
+def test_features_follow_the_picture_to_its_own_pixels(monkeypatch: pytest.MonkeyPatch):
+    """A point found in the reduced picture is where it is found in the whole one."""
+    rgba = np.dstack([textured(3, 640, 480), np.full((480, 640), 255, np.uint8)])
+    whole = find_features(rgba)
+    monkeypatch.setattr("vfr_bake.data.features.MAX_SIDE", 320)
+    reduced = find_features(rgba)
+    pairs = match(whole.descriptors, reduced.descriptors)
+    off = whole.points[pairs[:, 0]] - reduced.points[pairs[:, 1]]
+    assert (
+        len(pairs) > 50 and np.abs(np.median(off, axis=0)).max() < 0.15
+    )  # half a pixel too many shows as 0.5
+
+
+def test_nothing_is_found_where_a_picture_is_transparent():
+    rgba = np.dstack([textured(4), np.full((120, 160), 255, np.uint8)])
+    rgba[:, :80, 3] = 0
+    points = find_features(rgba).points
+    assert len(points) and points[:, 0].min() > 79
+
+
+def test_match_is_what_loops_say():
+    rng = np.random.default_rng(0)
+    a = np.abs(rng.normal(size=(300, 128))).astype(np.float32)
+    b = np.concatenate([a[50:250] + 0.3 * rng.normal(size=(200, 128)), np.abs(rng.normal(size=(40, 128)))])
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b.astype(np.float32)))
+    expected = []
+    for i in range(len(a)):
+        distances = np.linalg.norm(a[i] - b, axis=1)
+        j, second = np.argsort(distances)[:2]
+        if distances[j] < 0.8 * distances[second] and np.linalg.norm(a - b[j], axis=1).argmin() == i:
+            expected.append([i, j])
+    assert 20 < len(expected) and match(a, b).tolist() == expected
+    stacked = np.stack([b[:120], b[120:]])
+    assert _n_matches(a, stacked).tolist() == [len(match(a, half)) for half in stacked]
+    assert match(a[:0], b).shape == match(a, b[:1]).shape == (0, 2)
+
+
+def test_a_walk_is_closed_without_all_pairs():
+    """Sixty pictures of a strip that goes round: picture 59 overlaps picture 0."""
+    strip = textured(5, 1600, 120)
+    strip = np.concatenate([strip, strip[:, :200]], axis=1)
+    views = [strip[:, start : start + 160] for start in np.linspace(0, 1600, 60, endpoint=False).astype(int)]
+    opaque = np.full((120, 160), 255, np.uint8)
+    pairs = pairs_to_match([find_features(np.dstack([view, opaque])) for view in views])
+    assert (0, 59) in pairs and (0, 1) in pairs and len(pairs) < 60 * 59 / 4
+    assert len(set(pairs)) == len(pairs) and all(i < j for i, j in pairs)
+
+
+def test_one_camera_for_one_device_and_its_focal_length(tmp_path: Path):
+    exif = Image.Exif()
+    exif[271], exif[272] = "Maker", "Model"
+    exif.get_ifd(0x8769)[0xA405] = 26
+    for name, tags in (("a", exif), ("b", exif), ("c", Image.Exif())):
+        Image.fromarray(textured(0, 400, 300)).save(tmp_path / f"{name}.jpg", exif=tags)
+    a, b, c = (poses._sensor(tmp_path / f"{name}.jpg", 400, 300) for name in "abc")
+    assert a == b != c and c.focal is None
+    assert a.focal == pytest.approx(26 / 43.27 * 500)
+    assert mapping.colmap_camera(a).has_prior_focal_length
+    assert mapping.colmap_camera(c).focal_length == 480
+
+
+# --- video ---
+
+
+@pytest.fixture
+def short_video(tmp_path: Path) -> Path:
+    """Twelve frames, every second one blurred."""
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
+    for index in range(12):
+        frame = np.roll(textured(6), 3 * index, axis=1)
+        frame[:8] = 20 * index  # tells which it is
+        writer.write(cv2.GaussianBlur(frame, (9, 9), 3) if index % 2 else frame)
+    writer.release()
+    return path
+
+
+def frame_numbers(folder: Path) -> list[int]:
+    return [round(np.asarray(Image.open(path))[:5].mean() / 20) for path in sorted(folder.iterdir())]
+
+
+def test_the_sharpest_of_every_stretch(short_video: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(video, "N_FRAMES", 4)
+    calls: list[tuple[int, int]] = []
+    folder = video.extract_frames(short_video, lambda *call: calls.append(call))
+    assert folder == short_video.with_name("walk_frames") and calls[-1] == (12, 12)
+    numbers = frame_numbers(folder / "images")
+    assert [number // 3 for number in numbers] == [0, 1, 2, 3]
+    assert not any(number % 2 for number in numbers)
+    short_video.unlink()  # what is there is taken as it is
+    assert video.extract_frames(short_video, quiet_frames) == folder
+
+
+def quiet_frames(done: int, of: int) -> None:
+    raise AssertionError("nothing is to be done")
+
+
+def test_a_short_video_gives_all_its_frames(short_video: Path):
+    folder = video.extract_frames(short_video, lambda done, of: None)
+    assert frame_numbers(folder / "images") == list(range(12))
+
+
+def test_a_video_becomes_a_folder_of_pictures(short_video: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(poses, "_look_at", lambda pictures, *_: pytest.fail(f"{len(pictures)} pictures"))
+    assert is_video(short_video)
+    with pytest.raises(pytest.fail.Exception, match="12 pictures"):
+        estimate_cameras(short_video, quiet)
+
+
+def test_an_interrupted_video_leaves_nothing(short_video: Path):
+    def interrupt(done: int, of: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.extract_frames(short_video, interrupt)
+    assert list(short_video.parent.iterdir()) == [short_video]
+
+
+def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"no video" * 100)
+    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
+    assert not video.frames_folder(path).exists()

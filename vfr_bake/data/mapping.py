@@ -1,0 +1,215 @@
+"""Matches between pictures -> cameras and points, by COLMAP's incremental mapper (Schönberger and Frahm,
+Structure-from-motion revisited, CVPR 2016).
+
+COLMAP gets features and matches from here and never opens a picture: its own decoder knows few formats and
+takes the process down on some it does not know.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotDone
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.errors import MissingExtraError
+from vfr_bake.data.features import Features, match
+
+MIN_MATCHES = 15
+MIN_FOR_PRINCIPAL_POINT = 20
+SECONDS_BETWEEN_LOOKS = 0.1
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What pictures of one camera have in common; equal sensors share their intrinsics."""
+
+    width: int
+    height: int
+    device: tuple[str, ...]
+    """Maker, model and focal length as EXIF has them; empty where it has not."""
+    focal: float | None
+    """Focal length in pixels, from EXIF."""
+
+
+def pycolmap_module() -> Any:
+    """pycolmap, silenced. Raises MissingExtraError."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise MissingExtraError(
+            "cameras: expected pycolmap to estimate them: pip install 'vfr-bake[poses]'"
+        ) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    pycolmap.logging.stderrthreshold = pycolmap.logging.FATAL.value
+    return pycolmap
+
+
+def write_pictures(
+    database: Path, names: Sequence[str], sensors: Sequence[Sensor], features: Sequence[Features]
+) -> list[int]:
+    """Put the pictures, their cameras and their features into a new COLMAP database.
+
+    Returns COLMAP's number of each picture. Pictures of the same `Sensor` share a camera.
+    """
+    pycolmap = pycolmap_module()
+    rigs: dict[Sensor, tuple[int, int]] = {}
+    numbers = []
+    with closing(pycolmap.Database.open(database)) as db:
+        for name, sensor, found in zip(names, sensors, features, strict=True):
+            if sensor not in rigs:
+                camera = colmap_camera(sensor)
+                camera.camera_id = db.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                rigs[sensor] = camera.camera_id, db.write_rig(rig)
+            camera_id, rig_id = rigs[sensor]
+            image = pycolmap.Image(name=name, camera_id=camera_id)
+            image.image_id = db.write_image(image)
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame)
+            db.write_keypoints(image.image_id, found.points.astype(np.float32))
+            numbers.append(image.image_id)
+    return numbers
+
+
+def colmap_camera(sensor: Sensor) -> Any:
+    """The camera that the estimation begins with: square pixels and two terms of radial distortion.
+
+    OPENCV's second focal length and tangential terms are no better on a full set of pictures, and on a dozen
+    from a short arc the two focal lengths drift apart by 5 %. Without EXIF the focal length begins at
+    COLMAP's own guess, 1.2 of the longer side.
+    """
+    pycolmap = pycolmap_module()
+    focal = sensor.focal or 1.2 * max(sensor.width, sensor.height)
+    camera = pycolmap.Camera.create_from_model_name(1, "RADIAL", focal, sensor.width, sensor.height)
+    camera.has_prior_focal_length = sensor.focal is not None
+    return camera
+
+
+def match_pictures(
+    database: Path,
+    numbers: Sequence[int],
+    sensors: Sequence[Sensor],
+    features: Sequence[Features],
+    pairs: Sequence[tuple[int, int]],
+    progress: Callable[[int, int], object],
+) -> None:
+    """Match the `pairs` (i, j) of pictures, keep what agrees with one geometry, and put it into the
+    database."""
+    pycolmap = pycolmap_module()
+    cameras = {sensor: colmap_camera(sensor) for sensor in set(sensors)}
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    options.min_num_inliers = MIN_MATCHES
+
+    def geometry(pair: tuple[int, int]) -> tuple[np.ndarray, Any]:
+        i, j = pair
+        matches = match(features[i].descriptors, features[j].descriptors)
+        if len(matches) < MIN_MATCHES:
+            return matches, None
+        estimate = pycolmap.estimate_two_view_geometry(
+            cameras[sensors[i]], features[i].points, cameras[sensors[j]], features[j].points, matches, options
+        )
+        return matches, estimate
+
+    with closing(pycolmap.Database.open(database)) as db, ThreadPoolExecutor(n_threads()) as pool:
+        futures = [pool.submit(geometry, pair) for pair in pairs]
+        try:
+            for done, ((i, j), future) in enumerate(zip(pairs, futures, strict=True)):
+                matches, estimate = future.result()
+                if estimate is not None and len(estimate.inlier_matches) >= MIN_MATCHES:
+                    db.write_matches(numbers[i], numbers[j], matches)
+                    db.write_two_view_geometry(numbers[i], numbers[j], estimate)
+                progress(done + 1, len(pairs))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def map_pictures(
+    database: Path, pictures: Path, work: Path, n_pictures: int, progress: Callable[[int, int], object]
+) -> Any:
+    """The largest `pycolmap.Reconstruction` that the database's matches allow, or None.
+
+    `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption
+    reaches it through its token, between one picture and the next.
+    """
+    pycolmap = pycolmap_module()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = n_threads()
+    options.random_seed = 0
+    options.min_model_size = 3
+    options.extract_colors = False
+    token = pycolmap.CancellationToken()
+    n_placed = 0
+
+    def place(n_new: int) -> None:
+        # A second attempt begins again from nothing; the count never goes back.
+        nonlocal n_placed
+        n_placed = min(n_placed + n_new, n_pictures)
+
+    with ThreadPoolExecutor(1) as pool:
+        future: Future[dict[int, Any]] = pool.submit(
+            pycolmap.incremental_mapping,
+            database,
+            pictures,
+            work,
+            options,
+            initial_image_pair_callback=lambda: place(2),
+            next_image_callback=lambda: place(1),
+            cancellation_token=token,
+        )
+        try:
+            while True:
+                progress(n_placed, n_pictures)
+                try:
+                    models = future.result(SECONDS_BETWEEN_LOOKS)
+                    break
+                except NotDone:
+                    continue
+        except BaseException:
+            token.cancel()
+            raise
+    model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    if model is not None:
+        _refine_principal_points(model)
+    progress(n_pictures, n_pictures)
+    return model
+
+
+def _refine_principal_points(model: Any) -> None:
+    """Let the principal points go, once, at the end, where every camera has taken enough pictures.
+
+    A phone's is off by a hundredth of the picture, which turns every pose by half a degree and leaves a pixel
+    of error at the border; from few pictures it cannot be told from a turn.
+    """
+    pycolmap = pycolmap_module()
+    n_taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
+    if min(n_taken.values()) < MIN_FOR_PRINCIPAL_POINT:
+        return
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.print_summary = False
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.images.values():
+        if image.has_pose:
+            config.add_image(image.image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not `pycolmap.bundle_adjustment`, which writes to stderr whatever the log level.
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+
+
+def n_threads() -> int:
+    """As many as there are cores, up to eight: each holds a block of products and a decoded picture."""
+    return min(8, os.cpu_count() or 1)

@@ -1,0 +1,267 @@
+"""Photographs or a video without cameras -> a COLMAP model beside them, `sparse/0`, estimated once."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from player.errors import DataError, FormatError
+from player.files import new_folder
+from vfr_bake.data import video
+from vfr_bake.data.features import Features, find_features, pairs_to_match
+from vfr_bake.data.mapping import (
+    Sensor,
+    map_pictures,
+    match_pictures,
+    n_threads,
+    pycolmap_module,
+    write_pictures,
+)
+from vfr_bake.data.transforms import read_picture
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+
+MIN_PICTURES = 3
+MIN_SHARE = 0.6
+"""Where two pictures in five find no place, the subject is seen from one side only, or in two models of which
+the other half is lost: a field trained on the rest has holes that nobody asked for."""
+MIN_REGISTERED = 8
+"""Of fewer than these, all must be registered: a handful of pictures can agree on a wrong model."""
+MIN_FEATURES = 50
+"""Fewer than these, and a picture is blank, out of focus, or all blur."""
+SAME = 1.5
+"""Grey levels of 255, mean difference of thumbnails: what a camera's noise is below on a tripod."""
+
+ADVICE = (
+    "photograph with more overlap (a step of some 10 degrees from one picture to the next), move around the "
+    "subject instead of turning on the spot, hold still while the shutter is open, leave zoom and focus as "
+    "they are, and keep textured surroundings in the picture: a plain, shiny or transparent subject alone "
+    "gives nothing to hold on to"
+)
+
+Progress = Callable[[str, int, int], object]
+
+
+@dataclass(frozen=True)
+class PoseReport:
+    """How well the cameras of a set of pictures are known."""
+
+    folder: Path
+    """The folder that holds `sparse/0` and the pictures: the given one, or a video's folder of frames."""
+    n_pictures: int
+    n_registered: int
+    """The pictures that have got a camera."""
+    mean_error: float
+    """Pixels: mean over the points of how far their projections are from where the pictures show them."""
+    mean_track_length: float
+    """Pictures a point is seen in, on average."""
+
+    def summary(self) -> str:
+        """One sentence for whoever took the pictures.
+
+        >>> PoseReport(Path("garden"), 50, 48, 0.61, 7.25).summary()
+        'garden: cameras of 48 of 50 pictures, off by 0.61 pixels, a point is seen in 7.2 pictures'
+        """
+        return (
+            f"{self.folder}: cameras of {self.n_registered} of {self.n_pictures} pictures, "
+            f"off by {self.mean_error:.2f} pixels, a point is seen in {self.mean_track_length:.1f} pictures"
+        )
+
+
+def is_video(path: Path) -> bool:
+    """Whether `path` is a file that goes by the name of a video.
+
+    >>> is_video(Path("surely/not/there.mp4"))
+    False
+    """
+    return path.suffix.lower() in video.SUFFIXES and path.is_file()
+
+
+def has_pictures(folder: Path) -> bool:
+    """Whether `estimate_cameras` finds pictures in `folder` itself or in its `images/`."""
+    return bool(_pictures(folder))
+
+
+def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
+    """Estimate the camera of every picture, and keep the result as `sparse/0` beside the pictures.
+
+    `photos`: a folder with JPEG or PNG pictures in `images/` or in itself, or a video, whose frames are
+    first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and left as it
+    is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a video, then
+    `features`, `matches`, `cameras`), how much of it is done and how much there is.
+
+    Pictures of one size, and of one maker, model and focal length where EXIF tells, share one camera (model
+    RADIAL), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
+    do not tell them. A subject that looks the same from two sides may be folded into one, as if walked around
+    half: nothing here tells, and surroundings in the pictures prevent it.
+
+    Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
+    `sparse/0`), OutputError, MissingExtraError.
+    """
+    if is_video(photos):
+        photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of))
+    if not photos.is_dir():
+        found = "a file of another kind" if photos.exists() else "nothing"
+        raise DataError(f"{photos}: expected a folder of pictures or a video, got {found}")
+    pictures = _pictures(photos)
+    model = photos / "sparse" / "0"
+    if model.exists():
+        return _read_report(model, photos, len(pictures))
+    if len(pictures) < MIN_PICTURES:
+        raise DataError(
+            f"{photos}: pictures ({', '.join(SUFFIXES)}): expected at least {MIN_PICTURES}, "
+            f"got {len(pictures)}{_other_kinds(photos)}"
+        )
+    pycolmap_module()  # said at once if it is missing, not after minutes
+    sensors, features = _look_at(pictures, photos, lambda done, of: progress("features", done, of))
+    with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
+        work = Path(name)
+        database = work / "database.db"
+        names = [path.name for path in pictures]
+        numbers = write_pictures(database, names, sensors, features)
+        pairs = pairs_to_match(features)
+        match_pictures(
+            database, numbers, sensors, features, pairs, lambda done, of: progress("matches", done, of)
+        )
+        result = map_pictures(
+            database,
+            pictures[0].parent,
+            work,
+            len(pictures),
+            lambda done, of: progress("cameras", done, of),
+        )
+    n_registered = result.num_reg_images() if result is not None else 0
+    if result is None or n_registered < _n_needed(len(pictures)):
+        raise DataError(
+            f"{photos}: cameras: expected to find those of at least {_n_needed(len(pictures))} of "
+            f"{len(pictures)} pictures, got {n_registered}: {ADVICE}"
+        )
+    with new_folder(model) as new:
+        result.write_binary(str(new))
+    return _read_report(model, photos, len(pictures))
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """The pictures in `images/`, or else in the folder itself, in the order of their names."""
+    for place in (folder / "images", folder):
+        if place.is_dir():
+            # Names that begin with a dot are what systems leave behind (`._a.jpg` is no picture).
+            found = [
+                path
+                for path in place.iterdir()
+                if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()
+            ]
+            if found:
+                return sorted(found)
+    return []
+
+
+def _other_kinds(folder: Path) -> str:
+    kinds = {
+        path.suffix.lower()
+        for place in (folder, folder / "images")
+        if place.is_dir()
+        for path in place.iterdir()
+        if path.suffix.lower()
+        in (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".dng", ".bmp", ".gif")
+    }
+    return f"; there are {', '.join(sorted(kinds))} files: save them as JPEG" if kinds else ""
+
+
+def _look_at(
+    pictures: Sequence[Path], photos: Path, progress: Callable[[int, int], object]
+) -> tuple[list[Sensor], list[Features]]:
+    """Sensor and features of every picture; raises DataError where they cannot be enough."""
+
+    def look(path: Path) -> tuple[Sensor, Features, np.ndarray]:
+        rgba = read_picture(path)
+        thumbnail = np.asarray(Image.fromarray(rgba).convert("L").resize((32, 32), Image.Resampling.BOX))
+        return _sensor(path, rgba.shape[1], rgba.shape[0]), find_features(rgba), thumbnail.astype(np.float64)
+
+    looks = []
+    with ThreadPoolExecutor(n_threads()) as pool:
+        futures = [pool.submit(look, path) for path in pictures]
+        try:
+            for done, future in enumerate(futures):
+                looks.append(future.result())
+                progress(done + 1, len(pictures))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    sensors, features, thumbnails = (list(column) for column in zip(*looks, strict=True))
+    n_good = sum(len(found.points) >= MIN_FEATURES for found in features)
+    if n_good < _n_needed(len(pictures)):
+        raise DataError(
+            f"{photos}: pictures with something to recognise (at least {MIN_FEATURES} features): expected at "
+            f"least {_n_needed(len(pictures))} of {len(pictures)}, got {n_good}: the rest are blank, out of "
+            f"focus or blurred: {ADVICE}"
+        )
+    if all(np.abs(thumbnail - thumbnails[0]).mean() < SAME for thumbnail in thumbnails):
+        raise DataError(
+            f"{photos}: expected pictures from different places, got {len(pictures)} times the same: {ADVICE}"
+        )
+    return sensors, features
+
+
+def _sensor(path: Path, width: int, height: int) -> Sensor:
+    try:
+        with Image.open(path) as file:
+            exif = file.getexif()
+            details = exif.get_ifd(0x8769)
+    except (OSError, ValueError, SyntaxError):  # damaged EXIF is as good as none
+        return Sensor(width, height, (), None)
+    # Maker, model; focal length, and the same as it would be on 35 mm film.
+    device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
+    film = _positive(details.get(0xA405))
+    # Of equal diagonals, as the standard (CIPA DC-008, 4.6.5) has it; film's is 43.27 mm.
+    focal = film / 43.27 * float(np.hypot(width, height)) if film else None
+    return Sensor(width, height, device, focal)
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < 1e4 else None
+
+
+def _n_needed(n_pictures: int) -> int:
+    return max(int(np.ceil(MIN_SHARE * n_pictures)), min(MIN_REGISTERED, n_pictures))
+
+
+def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
+    """What the files of a COLMAP model say of themselves (its scene/reconstruction_io.cc has the format)."""
+    for name in MODEL_FILES:
+        if not (model / name).is_file():
+            raise FormatError(
+                f"{model}: {name}: expected a complete COLMAP model, got no such file: "
+                f"remove {model} to estimate the cameras anew"
+            )
+    points = (model / "points3D.bin").read_bytes()
+    n_registered = n_points = n_seen = 0
+    error_sum = 0.0
+    try:
+        (n_registered,) = struct.unpack_from("<Q", (model / "images.bin").read_bytes())
+        (n_points,) = struct.unpack_from("<Q", points)
+        at = 8
+        for _ in range(n_points):
+            error, length = struct.unpack_from("<dQ", points, at + 35)
+            at += 51 + 8 * length
+            n_seen += length
+            error_sum += error
+    except struct.error:
+        at = -1
+    if at != len(points):
+        raise FormatError(f"{model}: cut short: remove {model} to estimate the cameras anew")
+    return PoseReport(
+        folder, n_pictures, n_registered, error_sum / max(n_points, 1), n_seen / max(n_points, 1)
+    )
