@@ -80,8 +80,9 @@ def _train(options: Any) -> int:
     check_target(options.model, options.force)
     config = options.config
     processes = Processes.from_environment()
+    data = processes.in_turn(lambda: _with_cameras(options.data))
     with _Bar("reading pictures", processes.first) as bar:
-        scene = load_scene(options.data, bar.count, downscale=config.downscale, kind=config.kind)
+        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
     trainer = Trainer(scene, config, processes)
     checkpoint = checkpoint_path(options.model)
     if options.resume and checkpoint.exists():
@@ -91,13 +92,31 @@ def _train(options: Any) -> int:
     figures = _train_steps(trainer, checkpoint)
     interrupted = figures.pop("interrupted")
     if processes.first:
+        _save(options.model, trainer, scene, figures)
         if not interrupted and config.eval_views and scene.test.cameras:
             figures |= _test_figures(trainer, scene, config.eval_views)
-        _save(options.model, trainer, scene, figures)
+            _save(options.model, trainer, scene, figures)
         checkpoint.unlink(missing_ok=True)
         _report_training(options, figures, interrupted)
     processes.leave()
     return 130 if interrupted else 0
+
+
+def _with_cameras(data: str) -> str:
+    """The folder to load: photographs or a video without cameras have them estimated first."""
+    from vfr_bake.data import needs_cameras
+    from vfr_bake.data.poses import estimate_cameras
+
+    if not needs_cameras(data):
+        return data
+    bars: dict[str, _Bar] = {}
+    report = estimate_cameras(
+        Path(data), lambda stage, done, of: bars.setdefault(stage, _Bar(stage)).count(done, of)
+    )
+    for bar in bars.values():
+        bar.close()
+    print(f"vfr-train: {report.summary()}", file=sys.stderr)
+    return str(report.folder)
 
 
 def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:

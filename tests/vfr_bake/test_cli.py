@@ -14,12 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from player.errors import DataError
 from vfr_bake.cli import bake_main, eval_main, train_main
 from vfr_bake.data.scene import PosedImages
 from vfr_bake.training.evaluation import RenderedView
 from vfr_bake.training.metrics import over_background, to_8_bit
+from vfr_bake.training.model_file import load_model
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -228,3 +231,60 @@ def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
     assert process.wait(timeout=60) == 130
     process.stderr.close()
     assert eval_main([str(path), str(small_data)]) == 0
+
+
+def test_training_goes_on_after_kill_9(small_data: Path, tmp_path: Path) -> None:
+    """The interrupted run ends in the same field as one that was left alone, to the last bit."""
+    settings = [*SMALL, "--steps", "400", "--minutes", "60", "--eval-views", "0"]
+    settings += ["--checkpoint-minutes", "0.005"]
+    alone, killed = tmp_path / "alone.pt", tmp_path / "killed.pt"
+    assert train_main([str(small_data), str(alone), *settings]) == 0
+    program = "import sys; from vfr_bake.cli import train_main; sys.exit(train_main())"
+    checkpoint = tmp_path / "killed.pt.checkpoint"
+    process = subprocess.Popen([sys.executable, "-c", program, str(small_data), str(killed), *settings])
+    end = time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < end and process.poll() is None:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert checkpoint.exists() and not killed.exists()
+    assert train_main([str(small_data), str(killed), *settings, "--resume"]) == 0
+    assert not checkpoint.exists()
+    fields = [load_model(path).field.state_dict() for path in (alone, killed)]
+    for name, tensor in fields[0].items():
+        assert torch.equal(tensor, fields[1][name]), name
+
+
+def test_an_unbounded_model_is_evaluated_and_not_yet_baked(
+    small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = tmp_path / "model.pt"
+    arguments = ["--steps", "30", "--kind", "unbounded", "--batch-rays", "64", "--downscale", "2", *SMALL]
+    assert train_main([str(small_data), str(model), *arguments]) == 0
+    assert eval_main([str(model), str(small_data), "--json", str(tmp_path / "eval.json")]) == 0
+    assert json.loads((tmp_path / "eval.json").read_text())["n_views"] == 2
+    assert bake_main([str(model), str(tmp_path / "asset")]) == 1
+    one_error(capsys, "expected an object, got an unbounded scene", "--kind object")
+    assert not (tmp_path / "asset").exists()
+
+
+def test_photographs_without_cameras_have_them_estimated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the estimation itself does is tested where it is; here, that it is asked and told of."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index in range(3):
+        Image.fromarray(np.full((16, 16, 3), 90 * index, np.uint8)).save(photos / f"{index}.jpg")
+    assert train_main([str(photos), str(tmp_path / "model.pt")]) == 1
+    one_error(capsys, str(photos))
+    calls = []
+
+    def estimate(folder: Path, progress: object) -> object:
+        calls.append(folder)
+        raise DataError("found none")
+
+    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
+    assert train_main([str(photos), str(tmp_path / "model.pt")]) == 1
+    one_error(capsys, "found none")
+    assert calls == [photos]

@@ -18,6 +18,7 @@ from player.asset import Asset, GridArrays, write_asset
 from player.bricks import pack_vertices
 from player.cameras import Camera
 from player.density import encode_density
+from player.errors import ConfigError
 from player.files import check_target
 from player.manifest import Manifest
 from player.render import render
@@ -62,6 +63,7 @@ class BakeResult:
 def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
     """Bake `model` into the asset `folder`. Raises OutputError, TrainingError (nothing visible)."""
     check_target(folder, force)
+    _check_bakeable(model)
     begin = time.monotonic()
     resolution = config.resolution or round(2 * CELLS_PER_PIXEL / float(np.median(pixel_footprints(model))))
     resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
@@ -100,6 +102,15 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     figures = figures | check_asset(model, folder, config.check_views, _stage(report, "check"))
     n_bytes = sum(path.stat().st_size for path in folder.iterdir())
     return BakeResult(len(arrays.density), n_bytes, time.monotonic() - begin, figures)
+
+
+def _check_bakeable(model: Model) -> None:
+    """Raises ConfigError for a field that an asset cannot hold."""
+    _ = model.occupancy  # says so if the scene is unbounded
+    config = model.field.config
+    for name, needed in (("compositing", "features"), ("activation", "gelu")):
+        if getattr(config, name) != needed:
+            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(config, name)}")
 
 
 def _head(

@@ -10,6 +10,7 @@ from vfr_bake.config import SceneKind
 from vfr_bake.data.capture import Capture
 from vfr_bake.data.colmap import colmap_folder, load_colmap_folder
 from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 from vfr_bake.data.transforms import has_transforms, load_transforms_folder
 
@@ -32,6 +33,16 @@ def load_scene(
     """
     capture = demo_capture(progress=progress) if str(data) == "demo" else load_folder(Path(data), progress)
     return build_scene(capture, kind, downscale)
+
+
+def needs_cameras(data: str | Path) -> bool:
+    """Whether `data` is a video, or a folder of pictures without cameras: `poses.estimate_cameras` finds
+    them."""
+    folder = Path(data)
+    if str(data) == "demo" or is_video(folder):
+        return str(data) != "demo"
+    known = not folder.is_dir() or has_transforms(folder) or colmap_folder(folder) is not None
+    return not known and has_pictures(folder)
 
 
 def load_folder(folder: Path, progress: Progress | None = None) -> Capture:

@@ -24,7 +24,7 @@ from vfr_bake.data.mapping import (
     pycolmap_module,
     write_pictures,
 )
-from vfr_bake.data.transforms import read_picture
+from vfr_bake.data.pictures import read_picture
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")

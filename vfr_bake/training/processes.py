@@ -7,10 +7,13 @@ its hooks would not see it. Gradients are summed, so that the processes' batches
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, distributed
+
+T = TypeVar("T")
 
 
 class Processes:
@@ -58,8 +61,21 @@ class Processes:
             for gradient in gradients:
                 distributed.all_reduce(gradient)
 
-    def leave(self) -> None:
-        """Wait for the others and end the group."""
+    def in_turn(self, work: Callable[[], T]) -> T:
+        """The result of `work`, done by the first process before the others: they find what it left."""
+        if self.first:
+            result = work()
+            self._wait()
+            return result
+        self._wait()
+        return work()
+
+    def _wait(self) -> None:
         if self.size > 1:
             distributed.barrier()
+
+    def leave(self) -> None:
+        """Wait for the others and end the group."""
+        self._wait()
+        if self.size > 1:
             distributed.destroy_process_group()

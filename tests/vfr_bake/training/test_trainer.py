@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from player.errors import TrainingError
+from player.errors import ConfigError, FormatError, TrainingError
 from vfr_bake.config import FieldOptions, TrainConfig
-from vfr_bake.data.demo import demo_scene
-from vfr_bake.data.scene import Scene
+from vfr_bake.data.demo import demo_capture, demo_scene
+from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.trainer import Trainer
 
@@ -78,3 +80,85 @@ def test_pictures_without_alpha_train_over_their_own_background(scene: Scene) ->
     views = type(scene.train)(scene.train.cameras, opaque)
     photographs = Scene(scene.name, views, scene.test, False, scene.world_from_model)
     assert len(list(Trainer(photographs, config(steps=5)).run())) == 5
+
+
+def unbounded(scene_size: int = 32) -> Scene:
+    return build_scene(demo_capture(size=scene_size, n_train=12, n_test=2), "unbounded")
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(kind: str, tmp_path: Path) -> None:
+    """Bit by bit: everything that the next step depends on is in the checkpoint."""
+    scene = demo_scene(size=32, n_train=12, n_test=2) if kind == "object" else unbounded()
+    settings = {"steps": 40, "pilot_steps": 10, "batch_rays": 64, "batch_samples": 2048}
+    whole = Trainer(scene, config(**settings))
+    losses = [report.loss for report in whole.run()]
+    broken = Trainer(scene, config(**settings))
+    for report in broken.run():
+        if report.step == 17:
+            save_checkpoint(tmp_path / "c", broken)
+        if report.step == 20:
+            break  # killed: what came after the checkpoint is lost
+    again = Trainer(scene, config(**settings))
+    load_checkpoint(tmp_path / "c", again)
+    assert [report.loss for report in again.run()] == losses[18:]
+    for name, tensor in whole.field.state_dict().items():
+        assert torch.equal(tensor, again.field.state_dict()[name]), name
+
+
+def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:
+    trainer = Trainer(scene, config(steps=3))
+    save_checkpoint(tmp_path / "c", trainer)
+    load_checkpoint(tmp_path / "c", Trainer(scene, config(steps=9, eval_views=1)))  # a longer run may go on
+    with pytest.raises(ConfigError, match=r"seed: expected 0 as in the interrupted run, got 1"):
+        load_checkpoint(tmp_path / "c", Trainer(scene, config(seed=1)))
+    whole = (tmp_path / "c").read_bytes()
+    for content in (b"", b"no", whole[: len(whole) // 2]):
+        (tmp_path / "c").write_bytes(content)
+        with pytest.raises(FormatError, match="not a checkpoint"):
+            load_checkpoint(tmp_path / "c", trainer)
+
+
+def test_colours_can_be_composited_instead(scene: Scene) -> None:
+    """Equation 2, the paper's baseline, learns the same scene; its head has no pilot before it."""
+    colour = config(steps=150, field=FieldOptions(**vars(FIELD) | {"compositing": "colour"}))
+    trainer = Trainer(scene, colour)
+    before = [parameter.detach().clone() for parameter in trainer.pilot.parameters()]
+    for _ in trainer.run():
+        pass
+    scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3))
+    assert np.mean([score.psnr for score in scores]) > 17
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.pilot.parameters(), strict=True))
+
+
+def test_an_unbounded_scene_is_learnt() -> None:
+    scene = unbounded(48)
+    trainer = Trainer(scene, config(steps=300, pilot_steps=60, batch_rays=128))
+    white = np.ones(3)
+    before = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    reports = list(trainer.run())
+    after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    assert trainer.n_bad_steps == 0 and len(reports) == 300
+    assert after > before + 4
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(scene, config(steps=4, pilot_steps=0))
+    before = {name: tensor.clone() for name, tensor in trainer.field.state_dict().items()}
+    forward = trainer.field.head.forward
+    monkeypatch.setattr(trainer.field.head, "forward", lambda f, d: Poison.apply(forward(f, d)))
+    reports = list(trainer.run())
+    assert trainer.n_bad_steps == 4 and all(math.isnan(report.loss) for report in reports)
+    for name, tensor in trainer.field.state_dict().items():
+        assert torch.equal(tensor, before[name]), name
+    assert not trainer.field.grid.table.grad.any()
+
+
+class Poison(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: torch.Tensor) -> torch.Tensor:
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, *grads: torch.Tensor) -> torch.Tensor:
+        return grads[0] * math.nan
