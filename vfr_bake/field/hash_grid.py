@@ -13,6 +13,7 @@ from numba import get_num_threads
 from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
+from vfr_bake.field.memory import zeros
 from vfr_bake.kernels import hash_grid as kernels
 
 
@@ -70,9 +71,7 @@ class HashGrid(nn.Module):
         self.touched = np.empty((0, 0), np.int64), np.empty(0, np.int64)
         """Rows [n_levels, n] that the last backward pass wrote to, and how many of them at each level."""
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
-        self.table = nn.Parameter(
-            torch.empty(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4)
-        )
+        self.table = nn.Parameter(zeros(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4))
 
     def kernel_arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
         """(table, scales, offsets, hashed, mask) as the kernels take them."""

@@ -21,8 +21,11 @@ OPACITY_THRESHOLD = 0.01
 DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
-SHARE = 64
-"""An update looks at one cell in this many at random, and at as many of the occupied ones."""
+SHARE = 8, 32
+"""An update looks at one cell in so many at random, at first and later, and at as many of the occupied ones:
+matter that appears in a cell that counts as empty is found by no other way."""
+N_FIRST_UPDATES = 32
+"""Updates that count as first."""
 
 
 class OccupancyGrid:
@@ -54,7 +57,8 @@ class OccupancyGrid:
             cells = np.arange(n_cells)
             flat[:] = 0
         else:
-            cells = self._random.integers(0, n_cells, n_cells // SHARE)
+            n_looks = n_cells // SHARE[self.n_updates >= N_FIRST_UPDATES]
+            cells = self._random.integers(0, n_cells, n_looks)
             occupied = np.flatnonzero(self.distance == 0)
             if len(occupied) > len(cells):
                 occupied = self._random.choice(occupied, len(cells))

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
+from vfr_bake.field.memory import zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.samples import LIMITS, Samples
@@ -54,7 +55,7 @@ class ProposalGrid(nn.Module):
     def __init__(self, max_resolution: int) -> None:
         super().__init__()
         self.layout = GridLayout(N_LEVELS, 16, max_resolution, LOG2_TABLE_SIZE)
-        self.table = nn.Parameter(torch.zeros(self.layout.n_entries, 1))
+        self.table = nn.Parameter(zeros(self.layout.n_entries, 1))
 
     def kernel_arguments(self) -> tuple:
         return (self.table.detach().numpy(), *self.layout.kernel_arguments(np.float32))

@@ -25,7 +25,7 @@ from vfr_bake.training.optimiser import GridAdam
 
 FOG_STEPS = 512
 """First steps, in which empty space has to be found and the occupancy grid is updated often."""
-STEPS_PER_UPDATE = (16, 128)
+STEPS_PER_UPDATE = (16, 64)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 (mip-NeRF 360,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from numba import get_num_threads
 from torch import Tensor
 
+from vfr_bake.field.memory import zeros
 from vfr_bake.kernels.adam import adam_step, adam_step_rows
 
 WARMUP_STEPS = 100
@@ -37,8 +37,8 @@ class GridAdam:
         self, table: Tensor, beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e-15
     ) -> None:
         self.table = table
-        table.grad = torch.zeros_like(table)
-        self.moments = torch.zeros(len(table), 2 * table.shape[1])
+        table.grad = zeros(*table.shape)
+        self.moments = zeros(len(table), 2 * table.shape[1])
         self.betas, self.epsilon = (beta1, beta2), epsilon
         self.n_steps = 0
 
