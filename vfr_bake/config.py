@@ -153,15 +153,15 @@ class TrainConfig:
     downscale: int = 1
     """Pictures are reduced by this factor along each side before training."""
     steps: int = 60_000
-    """Optimiser steps at most (paper: 20,000 of 64 times as many samples; 40,000 for scenes). Training ends
+    """Optimiser steps at most (paper: 20,000 of 16 times as many samples; 40,000 for scenes). Training ends
     here or when the minutes are over."""
     minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
     further. Objects 9, scenes 14."""
-    batch_samples: int = 4096
-    """Objects: samples along rays in a batch (paper: 262,144). A CPU step costs time in proportion, and a few
-    minutes are better spent on many small steps: the same 25 million samples gave lego 26.3 dB in steps of
-    16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096."""
+    batch_samples: int = 16_384
+    """Objects: samples along rays in a batch (paper: 262,144). Smaller, because a CPU step costs time in
+    proportion. The same 25 million samples gave lego 26.3 dB in steps of 16,384, 27.1 in steps of 8,192 and
+    27.8 in steps of 4,096, which take twice the time, though."""
     batch_rays: int = 512
     """Scenes: rays in a batch (paper: 8,192); smaller for the same reason."""
     max_rays: int = 16_384

@@ -21,11 +21,10 @@ OPACITY_THRESHOLD = 0.01
 DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
-SHARE = 8, 32
-"""An update looks at one cell in so many at random, at first and later, and at as many of the occupied ones:
-matter that appears in a cell that counts as empty is found by no other way."""
-N_FIRST_UPDATES = 32
-"""Updates that count as first."""
+SHARE = 32
+"""An update looks at one cell in this many at random, and at as many of the occupied ones. With 64 matter that
+appears in a cell that counts as empty is found too late (lego after 1,200 steps: 1.0 dB less); with 8 more
+cells stay occupied, and a batch of so many samples holds fewer rays (0.9 dB less)."""
 
 
 class OccupancyGrid:
@@ -57,8 +56,7 @@ class OccupancyGrid:
             cells = np.arange(n_cells)
             flat[:] = 0
         else:
-            n_looks = n_cells // SHARE[self.n_updates >= N_FIRST_UPDATES]
-            cells = self._random.integers(0, n_cells, n_looks)
+            cells = self._random.integers(0, n_cells, n_cells // SHARE)
             occupied = np.flatnonzero(self.distance == 0)
             if len(occupied) > len(cells):
                 occupied = self._random.choice(occupied, len(cells))
