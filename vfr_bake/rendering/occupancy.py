@@ -22,9 +22,9 @@ DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
 SHARE = 32
-"""An update looks at one cell in this many at random, and at as many of the occupied ones. With 64 matter that
-appears in a cell that counts as empty is found too late (lego after 1,200 steps: 1.0 dB less); with 8 more
-cells stay occupied, and a batch of so many samples holds fewer rays (0.9 dB less)."""
+"""An update looks at one cell in this many at random, and at as many of the occupied ones. With 64, matter
+that appears in a cell that counts as empty is found too late (lego after 1,200 steps: 1.0 dB less); with 8,
+more cells stay occupied, and a batch of so many samples holds fewer rays (0.9 dB less)."""
 
 
 class OccupancyGrid:
