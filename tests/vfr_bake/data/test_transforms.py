@@ -176,18 +176,18 @@ def test_floating_point_is_refused(tmp_path: Path):
 
 def test_missing_folder(tmp_path: Path):
     text = message(tmp_path / "nowhere")
-    assert text.startswith(
-        f"{tmp_path / 'nowhere'}: no such folder: expected a folder with a transforms.json"
-    )
+    assert text.startswith(f"{tmp_path / 'nowhere'}: no such folder: expected one with pictures and cameras")
 
 
 def test_a_file_in_the_folders_place(tmp_path: Path):
     (tmp_path / "f").write_text("x")
-    assert "expected a folder with a transforms.json, got a file" in message(tmp_path / "f")
+    assert "expected a folder with a transforms.json or a COLMAP model, got a file" in message(tmp_path / "f")
 
 
 def test_empty_folder_and_folder_without_transforms(tmp_path: Path):
-    expected = f"{tmp_path}: expected transforms_train.json or transforms.json in it, got "
+    expected = (
+        f"{tmp_path}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got "
+    )
     assert message(tmp_path) == expected + "an empty folder"
     (tmp_path / "picture.png").write_bytes(b"")
     assert message(tmp_path) == expected + "neither"

@@ -28,7 +28,7 @@ def config(**changes: object) -> TrainConfig:
         "occupancy_resolution": 32,
         "pilot_steps": 60,
     }
-    return TrainConfig(field=FIELD, **(settings | changes))  # type: ignore[arg-type]
+    return TrainConfig(**({"field": FIELD} | settings | changes))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
