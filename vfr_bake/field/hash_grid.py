@@ -68,8 +68,8 @@ class HashGrid(nn.Module):
         self.layout = GridLayout(
             config.n_levels, config.base_resolution, config.max_resolution, config.log2_table_size
         )
-        self.touched = np.empty((0, 0), np.int64), np.empty(0, np.int64)
-        """Rows [n_levels, n] that the last backward pass wrote to, and how many of them at each level."""
+        self.pending: list[tuple[Tensor, Tensor]] | None = None
+        """If a list, backward passes put (points, gradient of the features) here instead of scattering."""
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
         self.table = nn.Parameter(zeros(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4))
 
@@ -127,17 +127,14 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads: Tensor):
         points, table = ctx.saved_tensors
+        gradient = grads[0].contiguous()
+        if ctx.grid.pending is not None:
+            ctx.grid.pending.append((points, gradient))
+            return None, None, None, None
         # A leaf with a gradient buffer receives the gradient in place: clearing and adding 40 MB a step is
         # saved.
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
-        gradient = grads[0].contiguous().numpy()
-        scales, offsets, hashed, mask = ctx.grid.layout.kernel_arguments(gradient.dtype)
-        rows = np.empty((len(scales), 8 * len(points)), np.int64)
-        counts = np.empty(len(scales), np.int64)
-        kernels.scatter(
-            points.numpy(), gradient, scales, offsets, hashed, mask, get_num_threads(), grad_table.numpy(),
-            rows, counts,
-        )  # fmt: skip
-        ctx.grid.touched = rows, counts
+        layout = ctx.grid.layout.kernel_arguments(gradient.numpy().dtype)
+        kernels.scatter(points.numpy(), gradient.numpy(), *layout, get_num_threads(), grad_table.numpy())
         return None, None if in_place else grad_table, None, None

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-PRIME_Y = 2654435761
-PRIME_Z = 805459861
+PRIME_Y = np.uint32(2654435761)
+PRIME_Z = np.uint32(805459861)
+ONE = np.uint32(1)
 N_CHANNELS = 2
 """Feature channels per level, as in the paper; the loops below are written out for two."""
 
@@ -22,62 +23,81 @@ hidden."""
 
 
 @njit(inline="always")
-def corner_rows(ix, iy, iz, side, offset, mask, hashed):
-    """Rows of the eight corners, in the order 000 100 010 110 001 101 011 111 (x fastest)."""
+def cell_of(position, last):
+    """Cell that a position (in cells of the level) lies in, 0 to `last`."""
+    return min(max(np.int32(position), np.int32(0)), last)
+
+
+@njit(inline="always")
+def corner_rows(ix, iy, iz, last, offset, mask, hashed):
+    """Rows of the eight corners of cell (ix, iy, iz) of 0 to `last`, in the order 000 100 010 110 001 101 011
+    111 (x fastest).
+
+    Unsigned: for a signed index Numba looks whether it counts from the end.
+    """
+    x, y, z, first = np.uint32(ix), np.uint32(iy), np.uint32(iz), np.uint64(offset)
     if hashed:
-        y0 = iy * PRIME_Y
-        z0 = iz * PRIME_Z
-        y1 = y0 + PRIME_Y
-        z1 = z0 + PRIME_Z
-        jx = ix + 1
+        bits = np.uint32(mask)
+        x1 = x + ONE
+        y0, y1 = y * PRIME_Y, (y + ONE) * PRIME_Y
+        z0, z1 = z * PRIME_Z, (z + ONE) * PRIME_Z
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
         return (
-            offset + ((ix ^ y0 ^ z0) & mask),
-            offset + ((jx ^ y0 ^ z0) & mask),
-            offset + ((ix ^ y1 ^ z0) & mask),
-            offset + ((jx ^ y1 ^ z0) & mask),
-            offset + ((ix ^ y0 ^ z1) & mask),
-            offset + ((jx ^ y0 ^ z1) & mask),
-            offset + ((ix ^ y1 ^ z1) & mask),
-            offset + ((jx ^ y1 ^ z1) & mask),
+            first + np.uint64(np.uint32(x ^ a) & bits),
+            first + np.uint64(np.uint32(x1 ^ a) & bits),
+            first + np.uint64(np.uint32(x ^ b) & bits),
+            first + np.uint64(np.uint32(x1 ^ b) & bits),
+            first + np.uint64(np.uint32(x ^ c) & bits),
+            first + np.uint64(np.uint32(x1 ^ c) & bits),
+            first + np.uint64(np.uint32(x ^ d) & bits),
+            first + np.uint64(np.uint32(x1 ^ d) & bits),
         )
-    row = offset + (iz * side + iy) * side + ix
+    side, one = np.uint64(last) + np.uint64(2), np.uint64(1)
+    row = first + (np.uint64(z) * side + np.uint64(y)) * side + np.uint64(x)
     plane = side * side
     return (
         row,
-        row + 1,
+        row + one,
         row + side,
-        row + side + 1,
+        row + side + one,
         row + plane,
-        row + plane + 1,
+        row + plane + one,
         row + plane + side,
-        row + plane + side + 1,
+        row + plane + side + one,
     )
+
+
+@njit(inline="always")
+def corners(x, y, z, scale, offset, mask, hashed):
+    """(rows, trilinear weights) of the eight corners around a point of the unit cube, order as in
+    `corner_rows`."""
+    kind = type(scale)
+    one = kind(1)
+    last = np.int32(scale) - np.int32(1)
+    px, py, pz = x * scale, y * scale, z * scale
+    ix, iy, iz = cell_of(px, last), cell_of(py, last), cell_of(pz, last)
+    fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
+    gx, gy, gz = one - fx, one - fy, one - fz
+    w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+    weights = (gx * w00, fx * w00, gx * w10, fx * w10, gx * w01, fx * w01, gx * w11, fx * w11)
+    return corner_rows(ix, iy, iz, last, offset, mask, hashed), weights
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def encode_point(x, y, z, table, scales, offsets, hashed, mask, out):
     """Write the features [2 * n_levels] of one point of the unit cube to `out`."""
-    kind = table.dtype.type
-    one = kind(1)
     for level in range(scales.shape[0]):
-        scale = scales[level]
-        last = np.int64(scale) - 1
-        px, py, pz = x * scale, y * scale, z * scale
-        ix = min(max(np.int64(px), 0), last)
-        iy = min(max(np.int64(py), 0), last)
-        iz = min(max(np.int64(pz), 0), last)
-        fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
-        gx, gy, gz = one - fx, one - fy, one - fz
-        r0, r1, r2, r3, r4, r5, r6, r7 = corner_rows(
-            ix, iy, iz, last + 2, offsets[level], mask, hashed[level]
-        )
-        w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+        r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
         for channel in range(2):
             out[2 * level + channel] = (
-                w00 * (gx * table[r0, channel] + fx * table[r1, channel])
-                + w10 * (gx * table[r2, channel] + fx * table[r3, channel])
-                + w01 * (gx * table[r4, channel] + fx * table[r5, channel])
-                + w11 * (gx * table[r6, channel] + fx * table[r7, channel])
+                w[0] * table[r[0], channel]
+                + w[1] * table[r[1], channel]
+                + w[2] * table[r[2], channel]
+                + w[3] * table[r[3], channel]
+                + w[4] * table[r[4], channel]
+                + w[5] * table[r[5], channel]
+                + w[6] * table[r[6], channel]
+                + w[7] * table[r[7], channel]
             )
 
 
@@ -88,50 +108,44 @@ def encode(points, table, scales, offsets, hashed, mask, out):
         encode_point(points[i, 0], points[i, 1], points[i, 2], table, scales, offsets, hashed, mask, out[i])
 
 
+@njit(inline="always")
+def scatter_level(points, grad_features, level, scale, offset, mask, hashed, grad_table, rows):
+    """Add one level's gradient to `grad_table` [n_entries, 2]; returns how many rows had none before, listed
+    in `rows`, which has room for 8 a point and one more.
+
+    The list grows without a branch: what a row held is known only when it has come from memory, and guessing
+    it wrong would stop the fetching of those to come.
+    """
+    n = np.uint64(0)
+    for i in range(points.shape[0]):
+        g0, g1 = grad_features[i, 2 * level], grad_features[i, 2 * level + 1]
+        if g0 == 0 and g1 == 0:
+            continue
+        r, w = corners(points[i, 0], points[i, 1], points[i, 2], scale, offset, mask, hashed)
+        for corner in range(8):
+            row = r[corner]
+            old0, old1 = grad_table[row, 0], grad_table[row, 1]
+            rows[n] = row
+            n += np.uint64((old0 == 0) & (old1 == 0))
+            grad_table[row, 0] = old0 + w[corner] * g0
+            grad_table[row, 1] = old1 + w[corner] * g1
+    return n
+
+
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, grad_table, rows, counts):
+def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, grad_table):
     """Add to `grad_table` [n_entries, 2] the gradient of `encode`, given `grad_features` [n_points, 2 *
     n_levels].
 
     One thread owns a level: no two threads write to one entry, and the sum has one order, so the result is
     the same in every run. Fine levels cost more than coarse ones, so neighbouring levels go to different
-    threads. Entries whose gradient was zero are listed in `rows[level, : counts[level]]`; `rows` has room for
-    8 a point.
+    threads.
     """
-    kind = grad_table.dtype.type
-    one = kind(1)
     n_levels = scales.shape[0]
     for thread in prange(n_threads):
+        rows = np.empty(8 * points.shape[0] + 1, np.uint32)
         for level in range(thread, n_levels, n_threads):
-            scale = scales[level]
-            last = np.int64(scale) - 1
-            n = 0
-            for i in range(points.shape[0]):
-                g0, g1 = grad_features[i, 2 * level], grad_features[i, 2 * level + 1]
-                if g0 == 0 and g1 == 0:
-                    continue
-                px, py, pz = points[i, 0] * scale, points[i, 1] * scale, points[i, 2] * scale
-                ix = min(max(np.int64(px), 0), last)
-                iy = min(max(np.int64(py), 0), last)
-                iz = min(max(np.int64(pz), 0), last)
-                fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
-                gx, gy, gz = one - fx, one - fy, one - fz
-                corners = corner_rows(ix, iy, iz, last + 2, offsets[level], mask, hashed[level])
-                weights = (
-                    gx * gy * gz,
-                    fx * gy * gz,
-                    gx * fy * gz,
-                    fx * fy * gz,
-                    gx * gy * fz,
-                    fx * gy * fz,
-                    gx * fy * fz,
-                    fx * fy * fz,
-                )
-                for corner in range(8):
-                    row = corners[corner]
-                    if grad_table[row, 0] == 0 and grad_table[row, 1] == 0:
-                        rows[level, n] = row
-                        n += 1
-                    grad_table[row, 0] += weights[corner] * g0
-                    grad_table[row, 1] += weights[corner] * g1
-            counts[level] = n
+            scatter_level(
+                points, grad_features, level, scales[level], offsets[level], mask, hashed[level], grad_table,
+                rows,
+            )  # fmt: skip

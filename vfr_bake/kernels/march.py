@@ -116,15 +116,15 @@ def density_logits(points, grid, network, out):
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def march_samples(
     rays_o, rays_d, jitter, step, distance, grid, network, limits, counts, starts, t_mid,
-    points, features,
+    points, features, sigmas,
 ):  # fmt: skip
     """Visible samples of as many rays as fit, in one pass: what is counted is what is written.
 
-    `t_mid` [n_chunks, capacity], `points` [n_chunks, capacity, 3] and `features` [n_chunks, capacity,
-    n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only if the
-    most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever written
-    past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the first
-    sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops).
+    `t_mid` and `sigmas` [n_chunks, capacity], `points` [n_chunks, capacity, 3] and `features` [n_chunks,
+    capacity, n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only
+    if the most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever
+    written past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the
+    first sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops).
     """
     table, scales, offsets, hashed, mask = grid
     w1, b1, w2, b2 = network
@@ -162,9 +162,11 @@ def march_samples(
                 points[chunk, k, 0] = ux
                 points[chunk, k, 1] = uy
                 points[chunk, k, 2] = uz
+                sigma = np.exp(min(logit, largest_logit))
+                sigmas[chunk, k] = sigma
                 k += 1
                 i += 1
-                tau += np.exp(min(logit, largest_logit)) * step
+                tau += sigma * step
             counts[ray] = k - starts[ray]
         used[chunk] = k
     return used

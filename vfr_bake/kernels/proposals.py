@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from vfr_bake.kernels.contraction import contracted_unit
-from vfr_bake.kernels.hash_grid import FLAGS, corner_rows, encode_point
+from vfr_bake.kernels.hash_grid import FLAGS, corners, encode_point
 from vfr_bake.kernels.march import density_logit
 
 PADDING = 1e-3
@@ -43,26 +43,18 @@ def distance(s):
 @njit(fastmath=FLAGS, error_model="numpy")
 def proposal_logit(x, y, z, table, scales, offsets, hashed, mask):
     """Log-density of a proposal at a point of the unit cube; `table` [n_entries, 1]."""
-    kind = table.dtype.type
-    one = kind(1)
-    total = kind(0)
+    total = table.dtype.type(0)
     for level in range(scales.shape[0]):
-        scale = scales[level]
-        last = np.int64(scale) - 1
-        px, py, pz = x * scale, y * scale, z * scale
-        ix = min(max(np.int64(px), 0), last)
-        iy = min(max(np.int64(py), 0), last)
-        iz = min(max(np.int64(pz), 0), last)
-        fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
-        gx, gy, gz = one - fx, one - fy, one - fz
-        r0, r1, r2, r3, r4, r5, r6, r7 = corner_rows(
-            ix, iy, iz, last + 2, offsets[level], mask, hashed[level]
-        )
+        r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
         total += (
-            gy * gz * (gx * table[r0, 0] + fx * table[r1, 0])
-            + fy * gz * (gx * table[r2, 0] + fx * table[r3, 0])
-            + gy * fz * (gx * table[r4, 0] + fx * table[r5, 0])
-            + fy * fz * (gx * table[r6, 0] + fx * table[r7, 0])
+            w[0] * table[r[0], 0]
+            + w[1] * table[r[1], 0]
+            + w[2] * table[r[2], 0]
+            + w[3] * table[r[3], 0]
+            + w[4] * table[r[4], 0]
+            + w[5] * table[r[5], 0]
+            + w[6] * table[r[6], 0]
+            + w[7] * table[r[7], 0]
         )
     return total
 
@@ -257,29 +249,15 @@ def interlevel(edges, starts, counts, weights, proposal_edges, proposal_weights,
 def scatter_logits(points, grad_logits, scales, offsets, hashed, mask, n_threads, grad_table):
     """Add to `grad_table` [n_entries, 1] the gradient of `proposal_logit` at `points` [n_points, 3], given
     `grad_logits` [n_points]. One thread owns a level, as in the hash grid's own scatter."""
-    kind = grad_table.dtype.type
-    one = kind(1)
     n_levels = scales.shape[0]
     for thread in prange(n_threads):
         for level in range(thread, n_levels, n_threads):
-            scale = scales[level]
-            last = np.int64(scale) - 1
             for i in range(points.shape[0]):
-                g = grad_logits[i]
-                if g == 0:
+                if grad_logits[i] == 0:
                     continue
-                px, py, pz = points[i, 0] * scale, points[i, 1] * scale, points[i, 2] * scale
-                ix = min(max(np.int64(px), 0), last)
-                iy = min(max(np.int64(py), 0), last)
-                iz = min(max(np.int64(pz), 0), last)
-                fx, fy, fz = px - kind(ix), py - kind(iy), pz - kind(iz)
-                gx, gy, gz = one - fx, one - fy, one - fz
-                rows = corner_rows(ix, iy, iz, last + 2, offsets[level], mask, hashed[level])
-                grad_table[rows[0], 0] += gx * gy * gz * g
-                grad_table[rows[1], 0] += fx * gy * gz * g
-                grad_table[rows[2], 0] += gx * fy * gz * g
-                grad_table[rows[3], 0] += fx * fy * gz * g
-                grad_table[rows[4], 0] += gx * gy * fz * g
-                grad_table[rows[5], 0] += fx * gy * fz * g
-                grad_table[rows[6], 0] += gx * fy * fz * g
-                grad_table[rows[7], 0] += fx * fy * fz * g
+                r, w = corners(
+                    points[i, 0], points[i, 1], points[i, 2], scales[level], offsets[level], mask,
+                    hashed[level],
+                )  # fmt: skip
+                for corner in range(8):
+                    grad_table[r[corner], 0] += w[corner] * grad_logits[i]

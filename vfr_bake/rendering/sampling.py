@@ -27,8 +27,9 @@ def march(
     jitter: Tensor,
     budget: int,
     n_chunks: int = 2,
-) -> Samples:
-    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays] in [0, 1).
+) -> tuple[Samples, np.ndarray]:
+    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities [n_samples]
+    that the march met there; `jitter` [n_rays] in [0, 1).
 
     The budget is grown to hold at least one whole ray per chunk.
     """
@@ -36,7 +37,7 @@ def march(
     longest = int(np.ceil(2 * 3**0.5 / step)) + 3
     capacity = max(budget // n_chunks, longest)
     n_channels = field.config.n_channels
-    t_mid = np.empty((n_chunks, capacity), np.float32)
+    t_mid, sigmas = np.empty((2, n_chunks, capacity), np.float32)
     points = np.empty((n_chunks, capacity, 3), np.float32)
     features = np.empty((n_chunks, capacity, n_channels), np.float32)
     counts = np.empty(len(rays_o), np.int64)
@@ -44,11 +45,11 @@ def march(
     used = kernels.march_samples(
         rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step),
         occupancy.distance,
-        *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features,
+        *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features, sigmas,
     )  # fmt: skip
     first = np.concatenate([[0], np.cumsum(used)])
     served = np.flatnonzero(counts >= 0)
-    return Samples(
+    samples = Samples(
         t_mid=torch.from_numpy(_join(t_mid, used)),
         deltas=torch.full((int(first[-1]),), step),
         points=torch.from_numpy(_join(points, used)),
@@ -57,6 +58,7 @@ def march(
         starts=torch.from_numpy(starts[served] + first[served % n_chunks]),
         counts=torch.from_numpy(counts[served]),
     )
+    return samples, _join(sigmas, used)
 
 
 def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.samples import Samples
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import GridAdam
+from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
 """First steps, in which empty space has to be found and the occupancy grid is updated often."""
@@ -79,8 +80,8 @@ class Guide(Protocol):
 class OccupancyGuide:
     """Marches an object's box and keeps its occupancy grid."""
 
-    def __init__(self, config: TrainConfig, step_length: float) -> None:
-        self._config = config
+    def __init__(self, config: TrainConfig, step_length: float, processes: Processes) -> None:
+        self._config, self._processes = config, processes
         self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
         self._samples_per_ray = 2 / step_length
 
@@ -94,6 +95,8 @@ class OccupancyGuide:
 
     def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
+            # Every process has seen its own rays.
+            self._processes.take_largest(torch.from_numpy(self.sampler.densities))
             self.sampler.update(field)
 
     def sample(
@@ -101,7 +104,10 @@ class OccupancyGuide:
     ) -> Samples:
         first = jitter[:, 0].contiguous()
         budget, n_chunks = int(self._budget(pilot) * share), torch.get_num_threads()
-        return march(field, self.sampler, rays_o, rays_d, first, budget, n_chunks)
+        samples, sigmas = march(field, self.sampler, rays_o, rays_d, first, budget, n_chunks)
+        if self.sampler.n_updates > 0:
+            self.sampler.observe(samples.points.numpy(), sigmas)
+        return samples
 
     def observe(self, n_rays: int, n_samples: int) -> None:
         per_ray = max(n_samples / max(n_rays, 1), 1.0)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from numba import get_num_threads
 from torch import Tensor
 
+from vfr_bake.field.hash_grid import HashGrid
 from vfr_bake.field.memory import zeros
-from vfr_bake.kernels.adam import adam_step, adam_step_rows
+from vfr_bake.kernels.adam import adam_step, scatter_and_step
 
 WARMUP_STEPS = 100
 MILESTONES = (0.5, 0.75, 0.9)
@@ -48,18 +50,21 @@ class GridAdam:
         assert self.table.grad is not None
         return self.table.grad
 
-    def step(self, rate: float, touched: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        """Apply and clear the gradient; `touched`, if known, are the rows that have one: [n_levels, n] and
-        how many at each level."""
+    def step(self, rate: float) -> None:
+        """Apply and clear the gradient."""
+        arrays = (a.numpy() for a in (self.table.detach(), self.gradient, self.moments))
+        adam_step(*arrays, *self._next_scalars(rate))
+
+    def clear(self) -> None:
+        """Drop the gradient of a step that is not to be taken."""
+        self.gradient.zero_()
+
+    def _next_scalars(self, rate: float) -> list[np.float32]:
+        """(bias-corrected rate, beta1, beta2, epsilon) of the next step."""
         self.n_steps += 1
         beta1, beta2 = self.betas
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
-        arrays = [a.numpy() for a in (self.table.detach(), self.gradient, self.moments)]
-        scalars = [np.float32(s) for s in (rate * correction, beta1, beta2, self.epsilon)]
-        if touched is None:
-            adam_step(*arrays, *scalars)
-        else:
-            adam_step_rows(*touched, get_num_threads(), *arrays, *scalars)
+        return [np.float32(s) for s in (rate * correction, beta1, beta2, self.epsilon)]
 
     def state(self) -> dict[str, Any]:
         return {"moments": self.moments, "n_steps": self.n_steps}
@@ -68,6 +73,32 @@ class GridAdam:
         self.moments.copy_(state["moments"])
         self.n_steps = state["n_steps"]
 
+
+class FusedGridAdam(GridAdam):
+    """The same steps for the table of a `HashGrid`, faster: its gradient never exists as a whole."""
+
+    def __init__(self, grid: HashGrid) -> None:
+        assert isinstance(grid.table, Tensor)
+        super().__init__(grid.table)
+        self.table.grad = None
+        self._grid = grid
+        self._pending: list[tuple[Tensor, Tensor]] = []
+        grid.pending = self._pending
+        self._buffer = zeros(get_num_threads(), int(np.diff(grid.layout.offsets).max()), self.table.shape[1])
+        self._rows = np.empty((get_num_threads(), 0), np.uint32)
+
+    def step(self, rate: float) -> None:
+        if not self._pending:
+            return
+        points, gradient = (torch.cat(parts) for parts in zip(*self._pending, strict=True))
+        if self._rows.shape[1] < 8 * len(points) + 1:
+            self._rows = np.empty((get_num_threads(), 8 * len(points) + 1), np.uint32)
+        scatter_and_step(
+            points.numpy(), gradient.numpy(), *self._grid.layout.kernel_arguments(np.float32),
+            self._buffer.numpy(), self._rows, self.table.detach().numpy(), self.moments.numpy(),
+            *self._next_scalars(rate),
+        )  # fmt: skip
+        self._pending.clear()
+
     def clear(self) -> None:
-        """Drop the gradient of a step that is not to be taken."""
-        self.gradient.zero_()
+        self._pending.clear()

@@ -61,6 +61,11 @@ class Processes:
             for gradient in gradients:
                 distributed.all_reduce(gradient)
 
+    def take_largest(self, values: Tensor) -> None:
+        """Replace each value by the largest that some process has."""
+        if self.size > 1:
+            distributed.all_reduce(values, distributed.ReduceOp.MAX)
+
     def in_turn(self, work: Callable[[], T]) -> T:
         """The result of `work`, done by the first process before the others: they find what it left."""
         if self.first:

@@ -21,7 +21,7 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.samples import Samples
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
-from vfr_bake.training.optimiser import GridAdam, rate_factor
+from vfr_bake.training.optimiser import FusedGridAdam, GridAdam, rate_factor
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import PixelSampler
 
@@ -87,8 +87,10 @@ class Trainer:
             self._guide = ProposalGuide(config, scene.near)
         else:
             step_length = 2.0 * config.step_cells / self.field.config.max_resolution
-            self._guide = OccupancyGuide(config, step_length)
-        self._grid_adam = GridAdam(self.field.grid.table)
+            self._guide = OccupancyGuide(config, step_length, self.processes)
+        grid = self.field.grid
+        # Several processes have to add up their gradients before the step.
+        self._grid_adam = GridAdam(grid.table) if self.processes.size > 1 else FusedGridAdam(grid)
         self._parameters = [*self.field.network_parameters(), *self.pilot.parameters()]
         self._adam = torch.optim.Adam(
             self._parameters, lr=config.network_rate, eps=1e-15, betas=(0.9, 0.99), fused=True
@@ -148,18 +150,15 @@ class Trainer:
         if regulariser is not None:
             loss = loss + regulariser / max(n_rays, 1)
         # A batch that met nothing (seen by no process) has nothing to teach.
-        self._clear_gradients(pilot)
-        if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays):
+        self._adam.zero_grad(set_to_none=True)
+        if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
             return value if n_samples == 0 else float("nan"), n_rays, n_samples
         factor = rate_factor(step, progress)
         for group in self._adam.param_groups:
             group["lr"] = self.config.network_rate * factor
         self._adam.step()
-        rate = self.config.grid_rate * factor
-        # Another process' rows are in the sum, but not in this one's list.
-        self._grid_adam.step(rate, self.field.grid.touched if self.processes.size == 1 else None)
-        for table in self._guide.tables():
-            table.step(rate)
+        for table in (self._grid_adam, *self._guide.tables()):
+            table.step(self.config.grid_rate * factor)
         return value, n_rays, n_samples
 
     def _draw(self, n_rays: int) -> Batch:
@@ -202,29 +201,34 @@ class Trainer:
         composited, opacity, weights = composite(sigmas, features, samples.deltas, starts, counts)
         return self.field.head(composited, dirs) * opacity[:, None], opacity, weights
 
-    def _clear_gradients(self, pilot: bool) -> None:
-        """Zero for the networks that learn in this step, so that a process whose rays meet nothing has
-        something to add up; none for the others, which Adam then leaves alone."""
-        self._adam.zero_grad(set_to_none=True)
-        network = self.pilot if pilot else self.field.head
-        for parameter in (*self.field.density.parameters(), *network.parameters()):
-            parameter.grad = torch.zeros_like(parameter)
-
-    def _backward(self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int) -> bool:
+    def _backward(
+        self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int, pilot: bool
+    ) -> bool:
         """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
         tables = [self._grid_adam, *self._guide.tables()]
         if value == value and abs(value) != float("inf"):
             if loss.requires_grad:
                 loss.backward()
             self._guide.add_gradients(samples, weights, n_rays)
-            gradients = [gradient for p in self._parameters if (gradient := p.grad) is not None]
-            self.processes.add_up([*gradients, *(table.gradient for table in tables)])
-            if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+            gradients = self._gradients(pilot)
+            if self.processes.size > 1:
+                self.processes.add_up([*gradients, *(table.gradient for table in tables)])
+            if bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients))):
                 return True
         self.n_bad_steps += 1
         for table in tables:
             table.clear()
         return False
+
+    def _gradients(self, pilot: bool) -> list[Tensor]:
+        """Of the networks that learn in this step, zero where this process' rays met nothing; the others
+        have none, which Adam leaves alone."""
+        network = self.pilot if pilot else self.field.head
+        learning = [*self.field.density.parameters(), *network.parameters()]
+        for parameter in learning:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        return [parameter.grad for parameter in learning if parameter.grad is not None]
 
     def state(self) -> dict[str, Any]:
         """All that the steps to come depend on, in tensors and plain values."""

@@ -38,10 +38,27 @@ def test_the_first_look_finds_the_ball_and_little_else() -> None:
 def test_what_moved_away_fades_and_what_came_is_found() -> None:
     grid = OccupancyGrid(24, step=0.01, seed=0)
     grid.update(Ball(0.3))  # type: ignore[arg-type]
+    random = np.random.default_rng(0)
+    ball = Ball(0.7)
     for _ in range(200):
-        grid.update(Ball(0.7))  # type: ignore[arg-type]
+        grid.update(ball)  # type: ignore[arg-type]
+        points = random.random((2000, 3)).astype(np.float32)  # of rays: they meet occupied cells only
+        points = points[grid.occupied[tuple((points * 24).astype(int).T)]]
+        grid.observe(points, np.exp(ball.log_densities(points)))
     assert not grid.occupied[inside_cells(0.3)].any()
     assert grid.occupied[inside_cells(0.7)].mean() > 0.95
+
+
+def test_what_rays_meet_counts_as_looked_at() -> None:
+    grid = OccupancyGrid(24, step=0.01, seed=0)
+    grid.update(Ball(0.4))  # type: ignore[arg-type]
+    # Two rays meet one cell, the denser counts; the far corner of the cube belongs to the last cell.
+    points = np.float32([[0.95, 0.05, 0.5], [0.951, 0.05, 0.5], [1.0, 1.0, 1.0]])
+    grid.observe(points, np.float32([200.0, 30.0, 200.0]))
+    assert grid.densities[22, 1, 12] == 200 and grid.densities[23, 23, 23] == 200
+    grid.update(Ball(0.4))  # type: ignore[arg-type]
+    assert grid.occupied[22, 1, 12] and grid.occupied[23, 23, 23]
+    assert not grid.occupied[21, 1, 12]
 
 
 def test_a_field_without_matter_is_looked_at_everywhere() -> None:

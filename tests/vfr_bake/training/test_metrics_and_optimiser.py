@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.hash_grid import HashGrid
 from vfr_bake.training.metrics import over_background, psnr, to_8_bit
-from vfr_bake.training.optimiser import GridAdam, rate_factor
+from vfr_bake.training.optimiser import FusedGridAdam, GridAdam, rate_factor
 
 
 def test_psnr_of_known_errors() -> None:
@@ -45,6 +47,26 @@ def test_grid_adam_is_adam_where_there_is_a_gradient() -> None:
     torch.testing.assert_close(ours[rows], theirs[rows], rtol=1e-5, atol=1e-6)
     assert torch.equal(ours[3], start[3]), "no gradient, no change"
     assert not ours.grad.any(), "the gradient is cleared"
+
+
+def test_scatter_and_step_in_one_are_the_two_one_after_the_other() -> None:
+    config = FieldConfig(n_levels=5, base_resolution=4, max_resolution=40, log2_table_size=10)
+    torch.manual_seed(0)
+    ours, theirs = HashGrid(config), HashGrid(config)
+    theirs.load_state_dict(ours.state_dict())
+    fused, plain = FusedGridAdam(ours), GridAdam(theirs.table)
+    for n_points in (300, 1, 0, 3000):  # the last outgrows the first one's scratch
+        # Many points at one place: their gradients add up in one row, and sometimes to zero.
+        points = torch.cat([torch.rand(n_points, 3), torch.full((n_points // 3, 3), 0.37)])
+        gradient = torch.randn(len(points), config.n_channels)
+        gradient[::7] = 0
+        for grid, adam in ((ours, fused), (theirs, plain)):
+            grid(points).backward(gradient)
+            grid(points[:5]).backward(gradient[:5])
+            adam.step(0.01)
+    assert torch.equal(ours.table, theirs.table)
+    assert torch.equal(fused.moments, plain.moments)
+    assert ours.table.grad is None
 
 
 def test_schedule_warms_up_and_steps_down() -> None:
