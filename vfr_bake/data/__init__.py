@@ -39,8 +39,10 @@ def needs_cameras(data: str | Path) -> bool:
     """Whether `data` is a video, or a folder of pictures without cameras: `poses.estimate_cameras` finds
     them."""
     folder = Path(data)
-    if str(data) == "demo" or is_video(folder):
-        return str(data) != "demo"
+    if str(data) == "demo":
+        return False
+    if is_video(folder):
+        return True
     known = not folder.is_dir() or has_transforms(folder) or colmap_folder(folder) is not None
     return not known and has_pictures(folder)
 

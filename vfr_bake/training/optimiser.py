@@ -13,6 +13,8 @@ from vfr_bake.field.hash_grid import HashGrid
 from vfr_bake.field.memory import zeros
 from vfr_bake.kernels.adam import adam_step, scatter_and_step
 
+BETAS, EPSILON = (0.9, 0.99), 1e-15
+"""Adam's decay rates and its smallest denominator, of grids and networks alike (instant-ngp)."""
 WARMUP_STEPS = 100
 MILESTONES = (0.5, 0.75, 0.9)
 DECAY = 0.33
@@ -35,13 +37,10 @@ class GridAdam:
     """Adam on a hash table [n_entries, n_channels] whose gradient is mostly zero; it owns that gradient's
     buffer."""
 
-    def __init__(
-        self, table: Tensor, beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e-15
-    ) -> None:
+    def __init__(self, table: Tensor) -> None:
         self.table = table
         table.grad = zeros(*table.shape)
         self.moments = zeros(len(table), 2 * table.shape[1])
-        self.betas, self.epsilon = (beta1, beta2), epsilon
         self.n_steps = 0
 
     @property
@@ -62,9 +61,9 @@ class GridAdam:
     def _next_scalars(self, rate: float) -> list[np.float32]:
         """(bias-corrected rate, beta1, beta2, epsilon) of the next step."""
         self.n_steps += 1
-        beta1, beta2 = self.betas
+        beta1, beta2 = BETAS
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
-        return [np.float32(s) for s in (rate * correction, beta1, beta2, self.epsilon)]
+        return [np.float32(s) for s in (rate * correction, beta1, beta2, EPSILON)]
 
     def state(self) -> dict[str, Any]:
         return {"moments": self.moments, "n_steps": self.n_steps}

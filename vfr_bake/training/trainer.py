@@ -21,7 +21,7 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.samples import Samples
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
-from vfr_bake.training.optimiser import FusedGridAdam, GridAdam, rate_factor
+from vfr_bake.training.optimiser import BETAS, EPSILON, FusedGridAdam, GridAdam, rate_factor
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import PixelSampler
 
@@ -93,7 +93,7 @@ class Trainer:
         self._grid_adam = GridAdam(grid.table) if self.processes.size > 1 else FusedGridAdam(grid)
         self._parameters = [*self.field.network_parameters(), *self.pilot.parameters()]
         self._adam = torch.optim.Adam(
-            self._parameters, lr=config.network_rate, eps=1e-15, betas=(0.9, 0.99), fused=True
+            self._parameters, lr=config.network_rate, eps=EPSILON, betas=BETAS, fused=True
         )
 
     @property
