@@ -26,8 +26,8 @@ def distance(s: Tensor) -> Tensor:
 def contracted_unit(points: Tensor) -> Tensor:
     """Points [..., 3] of the unit cube for `points` of the model frame (eq. 10), any finite ones.
 
-    >>> contracted_unit(torch.tensor([[1e30, 0.0, 0.0], [0.5, 0.0, -1.0]])).tolist()
-    [[1.0, 0.5, 0.5], [0.625, 0.5, 0.25]]
+    >>> contracted_unit(torch.tensor([[1e30, 0.0, 0.0], [0.5, 0.0, -0.5]])).tolist()
+    [[1.0, 0.5, 0.5], [0.625, 0.5, 0.375]]
     """
     # Divided by the largest coordinate first: the square of 1e30 is beyond float32.
     largest = points.abs().amax(dim=-1, keepdim=True).clamp(min=0.5)
