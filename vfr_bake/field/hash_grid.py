@@ -129,7 +129,7 @@ class HashGrid(nn.Module):
     def _rows(self, vertex: Tensor, level: int) -> Tensor:
         x, y, z = vertex.unbind(-1)
         if self.layout.hashed[level]:
-            row = (x ^ (y * kernels.PRIME_Y) ^ (z * kernels.PRIME_Z)) & self.layout.mask
+            row = (x ^ (y * int(kernels.PRIME_Y)) ^ (z * int(kernels.PRIME_Z))) & self.layout.mask
         else:
             side = self.layout.resolutions[level] + 1
             row = (z * side + y) * side + x
@@ -159,6 +159,9 @@ class _Encode(torch.autograd.Function):
         # saved.
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
-        layout = ctx.grid.layout.kernel_arguments(gradient.numpy().dtype)
-        kernels.scatter(points.numpy(), gradient.numpy(), *layout, get_num_threads(), grad_table.numpy())
+        scales, offsets, hashed, mask = ctx.grid.layout.kernel_arguments(gradient.numpy().dtype)
+        kernels.scatter(
+            points.numpy(), gradient.numpy(), scales, offsets, hashed, mask, get_num_threads(),
+            grad_table.numpy(),
+        )  # fmt: skip
         return None, None if in_place else grad_table, None, None
