@@ -121,8 +121,8 @@ class FieldOptions:
     max_resolution: int | None = None
     """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
     log2_table_size: int | None = None
-    """A level with more vertices than two to this power shares entries by hashing; 18 (paper: 19, with
-    batches 16 times as large to fill it)."""
+    """A level with more vertices than two to this power shares entries by hashing; CPU 18, GPU 19 as in the
+    paper, whose far larger batches fill it."""
     density_width: int | None = None
     """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
     compositing: Compositing = "features"
@@ -193,8 +193,8 @@ class TrainConfig:
     downscale: int = 1
     """Pictures are reduced by this factor along each side before training."""
     steps: int | None = None
-    """Optimiser steps at most; CPU 60,000, GPU 20,000 with far larger batches (scenes 40,000), as in the paper.
-    Training ends here or when the minutes are over."""
+    """Optimiser steps at most; CPU 60,000, GPU 20,000 (scenes 40,000) with far larger batches, as in the
+    paper. Training ends here or when the minutes are over."""
     minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
     further. CPU: objects 9, scenes 14; GPU: no limit."""
