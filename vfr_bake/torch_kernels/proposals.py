@@ -68,8 +68,10 @@ def midpoints(rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> tuple[Tensor, Te
 def weights_of(logits: Tensor, lengths: Tensor) -> Tensor:
     """Weights [n_rays, n] of intervals with log-densities `logits` and `lengths` [n_rays, n], 0 behind an
     opaque one; differentiable with respect to the logits."""
-    # Clamped in value alone, so that a saturated density can come down.
-    depths = torch.exp(logits - (logits - LARGEST_LOGIT).clamp(min=0).detach()) * lengths
+    # Clamped in value, with the gradient of the clamped value everywhere, so that a saturated density can
+    # come down: the bracket is 0.
+    sigmas = torch.exp(logits.detach().clamp(max=LARGEST_LOGIT))
+    depths = (sigmas + sigmas * (logits - logits.detach())) * lengths
     before = sums_before(depths)
     weights = torch.exp(-before) * -torch.expm1(-depths)
     return torch.where(before <= OPAQUE_DEPTH, weights, torch.zeros_like(weights))

@@ -138,8 +138,11 @@ class Trainer:
             self._guide = DeviceOccupancyGuide(self.config, self.pace, self._step_length(), self.device)
         self._grid_adam = DeviceGridAdam(self._field.grid.table)
         if can_compile(self.device):
-            for network in (self._field.density, self._field.head, self.pilot):
-                network.compile(dynamic=True)
+            density = self._field.density
+            # The exponential behind it is a function of its own, which torch warns about when it compiles.
+            density.logits = torch.compile(density.logits, dynamic=True)  # type: ignore[method-assign]
+            self._field.head.compile(dynamic=True)
+            self.pilot.compile(dynamic=True)
 
     def _step_length(self) -> float:
         return 2.0 * self.config.step_cells / self._field.config.max_resolution

@@ -182,8 +182,7 @@ def same_samples(ours: Samples, expected: Samples) -> None:
 
 
 def test_no_ray_at_all(device: torch.device) -> None:
-    field, _, rays_o, rays_d = make()
-    field = field.to(device)
+    field = make()[0].to(device)
     field.grid.backend = "torch"
     _, guide = guides(device)
     guide.prepare(0, field)
@@ -191,3 +190,18 @@ def test_no_ray_at_all(device: torch.device) -> None:
     samples = guide.sample(field, none, none, none, pilot=False, share=1.0)
     assert len(samples.t_mid) == len(samples.counts) == 0
     guide.add_gradients(samples, none[:, 0], 0)
+
+
+def test_a_saturated_density_can_come_down(device: torch.device) -> None:
+    logits = torch.tensor([[-1e30, 0.0, 20.0, 1e9]], device=device, requires_grad=True)
+    weights = kernels.weights_of(logits, torch.tensor([[1.0, 1.0, 1e-7, 1e-9]], device=device))
+    weights[0, 2].backward()
+    sigma = np.exp(15.0) * 1e-7
+    np.testing.assert_allclose(
+        weights.detach().cpu().numpy()[0, 2], np.exp(-1) * -np.expm1(-sigma), rtol=1e-5
+    )
+    assert weights[0, 3].item() == pytest.approx(
+        np.exp(-1 - sigma) * -np.expm1(-np.exp(15.0) * 1e-9), rel=1e-3
+    )
+    expected = [0, -np.exp(-1) * -np.expm1(-sigma), np.exp(-1) * sigma * np.exp(-sigma), 0]
+    np.testing.assert_allclose(logits.grad.cpu().numpy()[0], expected, rtol=1e-5)
