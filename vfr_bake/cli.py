@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.trainer import Trainer
 
+EVAL_VIEWS = {False: 25, True: 3}
+"""Test views rendered at the end by whether the scene is unbounded, where no number is asked for."""
 SECONDS_BETWEEN_LINES = 30.0
 """Where stderr is no terminal, progress is a line this often instead of a bar."""
 
@@ -93,8 +95,9 @@ def _train(options: Any) -> int:
     interrupted = figures.pop("interrupted")
     if processes.first:
         _save(options.model, trainer, scene, figures)
-        if not interrupted and config.eval_views and scene.test.cameras:
-            figures |= _test_figures(trainer, scene, config.eval_views)
+        n_views = config.eval_views if config.eval_views is not None else EVAL_VIEWS[scene.unbounded]
+        if not interrupted and n_views and scene.test.cameras:
+            figures |= _test_figures(trainer, scene, n_views)
             _save(options.model, trainer, scene, figures)
         checkpoint.unlink(missing_ok=True)
         _report_training(options, figures, interrupted)
