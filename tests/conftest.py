@@ -15,6 +15,15 @@ settings.load_profile("any_machine")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test that takes a `device` runs on every device that is there: none is skipped for want of a GPU."""
+    if "device" in metafunc.fixturenames:
+        import torch
+
+        names = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+        metafunc.parametrize("device", [torch.device(name) for name in names], ids=names)
+
+
 def _real_data(name: str, holds: str) -> Path:
     """A data set in `$VFR_DATA` (default `../shared/data`); missing, the test fails."""
     data = os.environ.get("VFR_DATA")

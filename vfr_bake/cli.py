@@ -206,7 +206,7 @@ def _save(path: Path, trainer: Trainer, scene: Scene, figures: dict[str, Any]) -
         world_from_model=scene.world_from_model,
         cameras=cameras,
         has_alpha=scene.has_alpha,
-        train={"data": scene.name} | asdict(trainer.config),
+        train={"data": scene.name} | trainer.settings,
         figures=figures,
     )
     save_model(path, model)

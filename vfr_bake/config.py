@@ -12,6 +12,7 @@ SceneKind = Literal["auto", "object", "unbounded"]
 Compositing = Literal["features", "colour"]
 Activation = Literal["gelu", "relu"]
 ViewEncoding = Literal["sh-features", "sh"]
+Device = Literal["auto", "cpu", "cuda"]
 CHOICES = {
     "compositing": get_args(Compositing),
     "activation": get_args(Activation),
@@ -26,6 +27,10 @@ UNBOUNDED_FIELD = {
 }
 """Settings of the paper's real-world scenes where they differ from those of objects (table 2), but for the
 number of levels: 32 double the time of a step on a CPU, most of which is spent on the grid's memory."""
+
+
+FIELD_BY_DEVICE = {"cpu": {}, "cuda": {"log2_table_size": 19}}
+"""Settings of the architecture that follow from the device: the paper's batches fill the paper's tables."""
 
 
 def _check(condition: bool, name: str, expected: str, got: Any) -> None:
@@ -116,8 +121,8 @@ class FieldOptions:
     max_resolution: int | None = None
     """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
     log2_table_size: int | None = None
-    """A level with more vertices than two to this power shares entries by hashing; 18 (paper: 19, with
-    batches 16 times as large to fill it)."""
+    """A level with more vertices than two to this power shares entries by hashing; CPU 18, GPU 19 as in the
+    paper, whose far larger batches fill it."""
     density_width: int | None = None
     """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
     compositing: Compositing = "features"
@@ -136,40 +141,75 @@ class FieldOptions:
     n_sh_features: int | None = None
     """Features that multiply each basis function; objects 4, scenes 8, as in the paper."""
 
-    def resolved(self, unbounded: bool) -> FieldConfig:
+    def resolved(self, unbounded: bool, device: str = "cpu") -> FieldConfig:
         """With every open setting filled in. Raises ConfigError for a value out of range."""
         given = {name: value for name, value in asdict(self).items() if value is not None}
-        return FieldConfig(**((UNBOUNDED_FIELD if unbounded else {}) | given))
+        return FieldConfig(**((UNBOUNDED_FIELD if unbounded else {}) | FIELD_BY_DEVICE[device] | given))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """Settings of a training that follow from the device where they are not given: how much a step takes, how
+    far it goes, how many there are."""
+
+    steps: int = 60_000
+    batch_samples: int = 4096
+    batch_rays: int = 512
+    max_rays: int = 16_384
+    grid_rate: float = 1e-2
+    network_rate: float = 4e-3
+
+    def __post_init__(self) -> None:
+        _check(self.steps >= 1, "steps", "at least 1", self.steps)
+        _check(1024 <= self.batch_samples <= 2**22, "batch_samples", "1,024 to 4,194,304", self.batch_samples)
+        _check(32 <= self.batch_rays <= 2**17, "batch_rays", "32 to 131,072", self.batch_rays)
+        _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
+        _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)
+        _check(0 < self.network_rate < 1, "network_rate", "between 0 and 1", self.network_rate)
+
+
+GPU_PACE = {
+    "batch_samples": 2**18,
+    "batch_rays": 2**13,
+    "max_rays": 2**16,
+    "grid_rate": 1e-2,
+    "network_rate": 1e-2,
+}
+"""The paper's; the most rays are ours: most of an object's meet nothing."""
+GPU_STEPS = {False: 20_000, True: 40_000}
+"""The paper's, by whether the scene is unbounded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of `vfr-train`. The defaults are made for two CPU cores; the paper's GPU figures stand beside
-    them."""
+    """Settings of `vfr-train`. What is None follows from the device (`pace`): the defaults of a CPU are made
+    for two cores, those of a GPU are the paper's."""
 
     kind: SceneKind = "auto"
     """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted, sampled by
     proposals. Auto: an object if the pictures have alpha or a plain background."""
+    device: Device = "auto"
+    """Where to train: a GPU that CUDA runs on, or the CPU. Auto: the GPU if there is one."""
     downscale: int = 1
     """Pictures are reduced by this factor along each side before training."""
-    steps: int = 60_000
-    """Optimiser steps at most (paper: 20,000 of 16 times as many samples; 40,000 for scenes). Training ends
-    here or when the minutes are over."""
+    steps: int | None = None
+    """Optimiser steps at most; CPU 60,000, GPU 20,000 (scenes 40,000) with far larger batches, as in the
+    paper. Training ends here or when the minutes are over."""
     minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
-    further. Objects 9, scenes 12."""
-    batch_samples: int = 4096
-    """Objects: samples along rays in a batch (paper: 262,144). Smaller, because the time of a CPU step grows
-    with it, and many small steps teach more than few large ones: the same 25 million samples gave lego 26.3
-    dB in steps of 16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096."""
-    batch_rays: int = 512
-    """Scenes: rays in a batch (paper: 8,192); smaller for the same reason."""
-    max_rays: int = 16_384
-    """Objects: rays in a batch at most, however few samples they need."""
-    grid_rate: float = 1e-2
-    """Adam learning rate of the hash grids."""
-    network_rate: float = 4e-3
-    """Adam learning rate of the density network and the head (paper: 0.01 for all)."""
+    further. CPU: objects 9, scenes 12; GPU: no limit."""
+    batch_samples: int | None = None
+    """Objects: samples along rays in a batch; GPU 262,144, CPU 4,096, because the time of a CPU step
+    grows with it, and many small steps teach more than few large ones: the same 25 million samples gave lego
+    26.3 dB in steps of 16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096."""
+    batch_rays: int | None = None
+    """Scenes: rays in a batch; GPU 8,192, CPU 512, for the same reason."""
+    max_rays: int | None = None
+    """Objects: rays in a batch at most, however few samples they need; GPU 65,536, CPU 16,384."""
+    grid_rate: float | None = None
+    """Adam learning rate of the hash grids; 0.01."""
+    network_rate: float | None = None
+    """Adam learning rate of the density network and the head; GPU 0.01, as in the paper, CPU 0.004."""
     pilot_steps: int = 300
     """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
     paper)."""
@@ -192,13 +232,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         _check(self.kind in get_args(SceneKind), "kind", f"one of {get_args(SceneKind)}", self.kind)
         _check(1 <= self.downscale <= 64, "downscale", "1 to 64", self.downscale)
-        _check(self.steps >= 1, "steps", "at least 1", self.steps)
+        _check(self.device in get_args(Device), "device", f"one of {get_args(Device)}", self.device)
         _check(self.minutes is None or self.minutes > 0, "minutes", "more than 0", self.minutes)
-        _check(1024 <= self.batch_samples <= 2**22, "batch_samples", "1,024 to 4,194,304", self.batch_samples)
-        _check(32 <= self.batch_rays <= 2**17, "batch_rays", "32 to 131,072", self.batch_rays)
-        _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
-        _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)
-        _check(0 < self.network_rate < 1, "network_rate", "between 0 and 1", self.network_rate)
         _check(self.pilot_steps >= 0, "pilot_steps", "at least 0", self.pilot_steps)
         _check(0.1 <= self.step_cells <= 16, "step_cells", "0.1 to 16", self.step_cells)
         _check(
@@ -210,6 +245,17 @@ class TrainConfig:
         _check(0 <= self.distortion < 1e3, "distortion", "0 to 1000", self.distortion)
         _check(self.eval_views is None or self.eval_views >= 0, "eval_views", "at least 0", self.eval_views)
         _check(self.checkpoint_minutes > 0, "checkpoint_minutes", "more than 0", self.checkpoint_minutes)
+        self.pace("cpu", False)  # so that what is out of range is refused before pictures are read
+
+    def pace(self, device: str, unbounded: bool) -> Pace:
+        """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.
+
+        >>> TrainConfig(steps=7).pace("cuda", False).steps, TrainConfig().pace("cuda", True).steps
+        (7, 40000)
+        """
+        defaults = {"steps": GPU_STEPS[unbounded]} | GPU_PACE if device == "cuda" else {}
+        given = {name: getattr(self, name) for name in Pace.__dataclass_fields__}
+        return Pace(**(defaults | {name: value for name, value in given.items() if value is not None}))
 
 
 @dataclass(frozen=True, kw_only=True)

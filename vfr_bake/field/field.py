@@ -35,6 +35,19 @@ class VfrField(nn.Module):
         kernels.density_logits(points, *self.kernel_arguments(), out)
         return np.minimum(out, LARGEST_LOGIT)
 
+    def lookup(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(features [n, n_channels], densities [n]) at `points` [n, 3] of the unit cube, on any device."""
+        features = self.grid(points)
+        return features, self.density(features)
+
+    def copied_to_cpu(self) -> VfrField:
+        """This field, or a copy if it is elsewhere."""
+        if self.grid.table.device.type == "cpu":
+            return self
+        copy = VfrField(self.config)
+        copy.load_state_dict(self.state_dict())
+        return copy
+
     @torch.no_grad()
     def features(self, points: np.ndarray) -> np.ndarray:
         """Features [n, n_channels] at `points` [n, 3] of the unit cube."""

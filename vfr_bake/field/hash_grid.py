@@ -7,6 +7,8 @@ each, or share 2^log2_table_size entries through the hash (x xor y * 2654435761 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import torch
 from numba import get_num_threads
@@ -15,6 +17,10 @@ from torch import Tensor, nn
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.memory import zeros
 from vfr_bake.kernels import hash_grid as kernels
+from vfr_bake.torch_kernels.hash_grid import Levels, features_at
+
+Backend = Literal["numba", "torch"]
+"""Whose kernels run: numba's, on a CPU, or torch's, on any device."""
 
 
 def level_resolutions(n_levels: int, base_resolution: int, max_resolution: int) -> list[int]:
@@ -45,6 +51,7 @@ class GridLayout:
         self.hashed = np.array([n > size for n in vertices])
         self.offsets = np.concatenate([[0], np.cumsum([min(n, size) for n in vertices])]).astype(np.int64)
         self.mask = size - 1
+        self._levels: dict[tuple[torch.device, torch.dtype], Levels] = {}
 
     @property
     def n_entries(self) -> int:
@@ -53,6 +60,19 @@ class GridLayout:
     def kernel_arguments(self, dtype: np.dtype | type) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """(scales, offsets, hashed, mask) as the kernels take them."""
         return np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask
+
+    def levels(self, table: Tensor) -> Levels:
+        """The same in torch, beside `table` and in its type; made once for each place."""
+        place = (table.device, table.dtype)
+        if place not in self._levels:
+            self._levels[place] = Levels(
+                scales=torch.tensor(self.resolutions, dtype=table.dtype, device=table.device),
+                sides=torch.tensor(self.resolutions, device=table.device) + 1,
+                offsets=torch.from_numpy(self.offsets[:-1]).to(table.device),
+                hashed=torch.from_numpy(self.hashed).to(table.device),
+                mask=self.mask,
+            )
+        return self._levels[place]
 
 
 class HashGrid(nn.Module):
@@ -70,6 +90,8 @@ class HashGrid(nn.Module):
         )
         self.pending: list[tuple[Tensor, Tensor]] | None = None
         """If a list, backward passes put (points, gradient of the features) here instead of scattering."""
+        self.backend: Backend = "numba"
+        """Which kernels `forward` runs where both could; elsewhere than on a CPU torch's alone can."""
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
         self.table = nn.Parameter(zeros(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4))
 
@@ -84,6 +106,8 @@ class HashGrid(nn.Module):
         Where the march has computed `features` already they are taken as they are, and only their gradient
         is our work. Not differentiable with respect to `points`.
         """
+        if self.backend == "torch" or points.device.type != "cpu":
+            return features_at(points, self.table, self.layout.levels(self.table), features)
         return _Encode.apply(points, self.table, self, features)  # type: ignore[return-value]
 
     def reference(self, points: Tensor) -> Tensor:

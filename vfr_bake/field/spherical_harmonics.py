@@ -21,6 +21,7 @@ class SphericalHarmonics(nn.Module):
     def __init__(self, degree: int) -> None:
         super().__init__()
         exponents, coefficients = sh_monomials(degree)
+        self._highest = int(exponents.max())  # of the array: a GPU's tensor would have to be waited for
         self.register_buffer("exponents", torch.as_tensor(exponents), persistent=False)
         self.register_buffer(
             "coefficients", torch.as_tensor(coefficients, dtype=torch.float32), persistent=False
@@ -29,7 +30,7 @@ class SphericalHarmonics(nn.Module):
     def forward(self, dirs: Tensor) -> Tensor:
         """Basis values [n, degree^2] at unit `dirs` [n, 3]."""
         powers = [torch.ones_like(dirs)]
-        for _ in range(int(self.exponents.max())):
+        for _ in range(self._highest):
             powers.append(powers[-1] * dirs)
         table = torch.stack(powers)  # [degree, n, 3]
         x, y, z = self.exponents.unbind(-1)

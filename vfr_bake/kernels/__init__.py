@@ -1,9 +1,9 @@
 """The field's inner loops compiled with numba for the CPU.
 
 Each kernel has a slow, readable twin in torch (`vfr_bake.field`, `vfr_bake.rendering`) that the tests
-compare it with. Kernels are generic in the float type: training runs in float32, `gradcheck` in float64.
-Constants are cast to the type of the arrays, because a bare `1.0` would silently turn float32 arithmetic
-into float64.
+compare it with, and one for a GPU in `vfr_bake.torch_kernels`. Kernels are generic in the float type:
+training runs in float32, `gradcheck` in float64. Constants are cast to the type of the arrays, because a bare
+`1.0` would silently turn float32 arithmetic into float64.
 """
 
 from numba import config

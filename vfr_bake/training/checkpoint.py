@@ -8,7 +8,6 @@ Tensors and plain values only; loads with `weights_only=True`.
 from __future__ import annotations
 
 import io
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -38,7 +37,7 @@ def save_checkpoint(path: Path, trainer: Trainer) -> None:
     content = {
         "format": FORMAT,
         "version": VERSION,
-        "settings": asdict(trainer.config),
+        "settings": trainer.settings,
         "state": trainer.state(),
     }
     torch.save(content, buffer)
@@ -58,8 +57,9 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
         raise FormatError(
             f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"
         )
-    then, now = content["settings"], asdict(trainer.config)
-    for name in sorted(set(then) | set(now)):
+    then, now = content["settings"], trainer.settings
+    # The device first: other settings follow from it.
+    for name in ["device", *sorted(set(then) | set(now))]:
         if name not in LENGTH_SETTINGS and then.get(name) != now.get(name):
             raise ConfigError(
                 f"{path}: {name}: expected {then.get(name)} as in the interrupted run, got {now.get(name)}"

@@ -6,14 +6,14 @@ trained field is rendered with.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.config import TrainConfig
+from vfr_bake.config import Pace, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import spacing
 from vfr_bake.rendering.compositing import distortion
@@ -21,7 +21,7 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.samples import Samples
 from vfr_bake.rendering.sampling import march
-from vfr_bake.training.optimiser import GridAdam
+from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
@@ -68,7 +68,7 @@ class Guide(Protocol):
         """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
         ...
 
-    def tables(self) -> Iterator[GridAdam]:
+    def tables(self) -> Iterator[TableAdam]:
         """The tables that learn in this step, with their gradients."""
         ...
 
@@ -77,21 +77,42 @@ class Guide(Protocol):
     def restore(self, state: dict[str, Any]) -> None: ...
 
 
-class OccupancyGuide:
-    """Marches an object's box and keeps its occupancy grid."""
+class OccupancyPace:
+    """How many rays of an object fill a batch: what its guides have in common on all devices."""
 
-    def __init__(self, config: TrainConfig, step_length: float, processes: Processes) -> None:
-        self._config, self._processes = config, processes
-        self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
+    def __init__(self, pace: Pace, step_length: float) -> None:
+        self._pace = pace
         self._samples_per_ray = 2 / step_length
 
     def n_rays(self, pilot: bool) -> int:
         wanted = 1.1 * self._budget(pilot) / self._samples_per_ray
-        return int(min(self._config.max_rays, max(64, wanted)))
+        return int(min(self._pace.max_rays, max(64, wanted)))
 
     def _budget(self, pilot: bool) -> int:
         # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
-        return self._config.batch_samples // 2 if pilot else self._config.batch_samples
+        return self._pace.batch_samples // 2 if pilot else self._pace.batch_samples
+
+    def observe(self, n_rays: int, n_samples: int) -> None:
+        per_ray = max(n_samples / max(n_rays, 1), 1.0)
+        self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
+
+    def regulariser(self, samples: Samples, weights: Tensor) -> None:
+        return None
+
+    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+        pass
+
+    def tables(self) -> Iterator[TableAdam]:
+        return iter(())
+
+
+class OccupancyGuide(OccupancyPace):
+    """Marches an object's box and keeps its occupancy grid."""
+
+    def __init__(self, config: TrainConfig, pace: Pace, step_length: float, processes: Processes) -> None:
+        super().__init__(pace, step_length)
+        self._processes = processes
+        self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
 
     def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
@@ -109,19 +130,6 @@ class OccupancyGuide:
             self.sampler.observe(samples.points.numpy(), sigmas)
         return samples
 
-    def observe(self, n_rays: int, n_samples: int) -> None:
-        per_ray = max(n_samples / max(n_rays, 1), 1.0)
-        self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
-
-    def regulariser(self, samples: Samples, weights: Tensor) -> None:
-        return None
-
-    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
-        pass
-
-    def tables(self) -> Iterator[GridAdam]:
-        return iter(())
-
     def state(self) -> dict[str, Any]:
         return {"samples_per_ray": self._samples_per_ray, "occupancy": self.sampler.state()}
 
@@ -130,32 +138,51 @@ class OccupancyGuide:
         self.sampler.restore_state(state["occupancy"])
 
 
-class ProposalGuide:
-    """Trains the two proposal grids of an unbounded scene beside the field."""
+class ProposalPace:
+    """When the proposals of a scene learn and how far they are believed: what its guides have in common on
+    all devices."""
 
-    def __init__(self, config: TrainConfig, near: float) -> None:
-        self._config = config
-        self.sampler = ProposalSampler(near)
-        self._adams = [GridAdam(grid.table) for grid in self.sampler.grids]  # type: ignore[arg-type]
+    def __init__(self, config: TrainConfig, pace: Pace, near: float) -> None:
+        self._config, self._pace = config, pace
+        self._adams: Sequence[TableAdam] = ()
         self._learns = True
-        self._span = float(spacing(FAR)) - float(spacing(near))
+        self._borders = (float(spacing(near)), float(spacing(FAR)))
+        self._span = self._borders[1] - self._borders[0]
 
     def n_rays(self, pilot: bool) -> int:
-        return self._config.batch_rays // 2 if pilot else self._config.batch_rays
+        return self._pace.batch_rays // 2 if pilot else self._pace.batch_rays
 
     def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
-        self.sampler.exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
+        self._set_exponent(ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x))
         self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0
+
+    def _set_exponent(self, exponent: float) -> None:
+        raise NotImplementedError
+
+    def observe(self, n_rays: int, n_samples: int) -> None:
+        pass
+
+    def tables(self) -> Iterator[TableAdam]:
+        return iter(self._adams if self._learns else ())
+
+
+class ProposalGuide(ProposalPace):
+    """Trains the two proposal grids of an unbounded scene beside the field."""
+
+    def __init__(self, config: TrainConfig, pace: Pace, near: float) -> None:
+        super().__init__(config, pace, near)
+        self.sampler = ProposalSampler(near)
+        self._adams = [GridAdam(grid.table) for grid in self.sampler.grids]  # type: ignore[arg-type]
+
+    def _set_exponent(self, exponent: float) -> None:
+        self.sampler.exponent = exponent
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> Samples:
         samples, self._edges, self._rounds = self.sampler.sample_rounds(field, rays_o, rays_d, jitter)
         return samples
-
-    def observe(self, n_rays: int, n_samples: int) -> None:
-        pass
 
     def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
@@ -171,9 +198,6 @@ class ProposalGuide:
     def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
         if self._learns:
             self.sampler.add_gradients(self._rounds, self._edges, samples, weights, n_rays)
-
-    def tables(self) -> Iterator[GridAdam]:
-        return iter(self._adams if self._learns else ())
 
     def state(self) -> dict[str, Any]:
         return {"proposals": self.sampler.state_dict(), "adams": [adam.state() for adam in self._adams]}

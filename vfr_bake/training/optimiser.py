@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -31,6 +31,57 @@ def rate_factor(step: int, progress: float) -> float:
     """
     warm_up = min(1.0, 0.01 + 0.99 * step / WARMUP_STEPS)
     return warm_up * DECAY ** sum(progress >= milestone for milestone in MILESTONES)
+
+
+class TableAdam(Protocol):
+    """Adam on a hash table, which gradients are added to until it takes its step."""
+
+    @property
+    def gradient(self) -> Tensor:
+        """[n_entries, n_channels], of the step to come."""
+        ...
+
+    def step(self, rate: float) -> None:
+        """Apply and clear the gradient."""
+        ...
+
+    def clear(self) -> None:
+        """Drop the gradient of a step that is not to be taken."""
+        ...
+
+    def state(self) -> dict[str, Any]: ...
+
+    def restore(self, state: dict[str, Any]) -> None: ...
+
+
+class DeviceGridAdam:
+    """torch's Adam on a hash table on a GPU, whose memory is fast enough to step all entries.
+
+    So entries without a gradient go on by their momentum for some steps, which `GridAdam`'s do not.
+    """
+
+    def __init__(self, table: Tensor) -> None:
+        self.table = table
+        self._adam = torch.optim.Adam([table], betas=BETAS, eps=EPSILON, fused=True)
+
+    @property
+    def gradient(self) -> Tensor:
+        assert self.table.grad is not None
+        return self.table.grad
+
+    def step(self, rate: float) -> None:
+        self._adam.param_groups[0]["lr"] = rate
+        self._adam.step()
+        self.clear()
+
+    def clear(self) -> None:
+        self.table.grad = None
+
+    def state(self) -> dict[str, Any]:
+        return self._adam.state_dict()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._adam.load_state_dict(state)
 
 
 class GridAdam:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -21,6 +22,45 @@ class RayBatch:
     """[n_rays, 3] float32, unit length."""
     rgba: Tensor
     """[n_rays, 4] float32 in [0, 1], straight alpha, sRGB."""
+
+
+class Pixels(Protocol):
+    """Draws random pixels."""
+
+    def draw(self, n_rays: int) -> RayBatch: ...
+
+
+class DevicePixelSampler:
+    """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
+
+    def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
+        device = generator.device
+        n_pixels = torch.tensor([camera.width * camera.height for camera in views.cameras])
+        pixels = np.concatenate([image.reshape(-1, 4) for image in views.images])
+        self._pixels = torch.from_numpy(pixels).to(device)
+        self._ends = torch.cumsum(n_pixels, dim=0).to(device)
+        self._starts = self._ends - n_pixels.to(device)
+        self._widths = torch.tensor([camera.width for camera in views.cameras], device=device)
+        poses = np.stack([c.c2w[:3] for c in views.cameras]).astype(np.float32)
+        self._poses = torch.from_numpy(poses).to(device)
+        self._intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], device=device)
+        self._generator = generator
+
+    def draw(self, n_rays: int) -> RayBatch:
+        device = self._pixels.device
+        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator, device=device)
+        view = torch.searchsorted(self._ends, index, right=True)
+        inside, width = index - self._starts[view], self._widths[view]
+        row, column = inside // width, inside % width
+        fx, fy, cx, cy = self._intrinsics[view].unbind(-1)
+        x, y = (column + 0.5 - cx) / fx, (cy - row - 0.5) / fy
+        poses = self._poses[view]
+        rays_d = x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
+        return RayBatch(
+            rays_o=poses[:, :, 3].contiguous(),
+            rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
+            rgba=self._pixels[index] * (1 / 255),
+        )
 
 
 class PixelSampler:

@@ -5,28 +5,40 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from player.errors import TrainingError
+from player.errors import ConfigError, TrainingError
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
+from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.pilot import Pilot
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.samples import Samples
+from vfr_bake.torch_kernels import can_compile
+from vfr_bake.torch_kernels.compositing import composite as composite_on_device
+from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
-from vfr_bake.training.optimiser import BETAS, EPSILON, FusedGridAdam, GridAdam, rate_factor
+from vfr_bake.training.optimiser import (
+    BETAS,
+    EPSILON,
+    DeviceGridAdam,
+    FusedGridAdam,
+    GridAdam,
+    TableAdam,
+    rate_factor,
+)
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.rays import PixelSampler
+from vfr_bake.training.rays import DevicePixelSampler, Pixels, PixelSampler
 
 MINUTES = {False: 9.0, True: 12.0}
-"""Training time by whether the scene is unbounded, where none is asked for."""
+"""Training time on a CPU by whether the scene is unbounded, where none is asked for."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""
 
@@ -69,32 +81,89 @@ class Trainer:
     its share.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, processes: Processes | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        processes: Processes | None = None,
+        backend: Backend | None = None,
+    ) -> None:
+        """`backend`: None for numba on a CPU and torch elsewhere; "torch" to do on a CPU what a GPU does.
+
+        Raises ConfigError: there is no such device, or it cannot be shared by several processes.
+        """
         torch.manual_seed(config.seed)
         self.config = config
+        self.device = choose_device(config.device)
+        self.pace = config.pace(self.device.type, scene.unbounded)
         self.processes = processes or Processes(0, 1)
-        self.field = VfrField(config.field.resolved(scene.unbounded))
-        self.pilot = Pilot(self.field.config)
+        backend = backend or ("numba" if self.device.type == "cpu" else "torch")
+        if backend == "torch" and self.processes.size > 1:
+            raise ConfigError(
+                f"device: several processes: expected cpu, got {self.device.type}: pass --device cpu, or "
+                "start one process"
+            )
+        self._field = VfrField(config.field.resolved(scene.unbounded, self.device.type)).to(self.device)
+        self._field.grid.backend = backend
+        self.pilot = Pilot(self._field.config).to(self.device)
         self.n_bad_steps = 0
-        self._minutes = config.minutes if config.minutes is not None else MINUTES[scene.unbounded]
+        # A GPU is done with its steps in minutes.
+        minutes = MINUTES[scene.unbounded] if self.device.type == "cpu" else float("inf")
+        self._minutes = minutes if config.minutes is None else config.minutes
         self._next_step, self._seconds = 0, 0.0
-        self._generator = torch.Generator().manual_seed(config.seed)
-        self._pixels = PixelSampler(scene.train, self._generator)
+        self._generator = torch.Generator(self.device).manual_seed(config.seed)
         # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
         self._random_background = scene.has_alpha or scene.unbounded
+        self._pixels: Pixels
         self._guide: Guide
-        if scene.unbounded:
-            self._guide = ProposalGuide(config, scene.near)
+        self._grid_adam: TableAdam
+        if backend == "torch":
+            self._use_torch(scene)
         else:
-            step_length = 2.0 * config.step_cells / self.field.config.max_resolution
-            self._guide = OccupancyGuide(config, step_length, self.processes)
-        grid = self.field.grid
+            self._use_numba(scene)
+        self._parameters = [*self._field.network_parameters(), *self.pilot.parameters()]
+        self._adam = torch.optim.Adam(
+            self._parameters, lr=self.pace.network_rate, eps=EPSILON, betas=BETAS, fused=True
+        )
+
+    def _use_numba(self, scene: Scene) -> None:
+        self._composite = composite
+        self._pixels = PixelSampler(scene.train, self._generator)
+        if scene.unbounded:
+            self._guide = ProposalGuide(self.config, self.pace, scene.near)
+        else:
+            self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
+        grid = self._field.grid
         # Several processes have to add up their gradients before the step.
         self._grid_adam = GridAdam(grid.table) if self.processes.size > 1 else FusedGridAdam(grid)
-        self._parameters = [*self.field.network_parameters(), *self.pilot.parameters()]
-        self._adam = torch.optim.Adam(
-            self._parameters, lr=config.network_rate, eps=EPSILON, betas=BETAS, fused=True
-        )
+
+    def _use_torch(self, scene: Scene) -> None:
+        self._composite = composite_on_device
+        self._pixels = DevicePixelSampler(scene.train, self._generator)
+        if scene.unbounded:
+            self._guide = DeviceProposalGuide(self.config, self.pace, scene.near, self.device)
+        else:
+            self._guide = DeviceOccupancyGuide(self.config, self.pace, self._step_length(), self.device)
+        self._grid_adam = DeviceGridAdam(self._field.grid.table)
+        if can_compile(self.device):
+            density = self._field.density
+            # The exponential behind it is a function of its own, which torch warns about when it compiles.
+            density.logits = torch.compile(density.logits, dynamic=True)  # type: ignore[method-assign]
+            self._field.head.compile(dynamic=True)
+            self.pilot.compile(dynamic=True)
+
+    def _step_length(self) -> float:
+        return 2.0 * self.config.step_cells / self._field.config.max_resolution
+
+    @property
+    def field(self) -> VfrField:
+        """The field on the CPU: the one that is trained, or what a GPU's is now."""
+        return self._field.copied_to_cpu()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of this training, with what followed from the device filled in; plain values."""
+        return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
 
     @property
     def next_step(self) -> int:
@@ -108,26 +177,26 @@ class Trainer:
 
     @property
     def sampler(self) -> OccupancyGrid | ProposalSampler:
-        """Where the field is to be looked up."""
+        """Where the field is to be looked up; on the CPU, as `field`."""
         return self._guide.sampler
 
     def run(self) -> Iterator[StepReport]:
         """Train until the steps or the minutes are over. Raises TrainingError when the loss stays NaN."""
         begin = time.monotonic() - self._seconds
         bad_in_a_row = 0
-        for step in range(self._next_step, self.config.steps):
+        for step in range(self._next_step, self.pace.steps):
             seconds = self.processes.agree(time.monotonic() - begin)
-            progress = max(step / self.config.steps, seconds / (60 * self._minutes))
+            progress = max(step / self.pace.steps, seconds / (60 * self._minutes))
             if progress >= 1:
                 return
-            self._guide.prepare(step, self.field)
+            self._guide.prepare(step, self._field)
             loss, n_rays, n_samples = self._step(step, progress)
             bad_in_a_row = bad_in_a_row + 1 if loss != loss else 0
             if bad_in_a_row == MOST_BAD_STEPS:
                 raise TrainingError(
                     f"step {step}: loss: not a finite number for {MOST_BAD_STEPS} steps: "
-                    f"lower --network-rate (now {self.config.network_rate}) "
-                    f"or --grid-rate (now {self.config.grid_rate})"
+                    f"lower --network-rate (now {self.pace.network_rate}) "
+                    f"or --grid-rate (now {self.pace.grid_rate})"
                 )
             self._next_step, self._seconds = step + 1, time.monotonic() - begin
             yield StepReport(step, progress, loss, n_rays, n_samples, self._seconds)
@@ -135,10 +204,10 @@ class Trainer:
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
         # Where colours are composited anyway the head needs no pilot.
-        pilot = step < self.config.pilot_steps and self.field.config.compositing == "features"
+        pilot = step < self.config.pilot_steps and self._field.config.compositing == "features"
         batch = self._draw(self._guide.n_rays(pilot))
         samples = self._guide.sample(
-            self.field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
+            self._field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
         )
         totals = self.processes.total(len(samples.rays), len(samples.t_mid))
         n_rays, n_samples = int(totals[0]), int(totals[1])
@@ -155,20 +224,20 @@ class Trainer:
             return value if n_samples == 0 else float("nan"), n_rays, n_samples
         factor = rate_factor(step, progress)
         for group in self._adam.param_groups:
-            group["lr"] = self.config.network_rate * factor
+            group["lr"] = self.pace.network_rate * factor
         self._adam.step()
         for table in (self._grid_adam, *self._guide.tables()):
-            table.step(self.config.grid_rate * factor)
+            table.step(self.pace.grid_rate * factor)
         return value, n_rays, n_samples
 
     def _draw(self, n_rays: int) -> Batch:
         """This process' share of a joint batch, drawn alike in all of them."""
         rays = self._pixels.draw(n_rays)
-        jitter = torch.rand(n_rays, 3, generator=self._generator)
+        jitter = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         if self._random_background:
-            background = torch.rand(n_rays, 3, generator=self._generator)
+            background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         else:
-            background = torch.ones(n_rays, 3)
+            background = torch.ones(n_rays, 3, device=self.device)
         share = self.processes.share
         return Batch(*(share(rows) for rows in (rays.rays_o, rays.rays_d, rays.rgba, jitter, background)))
 
@@ -190,16 +259,16 @@ class Trainer:
         self, samples: Samples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(Colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of the rays that hit."""
-        features = self.field.grid(samples.points, samples.features)
-        sigmas = self.field.density(features)
-        if pilot or self.field.config.compositing == "colour":
-            network = self.pilot if pilot else self.field.head
+        features = self._field.grid(samples.points, samples.features)
+        sigmas = self._field.density(features)
+        if pilot or self._field.config.compositing == "colour":
+            network = self.pilot if pilot else self._field.head
             # Rays of several chunks: the samples' order is that of the starts.
             order = torch.argsort(starts)
             values = network(features, dirs[order.repeat_interleave(counts[order])])
-            return composite(sigmas, values, samples.deltas, starts, counts)
-        composited, opacity, weights = composite(sigmas, features, samples.deltas, starts, counts)
-        return self.field.head(composited, dirs) * opacity[:, None], opacity, weights
+            return self._composite(sigmas, values, samples.deltas, starts, counts)
+        composited, opacity, weights = self._composite(sigmas, features, samples.deltas, starts, counts)
+        return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
 
     def _backward(
         self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int, pilot: bool
@@ -223,34 +292,58 @@ class Trainer:
     def _gradients(self, pilot: bool) -> list[Tensor]:
         """Of the networks that learn in this step, zero where this process' rays met nothing; the others
         have none, which Adam leaves alone."""
-        network = self.pilot if pilot else self.field.head
-        learning = [*self.field.density.parameters(), *network.parameters()]
+        network = self.pilot if pilot else self._field.head
+        learning = [*self._field.density.parameters(), *network.parameters()]
         for parameter in learning:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
         return [parameter.grad for parameter in learning if parameter.grad is not None]
 
     def state(self) -> dict[str, Any]:
-        """All that the steps to come depend on, in tensors and plain values."""
-        return {
+        """All that the steps to come depend on, in CPU tensors and plain values."""
+        state = {
             "step": self._next_step,
             "seconds": self._seconds,
             "n_bad_steps": self.n_bad_steps,
             "generator": self._generator.get_state(),
-            "field": self.field.state_dict(),
+            "field": self._field.state_dict(),
             "pilot": self.pilot.state_dict(),
             "adam": self._adam.state_dict(),
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
         }
+        return state if self.device.type == "cpu" else _on_cpu(state)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave, as if nothing had happened in between."""
         self._next_step, self._seconds = state["step"], state["seconds"]
         self.n_bad_steps = state["n_bad_steps"]
         self._generator.set_state(state["generator"])
-        self.field.load_state_dict(state["field"])
+        self._field.load_state_dict(state["field"])
         self.pilot.load_state_dict(state["pilot"])
         self._adam.load_state_dict(state["adam"])
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a `TrainConfig.device`. Raises ConfigError: CUDA is asked for and not there.
+
+    >>> choose_device("cpu")
+    device(type='cpu')
+    """
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise ConfigError("device: expected a GPU that torch can run CUDA on, got none: pass --device cpu")
+    return torch.device("cuda" if there and name != "cpu" else "cpu")
+
+
+def _on_cpu(state: Any) -> Any:
+    """`state` with every tensor in it on the CPU."""
+    if isinstance(state, Tensor):
+        return state.cpu()
+    if isinstance(state, dict):
+        return {key: _on_cpu(value) for key, value in state.items()}
+    if isinstance(state, list | tuple):
+        return type(state)(_on_cpu(value) for value in state)
+    return state

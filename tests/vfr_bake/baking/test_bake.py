@@ -36,7 +36,9 @@ def quiet(stage: str, done: int, of: int) -> None:
 def model() -> Model:
     scene = demo.demo_scene(size=64, n_train=24, n_test=2)
     field = FieldOptions(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
-    config = TrainConfig(field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48)
+    config = TrainConfig(
+        device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48
+    )
     trainer = Trainer(scene, config)
     for _ in trainer.run():
         pass
@@ -186,7 +188,7 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path
 
 
 def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
-    empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(steps=1))
+    empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
     with torch.no_grad():
         empty.field.density.out.bias.fill_(-30)
     hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})

@@ -25,8 +25,8 @@ numba.set_num_threads(n_threads)
 processes = Processes.from_environment()
 scene = build_scene(demo_capture(size=32, n_train=12, n_test=2), kind)
 field = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
-config = TrainConfig(steps=40, pilot_steps=10, batch_samples=2048, batch_rays=64, field=field,
-                     occupancy_resolution=32)
+config = TrainConfig(device="cpu", steps=40, pilot_steps=10, batch_samples=2048, batch_rays=64,
+                     field=field, occupancy_resolution=32)
 trainer = Trainer(scene, config, processes)
 losses = [report.loss for report in trainer.run()]
 if processes.first:

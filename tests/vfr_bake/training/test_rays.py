@@ -9,7 +9,7 @@ import torch
 
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
-from vfr_bake.training.rays import PixelSampler
+from vfr_bake.training.rays import DevicePixelSampler, PixelSampler
 
 
 def mixed_views() -> PosedImages:
@@ -39,6 +39,22 @@ def test_rays_and_colours_are_those_of_the_pixels_of_pictures_of_mixed_sizes() -
     np.testing.assert_allclose(batch.rays_o.numpy(), rays_o[number], atol=1e-6)
     np.testing.assert_allclose(batch.rays_d.numpy(), rays_d[number], atol=1e-6)
     np.testing.assert_allclose(batch.rgba[:, 3].numpy() * 255, 255 - number, atol=1e-4)
+
+
+def test_a_gpus_sampler_draws_the_same(device: torch.device) -> None:
+    views = mixed_views()
+    ours = DevicePixelSampler(views, torch.Generator(device).manual_seed(0)).draw(4000)
+    rays = [camera.rays() for camera in views.cameras]
+    number = (ours.rgba[:, 0] * 255).round().long().cpu().numpy()
+    assert set(number.tolist()) == set(range(59))
+    for k, values in enumerate((ours.rays_o, ours.rays_d)):
+        expected = np.concatenate([pair[k] for pair in rays])[number]
+        np.testing.assert_allclose(values.cpu().numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(ours.rgba[:, 3].cpu().numpy() * 255, 255 - number, atol=1e-4)
+    if device.type == "cpu":  # one generator: the same pixels
+        numpys = PixelSampler(views, torch.Generator().manual_seed(0)).draw(4000)
+        torch.testing.assert_close(ours.rgba, numpys.rgba, rtol=0, atol=1e-7)
+        torch.testing.assert_close(ours.rays_d, numpys.rays_d, rtol=0, atol=1e-6)
 
 
 def test_every_pixel_is_as_likely_as_any_other() -> None:

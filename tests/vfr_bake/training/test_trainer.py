@@ -22,6 +22,7 @@ FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_wid
 
 def config(**changes: object) -> TrainConfig:
     settings = {
+        "device": "cpu",
         "steps": 220,
         "minutes": 5.0,
         "batch_samples": 8192,

@@ -1,0 +1,207 @@
+"""Proposal sampling in torch against the numba kernels and the formulas in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.vfr_bake.rendering.test_proposals import (
+    HISTOGRAMS,
+    contract,
+    make,
+    naive_interlevel,
+    naive_resample,
+)
+from vfr_bake.config import TrainConfig
+from vfr_bake.field.density import LARGEST_LOGIT
+from vfr_bake.kernels import proposals as compiled
+from vfr_bake.kernels.proposals import spacing
+from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED
+from vfr_bake.rendering.samples import OPAQUE_DEPTH, Samples
+from vfr_bake.torch_kernels import proposals as kernels
+from vfr_bake.training.device_guides import DeviceProposalGuide
+from vfr_bake.training.guides import ProposalGuide
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 0.3, 0.999, 1.0, 1.001, 2.0, 1e3, 1e10, 1e30, 3e38])
+def test_contraction_is_equation_10(size: float, device: torch.device) -> None:
+    directions = [[1, 0, 0], [0, -1, 0], [0.6, 0.0, -0.8], [0.5773, -0.5773, 0.5773]]
+    points = (np.array(directions) * size).astype(np.float32)
+    ours = kernels.contracted_unit(torch.from_numpy(points).to(device)).cpu().numpy()
+    expected = [(contract(point) + 2) / 4 for point in points.astype(np.float64)]
+    np.testing.assert_allclose(ours, np.stack(expected), rtol=0, atol=3e-7)
+
+
+def test_distance_is_the_inverse_of_the_kernels_spacing(device: torch.device) -> None:
+    t = np.array([0.0, 1e-6, 0.5, 1 - 1e-7, 1.0, 1 + 1e-6, 7.0, 1e3])
+    s = torch.tensor([spacing(value) for value in t], dtype=torch.float64, device=device)
+    np.testing.assert_allclose(kernels.distance(s).cpu().numpy(), t, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5, 0.999])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 2e-5)])
+def test_resampling_inverts_the_distribution(
+    jitter: float, dtype: torch.dtype, tolerance: float, device: torch.device
+) -> None:
+    weights = np.stack(list(HISTOGRAMS.values()))
+    edges = np.sort(np.random.default_rng(0).random((len(weights), 17)))
+    tensors = (torch.from_numpy(a).to(device, dtype) for a in (edges, weights))
+    jitters = torch.full((len(weights),), jitter, device=device, dtype=dtype)
+    ours = kernels.resample(*tensors, 1.0, jitters, 8).cpu().numpy()
+    for row, name in enumerate(HISTOGRAMS):
+        expected = naive_resample(edges[row], weights[row], 8, jitter)
+        np.testing.assert_allclose(ours[row], expected, rtol=0, atol=tolerance, err_msg=name)
+    assert (np.diff(ours) >= 0).all()
+    low, high = edges.astype(ours.dtype)[:, 0], edges.astype(ours.dtype)[:, -1]
+    assert (ours[:, 0] >= low).all() and (ours[:, -1] <= high).all()
+
+
+def test_one_interval_is_the_whole_and_no_ray_is_none(device: torch.device) -> None:
+    edges = torch.tensor([[0.1, 0.4, 0.9]], device=device)
+    weights, jitter = torch.ones(1, 2, device=device), torch.zeros(1, device=device)
+    torch.testing.assert_close(kernels.resample(edges, weights, 1.0, jitter, 1), edges[:, [0, 2]])
+    assert kernels.resample(edges[:0], weights[:0], 1.0, jitter[:0], 5).shape == (0, 6)
+
+
+def test_interlevel_loss_and_its_gradient(device: torch.device) -> None:
+    random = np.random.default_rng(1)
+    n, m, n_rays = 7, 5, 6
+    edges = np.sort(random.random((n_rays, m + 1)))
+    weights = random.random((n_rays, m)) * 0.4
+    p_edges = np.sort(random.random((n_rays, n + 1)))
+    p_edges[:, 0], p_edges[:, -1] = 0, 1
+    edges[1] += 2  # beyond the proposal's last interval
+    edges[2, 2] = edges[2, 1]  # an interval of no length
+    p_edges[3, 3] = edges[3, 2]  # equal borders
+    p_edges.sort(axis=1)
+    p_weights = torch.from_numpy(random.random((n_rays, n)) * 0.05).to(device).requires_grad_()
+    tensors = [torch.from_numpy(a).to(device) for a in (edges, weights, p_edges)]
+    losses = kernels.interlevel(*tensors, p_weights)
+    proposed = p_weights.detach().cpu().numpy()
+    expected, depths, starts = np.empty(n_rays), np.zeros((n_rays, n)), np.arange(n_rays) * m
+    compiled.interlevel(
+        edges, starts, np.full(n_rays, m), weights.reshape(-1), p_edges, proposed, depths, expected,
+        np.empty((n_rays, n)),
+    )  # fmt: skip
+    np.testing.assert_allclose(losses.detach().cpu().numpy(), expected, rtol=1e-12)
+    for ray in (0, 3, 4, 5):
+        naive = naive_interlevel(edges[ray], weights[ray], p_edges[ray], proposed[ray])
+        assert losses[ray].item() == pytest.approx(naive, rel=1e-12)
+    assert torch.isfinite(losses).all() and (losses > 0).all()
+    assert torch.autograd.gradcheck(lambda p: kernels.interlevel(*tensors, p), (p_weights,))
+
+
+def guides(device: torch.device) -> tuple[ProposalGuide, DeviceProposalGuide]:
+    """Both paths' with the same tables."""
+    _, sampler, _, _ = make()
+    config = TrainConfig()
+    pace = config.pace("cpu", True)
+    ours, expected = DeviceProposalGuide(config, pace, 0.05, device), ProposalGuide(config, pace, 0.05)
+    for guide in (ours._sampler, expected.sampler):
+        guide.load_state_dict(sampler.state_dict())
+    return expected, ours
+
+
+@pytest.mark.parametrize("step", [0, 10, 1000])
+def test_rounds_and_samples_are_the_kernels_in_float64(step: int, device: torch.device) -> None:
+    """In float32 flat parts of a distribution magnify rounding a thousandfold in each round."""
+    field, _, *rays = make()
+    torch.manual_seed(3)
+    rays = [a.double() for a in (*rays, torch.rand(40, 3))]
+    expected, guide = guides(device)
+    for module in (field, expected.sampler, guide._sampler):
+        module.double()
+    guide.prepare(step, field)
+    grids = [
+        (grid.table.detach().numpy(), *grid.layout.kernel_arguments(np.float64))
+        for grid in expected.sampler.grids
+    ]
+    arrays, limits = [a.numpy() for a in rays], (np.float64(LARGEST_LOGIT), np.float64(OPAQUE_DEPTH))
+    shapes = [(40, N_PROPOSED + 1), (40, N_PROPOSED), (40, N_PROPOSED, 3), (40, N_PROPOSED)]
+    rounds = [[np.zeros(shape) for shape in shapes] for _ in range(2)]
+    edges, counts, n = np.empty((40, N_FINAL + 1)), np.empty(40, np.int64), 40 * N_FINAL
+    compiled.propose(
+        *arrays, guide._borders, np.float64(guide._sampler.exponent), *grids, limits, *rounds[0], *rounds[1],
+        edges,
+    )  # fmt: skip
+    t_mid, deltas, points = np.empty(n), np.empty(n), np.empty((n, 3))
+    features = np.empty((n, field.config.n_channels))
+    compiled.field_samples(
+        *arrays[:2], edges, *field.kernel_arguments(), limits, counts, t_mid, deltas, points, features
+    )
+    field.to(device).grid.backend = "torch"
+    samples = guide.sample(field, *(a.to(device) for a in rays), pilot=False, share=1.0)
+    for (ours, weights), found in zip(guide._rounds, rounds, strict=True):
+        np.testing.assert_allclose(ours.cpu().numpy(), found[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(weights.detach().cpu().numpy(), found[3], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(guide._edges.cpu().numpy(), edges, rtol=0, atol=1e-8)
+    assert samples.counts.tolist() == counts.tolist()
+    kept = (np.arange(N_FINAL) < counts[:, None]).reshape(-1)
+    for name, values in {"t_mid": t_mid, "deltas": deltas, "points": points, "features": features}.items():
+        ours = getattr(samples, name).cpu().numpy()
+        np.testing.assert_allclose(ours, values[kept], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("step", [0, 5])
+@pytest.mark.parametrize("bias", [0.0, 20.0])
+def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, device: torch.device) -> None:
+    """Samples, regulariser and the tables' gradients; with a bias of 20 every first sample is opaque."""
+    field, _, rays_o, rays_d = make()
+    with torch.no_grad():
+        field.density.out.bias.fill_(bias)
+    torch.manual_seed(3)
+    jitter, noise = torch.rand(40, 3), torch.rand(40 * 32)
+    found, losses, gradients = [], [], []
+    for guide, place in zip(guides(device), (torch.device("cpu"), device), strict=True):
+        if isinstance(guide, DeviceProposalGuide):
+            field = field.to(place)
+            field.grid.backend = "torch"
+        guide.prepare(step, field)
+        rays = (a.to(place) for a in (rays_o, rays_d, jitter))
+        samples = guide.sample(field, *rays, pilot=False, share=1.0)
+        weights = noise[: len(samples.t_mid)].to(place)
+        losses.append(guide.regulariser(samples, weights))
+        guide.add_gradients(samples, weights, 40)
+        found.append(samples)
+        gradients.append([table.gradient.cpu() for table in guide.tables()])
+    same_samples(found[1], found[0])
+    torch.testing.assert_close(losses[1].cpu(), losses[0], rtol=1e-4, atol=1e-7)
+    assert len(gradients[0]) == len(gradients[1]) == 2
+    for ours, expected in zip(*reversed(gradients), strict=True):
+        assert expected.abs().max() > 0
+        torch.testing.assert_close(ours, expected, rtol=1e-3, atol=2e-4 * float(expected.abs().max()))
+
+
+def same_samples(ours: Samples, expected: Samples) -> None:
+    assert torch.equal(ours.counts.cpu(), expected.counts) and torch.equal(ours.starts.cpu(), expected.starts)
+    # Borders are drawn from sums of 64 weights in another order; far out a rounding of s is magnified in t.
+    torch.testing.assert_close(ours.t_mid.cpu(), expected.t_mid, rtol=2e-3, atol=1e-5)
+    torch.testing.assert_close(ours.deltas.cpu(), expected.deltas, rtol=5e-2, atol=1e-5)
+    torch.testing.assert_close(ours.points.cpu(), expected.points, rtol=0, atol=1e-5)
+
+
+def test_no_ray_at_all(device: torch.device) -> None:
+    field = make()[0].to(device)
+    field.grid.backend = "torch"
+    _, guide = guides(device)
+    guide.prepare(0, field)
+    none = torch.zeros(0, 3, device=device)
+    samples = guide.sample(field, none, none, none, pilot=False, share=1.0)
+    assert len(samples.t_mid) == len(samples.counts) == 0
+    guide.add_gradients(samples, none[:, 0], 0)
+
+
+def test_a_saturated_density_can_come_down(device: torch.device) -> None:
+    logits = torch.tensor([[-1e30, 0.0, 20.0, 1e9]], device=device, requires_grad=True)
+    weights = kernels.weights_of(logits, torch.tensor([[1.0, 1.0, 1e-7, 1e-9]], device=device))
+    weights[0, 2].backward()
+    sigma = np.exp(15.0) * 1e-7
+    np.testing.assert_allclose(
+        weights.detach().cpu().numpy()[0, 2], np.exp(-1) * -np.expm1(-sigma), rtol=1e-5
+    )
+    assert weights[0, 3].item() == pytest.approx(
+        np.exp(-1 - sigma) * -np.expm1(-np.exp(15.0) * 1e-9), rel=1e-3
+    )
+    expected = [0, -np.exp(-1) * -np.expm1(-sigma), np.exp(-1) * sigma * np.exp(-sigma), 0]
+    np.testing.assert_allclose(logits.grad.cpu().numpy()[0], expected, rtol=1e-5)

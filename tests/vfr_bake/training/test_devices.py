@@ -1,0 +1,170 @@
+"""Training through torch, as on a GPU: on a CPU it ends where numba ends; settings follow from the device."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from player.errors import ConfigError
+from tests.vfr_bake.training.test_trainer import config, unbounded
+from vfr_bake.config import FieldOptions, TrainConfig
+from vfr_bake.data.demo import demo_scene
+from vfr_bake.data.scene import Scene
+from vfr_bake.field.field import VfrField
+from vfr_bake.field.pilot import Pilot
+from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
+from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import Model, load_model, save_model
+from vfr_bake.training.processes import Processes
+from vfr_bake.training.trainer import Trainer, choose_device
+
+
+def small_scene(kind: str) -> Scene:
+    return demo_scene(size=32, n_train=12, n_test=2) if kind == "object" else unbounded()
+
+
+def psnr(trainer: Trainer, scene: Scene) -> float:
+    scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3))
+    return float(np.mean([score.psnr for score in scores]))
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None:
+    scene = small_scene(kind)
+    settings = {"pilot_steps": 40, "batch_samples": 4096, "batch_rays": 48}
+    settings["steps"] = 150 if kind == "object" else 120
+    ours = Trainer(scene, config(**settings | {"device": device.type}), backend="torch")
+    expected = Trainer(scene, config(**settings))
+    before = psnr(ours, scene)
+    losses = [[report.loss for report in trainer.run()] for trainer in (ours, expected)]
+    assert ours.n_bad_steps == 0 and len(losses[0]) == settings["steps"]
+    if device.type == "cpu":  # one generator: the same rays
+        np.testing.assert_allclose(losses[0][:20], losses[1][:20], rtol=0.02)
+    assert psnr(ours, scene) == pytest.approx(psnr(expected, scene), abs=1.0)
+    assert psnr(ours, scene) > before + (3 if kind == "object" else 0.5)
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_what_a_step_makes_is_made_beside_the_field(kind: str) -> None:
+    """A tensor that were made on torch's default device, whatever it is, could not be used on a GPU."""
+    settings = {"pilot_steps": 1, "batch_rays": 32, "batch_samples": 1024, "steps": 3}
+    trainer = Trainer(small_scene(kind), config(**settings), backend="torch")
+    with torch.device("meta"):
+        reports = list(trainer.run())
+    assert len(reports) == 3 and trainer.n_bad_steps == 0
+
+
+def test_colours_can_be_composited_instead(device: torch.device) -> None:
+    field = FieldOptions(**vars(config().field) | {"compositing": "colour"})
+    settings = config(steps=5, batch_samples=1024, field=field, device=device.type)
+    trainer = Trainer(small_scene("object"), settings, backend="torch")
+    assert len(list(trainer.run())) == 5 and trainer.n_bad_steps == 0
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_a_run_that_was_interrupted_goes_on(kind: str, device: torch.device, tmp_path: Path) -> None:
+    scene = small_scene(kind)
+    settings = {"steps": 24, "pilot_steps": 6, "batch_rays": 32, "batch_samples": 1024, "device": device.type}
+    whole = Trainer(scene, config(**settings), backend="torch")
+    losses = []
+    for report in whole.run():
+        losses.append(report.loss)
+        if report.step == 11:
+            save_checkpoint(tmp_path / "c", whole)
+    again = Trainer(scene, config(**settings), backend="torch")
+    load_checkpoint(tmp_path / "c", again)
+    # A GPU adds up in no fixed order.
+    tolerance = 0 if device.type == "cpu" else 1e-2
+    np.testing.assert_allclose([report.loss for report in again.run()], losses[12:], rtol=tolerance)
+    content = torch.load(tmp_path / "c", weights_only=True)  # without map_location: where they were saved
+    assert {tensor.device.type for tensor in tensors(content)} == {"cpu"}
+
+
+def tensors(content: object) -> list[torch.Tensor]:
+    if isinstance(content, torch.Tensor):
+        return [content]
+    parts = content.values() if isinstance(content, dict) else content if isinstance(content, list) else []
+    return [tensor for part in parts for tensor in tensors(part)]
+
+
+def test_a_checkpoint_of_another_device_or_backend_is_refused(tmp_path: Path) -> None:
+    scene = small_scene("object")
+    trainer = Trainer(scene, config(steps=1))
+    save_checkpoint(tmp_path / "c", trainer)
+    content = torch.load(tmp_path / "c", weights_only=True)
+    content["settings"]["device"] = "cuda"
+    content["settings"]["batch_samples"] = 2**18
+    torch.save(content, tmp_path / "c")
+    with pytest.raises(ConfigError, match=r"device: expected cuda as in the interrupted run, got cpu"):
+        load_checkpoint(tmp_path / "c", trainer)
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_its_model_file_is_any_model_file(kind: str, device: torch.device, tmp_path: Path) -> None:
+    scene = small_scene(kind)
+    settings = config(steps=3, batch_rays=32, batch_samples=1024, device=device.type)
+    trainer = Trainer(scene, settings, backend="torch")
+    list(trainer.run())
+    model = Model(
+        field=trainer.field, sampler=trainer.sampler, world_from_model=scene.world_from_model,
+        cameras=scene.train.cameras, has_alpha=scene.has_alpha, train=trainer.settings, figures={},
+    )  # fmt: skip
+    save_model(tmp_path / "model.pt", model)
+    loaded = load_model(tmp_path / "model.pt")
+    for name, tensor in trainer.field.state_dict().items():
+        assert torch.equal(tensor, loaded.field.state_dict()[name]), name
+    assert loaded.train["device"] == device.type and loaded.train["batch_samples"] == 1024
+    assert psnr(trainer, scene) == pytest.approx(
+        np.mean([s.psnr for s in evaluate(loaded.field, loaded.sampler, scene.test, np.ones(3))]), abs=1e-6
+    )
+
+
+def test_a_gpu_is_taken_if_there_is_one_and_missed_if_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == choose_device("cpu") == torch.device("cpu")
+    with pytest.raises(ConfigError, match=r"device: expected a GPU .*, got none: pass --device cpu"):
+        choose_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert choose_device("auto") == choose_device("cuda") == torch.device("cuda")
+    assert choose_device("cpu") == torch.device("cpu")
+
+
+@pytest.mark.parametrize("unbounded_field", [False, True])
+def test_the_networks_are_one_graph_each(unbounded_field: bool, device: torch.device) -> None:
+    """As they are compiled on a GPU: without a break, and with equal gradients."""
+    options = FieldOptions(n_levels=4, max_resolution=64, log2_table_size=12, head_width=16)
+    field = VfrField(options.resolved(unbounded_field)).to(device)
+    torch._dynamo.reset()
+    for network in (field.density.logits, field.head, Pilot(field.config).to(device)):
+        graph = torch.compile(network, backend="aot_eager", fullgraph=True, dynamic=True)
+        for n in (13, 50):
+            features = torch.randn(n, field.config.n_channels, device=device, requires_grad=True)
+            dirs = torch.nn.functional.normalize(torch.randn(n, 3, device=device), dim=-1)
+            arguments = (features, dirs) if isinstance(network, torch.nn.Module) else (features,)
+            results = [run(*arguments) for run in (network, graph)]
+            gradients = [torch.autograd.grad(result.sum(), features)[0] for result in results]
+            torch.testing.assert_close(results[1], results[0])
+            torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-5)
+
+
+def test_several_processes_stay_on_the_cpu() -> None:
+    with pytest.raises(ConfigError, match="device: several processes: expected cpu"):
+        Trainer(small_scene("object"), config(), Processes(0, 2), backend="torch")
+
+
+def test_what_is_not_given_follows_from_the_device() -> None:
+    cpu, gpu = (TrainConfig().pace(device, False) for device in ("cpu", "cuda"))
+    assert (cpu.steps, cpu.batch_rays, cpu.max_rays, cpu.network_rate) == (60_000, 512, 16_384, 4e-3)
+    assert (gpu.steps, gpu.batch_samples, gpu.batch_rays) == (20_000, 2**18, 2**13)
+    assert (gpu.network_rate, gpu.grid_rate) == (0.01, 0.01)
+    assert TrainConfig().pace("cuda", True).steps == 40_000
+    assert TrainConfig(batch_rays=64).pace("cuda", True).batch_rays == 64
+    assert FieldOptions().resolved(False, "cuda").log2_table_size == 19
+    assert FieldOptions(log2_table_size=15).resolved(False, "cuda").log2_table_size == 15
+    assert FieldOptions().resolved(False) == FieldOptions().resolved(False, "cpu")
+    for name, value in {"steps": 0, "batch_samples": 3, "network_rate": 1.0, "device": "tpu"}.items():
+        with pytest.raises(ConfigError, match=f"{name}: expected"):
+            TrainConfig(**{name: value})  # type: ignore[arg-type]

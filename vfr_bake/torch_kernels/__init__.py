@@ -1,0 +1,35 @@
+"""The field's inner loops as vectorised torch, for a GPU; any device runs them.
+
+Each function has its numba kernel of `vfr_bake.kernels` as its twin, with the same letters, and the tests
+compare the two. Pure functions of tensors without a branch on their values, so that `torch.compile` makes few
+kernels of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+
+def fast(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
+    """`function` compiled where that pays: on a GPU, where its code generator Triton is there.
+
+    >>> fast(len, torch.device("cpu")) is len
+    True
+    """
+    return _compiled(function) if can_compile(device) else function
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether torch can generate code for `device`; Triton does not come with torch on Windows."""
+    return device.type == "cuda" and find_spec("triton") is not None
+
+
+@cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    # The number of samples differs from step to step; without `dynamic` each would be compiled anew.
+    return torch.compile(function, dynamic=True)

@@ -1,0 +1,93 @@
+"""Multiresolution hash grid in torch: features at points, and their gradient added up (Mueller et al. 2022,
+section 3).
+
+Letters as in `vfr_bake.kernels.hash_grid`; all levels of all points at once.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z
+from vfr_bake.torch_kernels import fast
+
+
+class Levels(NamedTuple):
+    """Which entries of a table belong to which level; tensors on the table's device."""
+
+    scales: Tensor
+    """[n_levels] cells per axis, in the table's type."""
+    sides: Tensor
+    """[n_levels] int64 vertices per axis."""
+    offsets: Tensor
+    """[n_levels] int64 first row of each level."""
+    hashed: Tensor
+    """[n_levels] bool: whether vertices share entries through the spatial hash."""
+    mask: int
+    """Entries of a hashed level, less one; a power of two less one."""
+
+
+def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
+    """(rows, trilinear weights), both [n_points, n_levels, 8] with x fastest, of the corners around `points`
+    [n_points, 3] of the unit cube."""
+    position = points[:, None, :] * levels.scales[:, None]
+    cell = torch.minimum(position.long().clamp(min=0), (levels.sides - 2)[:, None])
+    inside = position - cell
+    weights = torch.stack([1 - inside, inside], dim=-1)  # [n_points, n_levels, 3, 2]
+    vertices = cell[..., None] + torch.arange(2, device=points.device)
+    x = vertices[:, :, 0, None, None, :]
+    y = vertices[:, :, 1, None, :, None]
+    z = vertices[:, :, 2, :, None, None]
+    side, hashed = levels.sides[:, None, None, None], levels.hashed[:, None, None, None]
+    # In 64 bits: the products do not overflow, and the mask takes the bits that 32 would have kept.
+    shared = (x ^ (y * int(PRIME_Y)) ^ (z * int(PRIME_Z))) & levels.mask
+    rows = torch.where(hashed, shared, (z * side + y) * side + x) + levels.offsets[:, None, None, None]
+    wx, wy, wz = weights[:, :, 0], weights[:, :, 1], weights[:, :, 2]
+    products = wx[:, :, None, None, :] * (wy[:, :, None, :, None] * wz[:, :, :, None, None])
+    return rows.flatten(2), products.flatten(2)
+
+
+def encode(points: Tensor, table: Tensor, levels: Levels) -> Tensor:
+    """Features [n_points, n_levels * n_channels] at `points` [n_points, 3] of the unit cube; `table`
+    [n_entries, n_channels]."""
+    rows, weights = corners(points, levels)
+    return (weights[..., None] * table[rows]).sum(dim=2).flatten(1)
+
+
+def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) -> Tensor:
+    """The table's gradient [n_entries, n_channels], given that of `encode` [n_points, n_levels * n_channels].
+
+    By `index_add`, which adds atomically on a GPU; autograd's own would sort 33 million rows in every step.
+    One-dimensional, because on a CPU only that is fast.
+    """
+    rows, weights = corners(points, levels)
+    n_channels = gradient.shape[1] // rows.shape[1]
+    values = weights[..., None] * gradient.reshape(rows.shape[0], rows.shape[1], 1, n_channels)
+    entries = rows[..., None] * n_channels + torch.arange(n_channels, device=points.device)
+    total = gradient.new_zeros(n_entries * n_channels)
+    return total.index_add(0, entries.flatten(), values.flatten()).reshape(n_entries, n_channels)
+
+
+def features_at(points: Tensor, table: Tensor, levels: Levels, features: Tensor | None = None) -> Tensor:
+    """`encode`, differentiable with respect to `table` alone. `features`, if already known, are taken as they
+    are."""
+    return _Features.apply(points, table, levels, features)  # type: ignore[return-value]
+
+
+class _Features(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, points: Tensor, table: Tensor, levels: Levels, features: Tensor | None) -> Tensor:
+        ctx.save_for_backward(points)
+        ctx.levels, ctx.n_entries = levels, len(table)
+        if features is not None:
+            return features
+        return fast(encode, points.device)(points, table, levels)
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor):
+        (points,) = ctx.saved_tensors
+        add_up = fast(scatter, points.device)
+        return None, add_up(points, grads[0].contiguous(), ctx.n_entries, ctx.levels), None, None

@@ -1,0 +1,156 @@
+"""The guides of `vfr_bake.training.guides` on a GPU: the same decisions, on tensors beside the field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vfr_bake.config import Pace, TrainConfig
+from vfr_bake.field.field import VfrField
+from vfr_bake.rendering.device_grid import DeviceOccupancyGrid
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid, ProposalSampler
+from vfr_bake.rendering.samples import OPAQUE_DEPTH, Samples
+from vfr_bake.torch_kernels import fast
+from vfr_bake.torch_kernels import proposals as kernels
+from vfr_bake.torch_kernels.compositing import Padding, distortion, sums_before
+from vfr_bake.torch_kernels.hash_grid import features_at
+from vfr_bake.torch_kernels.march import march
+from vfr_bake.training.guides import FOG_STEPS, STEPS_PER_UPDATE, OccupancyPace, ProposalPace
+from vfr_bake.training.optimiser import DeviceGridAdam
+
+
+class DeviceOccupancyGuide(OccupancyPace):
+    """Marches an object's box and keeps its occupancy grid."""
+
+    def __init__(self, config: TrainConfig, pace: Pace, step_length: float, device: torch.device) -> None:
+        super().__init__(pace, step_length)
+        self._grid = DeviceOccupancyGrid(config.occupancy_resolution, step_length, config.seed, device)
+
+    @property
+    def sampler(self) -> OccupancyGrid:
+        """As the CPU has it."""
+        return self._grid.on_cpu()
+
+    def prepare(self, step: int, field: VfrField) -> None:
+        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
+            self._grid.update(field)
+
+    def sample(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
+    ) -> Samples:
+        grid, budget = self._grid, int(self._budget(pilot) * share)
+        samples, sigmas = march(
+            field.lookup, grid.occupied, grid.step, rays_o, rays_d, jitter[:, 0].contiguous(), budget
+        )
+        grid.observe(samples.points, sigmas)
+        return samples
+
+    def state(self) -> dict[str, Any]:
+        return {"samples_per_ray": self._samples_per_ray, "occupancy": self._grid.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._samples_per_ray = state["samples_per_ray"]
+        self._grid.restore_state(state["occupancy"])
+
+
+class DeviceProposalGuide(ProposalPace):
+    """Trains the two proposal grids of an unbounded scene beside the field, by autograd."""
+
+    def __init__(self, config: TrainConfig, pace: Pace, near: float, device: torch.device) -> None:
+        super().__init__(config, pace, near)
+        self._sampler = ProposalSampler(near).to(device)
+        self._adams = [DeviceGridAdam(grid.table) for grid in self._sampler.grids]  # type: ignore[arg-type]
+
+    @property
+    def sampler(self) -> ProposalSampler:
+        """As the CPU has it."""
+        if next(self._sampler.parameters()).device.type == "cpu":
+            return self._sampler
+        copy = ProposalSampler(self._sampler.near)
+        copy.load_state_dict(self._sampler.state_dict())
+        copy.exponent = self._sampler.exponent
+        return copy
+
+    def _set_exponent(self, exponent: float) -> None:
+        self._sampler.exponent = exponent
+
+    def sample(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
+    ) -> Samples:
+        self._rounds = []
+        near, far = self._borders
+        edges = rays_o.new_tensor([near, far]).expand(len(rays_o), 2)
+        weights = rays_o.new_ones(len(rays_o), 1)
+        for number, grid in enumerate(self._sampler.grids):
+            exponent = self._sampler.exponent if number else 1.0
+            edges = self._resample(edges, weights, exponent, jitter[:, number], N_PROPOSED)
+            assert isinstance(grid, ProposalGrid)
+            with torch.set_grad_enabled(self._learns):
+                weights = proposal_weights(grid, rays_o, rays_d, edges)
+            self._rounds.append((edges, weights))
+        self._edges = self._resample(edges, weights, self._sampler.exponent, jitter[:, 2], N_FINAL)
+        return field_samples(field, rays_o, rays_d, self._edges)
+
+    @staticmethod
+    def _resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n: int) -> Tensor:
+        return kernels.resample(edges.contiguous(), weights.detach(), exponent, jitter, n)
+
+    def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:
+        if self._config.distortion == 0:
+            return None
+        # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
+        kept = torch.arange(N_FINAL, device=weights.device) < samples.counts[:, None]
+        low, high = self._edges[:, :-1][kept], self._edges[:, 1:][kept]
+        mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
+        losses = distortion(weights, mids, widths, samples.starts, samples.counts)
+        return self._config.distortion * losses.sum()
+
+    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+        if not self._learns or not n_rays:
+            return
+        final = weights.new_zeros(len(samples.counts), N_FINAL)
+        rows = Padding(samples.starts, samples.counts, len(weights)).rows(weights.detach())
+        final[:, : rows.shape[1]] = rows
+        losses = [kernels.interlevel(self._edges, final, edges, proposed) for edges, proposed in self._rounds]
+        (torch.stack(losses).sum() / n_rays).backward()
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "proposals": self._sampler.state_dict(),
+            "adams": [adam.state() for adam in self._adams],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._sampler.load_state_dict(state["proposals"])
+        for adam, kept in zip(self._adams, state["adams"], strict=True):
+            adam.restore(kept)
+
+
+def proposal_weights(grid: ProposalGrid, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> Tensor:
+    """Weights [n_rays, n] that a proposal gives to intervals with borders `edges` [n_rays, n + 1] in s."""
+    _, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
+    levels = grid.layout.levels(grid.table)
+    logits = features_at(points.reshape(-1, 3), grid.table, levels).sum(dim=1)
+    return kernels.weights_of(logits.reshape(lengths.shape), lengths)
+
+
+@torch.no_grad()
+def field_samples(field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> Samples:
+    """The field in the middle of intervals with borders `edges` [n_rays, n + 1] in s, up to where a ray is
+    opaque."""
+    t_mid, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
+    features, sigmas = field.lookup(points.reshape(-1, 3))
+    kept = sums_before(sigmas.reshape(lengths.shape) * lengths) <= OPAQUE_DEPTH
+    counts = kept.sum(dim=1)
+    return Samples(
+        t_mid=t_mid[kept],
+        deltas=lengths[kept],
+        points=points[kept],
+        features=features[kept.reshape(-1)],
+        rays=torch.arange(len(rays_o), device=rays_o.device),
+        starts=torch.cumsum(counts, dim=0) - counts,
+        counts=counts,
+    )
