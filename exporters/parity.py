@@ -9,15 +9,21 @@ import numpy as np
 from exporters.glb import parse_glb, y_up
 from exporters.mesh import TriangleMesh
 from exporters.ply import parse_ply
+from exporters.points import parse_points
+from exporters.stl import parse_stl
 from player.errors import ParityError
 
 
 def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -> None:
-    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb) file, has other counts or
-    bounds than `mesh`.
+    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl) file, has other counts
+    or bounds than `mesh`; of an STL, which has no vertices, other corners.
 
-    Bounds may differ by what the format rounds: float32 for PLY and GLB, nine digits for OBJ.
+    Bounds may differ by what the format rounds: float32 for PLY, GLB and STL, nine digits for OBJ.
     """
+    if suffix == ".stl":
+        corners = parse_stl(data, where)["corners"].reshape(-1, 3)
+        _check_places(where, "corners", mesh.vertices[mesh.faces].reshape(-1, 3), corners)
+        return
     n_vertices, n_faces, bounds = {".ply": _ply, ".obj": _obj, ".glb": _glb}[suffix](data, where)
     for name, expected, got in (
         ("vertices", len(mesh.vertices), n_vertices),
@@ -35,6 +41,29 @@ def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -
         raise ParityError(
             f"{where}: bounds: expected {expected.tolist()}, got {bounds.tolist()}: "
             f"{worst:g} apart, tolerance {tolerance:g}"
+        )
+
+
+def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
+    """Raises ParityError if `data`, the content of a point cloud's PLY, holds other points than `cloud`."""
+    points = parse_points(data, where)
+    _check_places(where, "points", cloud.vertices, points["position"])
+    _check_places(where, "normals", cloud.normals, points["normal"])
+    if not np.array_equal(points["colour"], cloud.colours):
+        raise ParityError(f"{where}: colours: expected those of the points, got others")
+
+
+def _check_places(where: str, what: str, expected: np.ndarray, got: np.ndarray) -> None:
+    """Row by row, to the rounding of float32 at the largest coordinate."""
+    if expected.shape != got.shape:
+        raise ParityError(f"{where}: {what}: expected {len(expected)}, got {len(got)}")
+    apart = np.abs(expected - got.astype(np.float64)).max(axis=-1, initial=0)
+    tolerance = 2e-7 * max(float(np.abs(expected).max(initial=0)), 1e-30)
+    if not (apart <= tolerance).all():
+        row = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
+        raise ParityError(
+            f"{where}: {what}: number {row}: expected {expected[row].tolist()}, got {got[row].tolist()}: "
+            f"{apart[row]:g} apart, tolerance {tolerance:g}"
         )
 
 

@@ -50,8 +50,8 @@ class Frame:
     background: Background
     """What is behind, or "transparent"."""
     features: np.ndarray | None = None
-    """[h, w, n_channels] float32, what the head was given (in units of the codes), 0 where it was not run; None
-    unless asked for with `layers`."""
+    """[h, w, n_channels] float32, what the head was given (in units of the codes), 0 where it was not run;
+    None unless asked for with `layers`."""
     normals: np.ndarray | None = None
     """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.normals`); None unless asked for with
     `layers`."""
@@ -113,8 +113,8 @@ class Renderer:
             camera: in the WORLD frame.
             n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
             background: colour 0..1 or "transparent"; the asset's own if None.
-            layers: fill in the frame's `features` and `normals` too; the picture is the same, and takes a second
-                march.
+            layers: fill in the frame's `features` and `normals` too, at the cost of a second march; the
+                picture is the same.
 
         Raises:
             ConfigError: a picture over MAX_PIXELS, or n_samples out of range.

@@ -52,8 +52,8 @@ def test_normals_are_the_naive_loop(asset: Asset, scene: Scene, camera: Camera) 
 
 
 def test_a_sphere_has_radial_normals(asset: Asset) -> None:
-    """Of the gradient alone, a voxel outside the peak of the outer shell. Most cells bend by a degree; a few have
-    a corner on the other side of the peak."""
+    """Of the gradient alone, a voxel outside the peak of the outer shell. Most cells bend by a degree; a few
+    have a corner on the other side of the peak."""
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     radius = 0.99 + 1.0 * 2 / RESOLUTION
