@@ -1,15 +1,15 @@
-"""The head of an asset as an ONNX file for other programs: alone, or with the decode of the features in front.
+"""The head of an asset as an ONNX file for other programs: alone, or with the decode of features in front.
 
 | graph | inputs | output |
 |---|---|---|
 | alone | `features` float [n, n_channels], `dirs` float [n, 3] | `rgb` float [n, 3] |
-| with decode | `codes` int8 [n, k, n_channels], `weights` float [n, k], `dirs` float [n, 3] | `rgb` float [n, 3] |
+| with decode | `codes` int8 [n, k, n_channels], `weights` float [n, k], `dirs` float [n, 3] | the same |
 
-n, and k, are free. `features` are the sum of weight times code that a player composes; the scales of the codes
-are in the head's first layer since the asset was baked. With the decode, `codes` are k rows of features.npy
-(or rounded interpolations of them) and `weights` their compositing weights: `features = sum_k weights codes` is
-part of the graph. `dirs` are unit, model frame, from the camera into the scene; `rgb` is 0..1 in the asset's
-colour space, to be composed as `rgb A + (1 - A) background`.
+n, and k, are free. `features` are the sum of weight times code that a player composes; the scales of the
+codes are in the head's first layer since the asset was baked. With the decode, `codes` are k rows of
+features.npy and `weights` what each counts, compositing weight times the share of a corner: `features = sum_k
+weights codes` is part of the graph. `dirs` are unit, model frame, from the camera into the scene; `rgb` is
+0..1 in the asset's colour space, to be composed as `rgb A + (1 - A) background`.
 
 The file's metadata records the opset, the names, and what was compared and how far it was apart.
 """
@@ -25,8 +25,8 @@ from player.errors import FormatError, MissingExtraError, ParityError
 from player.head import Head
 
 TOLERANCE = 1e-6
-"""Most that rgb may differ from the asset's own head: the same graph and numbers that are exact in float32, so
-that only another order of float32 additions is allowed for."""
+"""Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
+float32, so that only another order of float32 additions is allowed for."""
 
 N_FETCHES = 5
 """k of the comparison."""

@@ -1,4 +1,4 @@
-"""transforms.json of cameras, in the frame of an export: instant-ngp's form, as `player.transforms` writes it.
+"""transforms.json of cameras in the frame of an export: instant-ngp's form, as `player.transforms` writes it.
 
 The axes of a camera (x right, y up, looks along -z) and the pixels stay; what changes with the frame is where
 the cameras are.

@@ -110,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--format", metavar="NAME", help="exr or colmap for a folder; or a suffix without its dot")
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
     add("--crop", metavar="X,Y,Z,W,D,H[,YAW]", help="only what is in this box of the world; or a .json file")
-    add("--faces", type=int, metavar="N", help="simplify the mesh to at most N faces")
+    add("--faces", type=int, metavar="N", help="simplify the mesh to N faces, or as few as can be reached")
     add("--points", type=int, metavar="N", help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})")
     add("--cameras", type=Path, metavar="FILE", help="views of a transforms.json (the training cameras)")
     add("--views", type=_slice, metavar="A:B", help="a slice of the views, as in Python")
@@ -177,6 +177,8 @@ def _sentence(summary: dict[str, Any]) -> str:
         parts.append(f"bounds {_corner(low)} to {_corner(high)}")
     if summary.get("frame", "world") != "world":
         parts.append(f"written in the frame {summary['frame']}")
+    if summary.get("faces", 0) > summary.get("faces_asked", float("inf")):
+        parts.append(f"{summary['faces_asked']} were asked for, but no other edge can go without a fold")
     if "removed" in summary:
         parts.append(f"the crop removed {summary['removed']:.1%} of the faces")
     return f"{summary['file']}: {', '.join(parts)}"

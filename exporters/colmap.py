@@ -1,4 +1,4 @@
-"""A COLMAP model as text: `cameras.txt`, `images.txt`, `points3D.txt`, as 3D Gaussian splatting and MVS read it.
+"""A COLMAP model as text: `cameras.txt`, `images.txt`, `points3D.txt`; for Gaussian splatting and MVS.
 
 COLMAP's camera looks along +z with y down (OpenCV), and a picture has the pose camera from world, as a
 quaternion (w, x, y, z) and a translation; pixel centres are at +0.5 as here. Pictures have no keypoints and

@@ -39,9 +39,10 @@ def export_asset(
         progress: called after each picture.
 
     Returns:
-        JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3] in
-        WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took);
-        `points`; `cameras`; `pictures`, `channels`; `inputs`.
+        JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
+        in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
+        `faces_asked`;
+        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop.
@@ -85,6 +86,7 @@ def _mesh(asset: Asset, target: Path, options: ExportOptions, name: str) -> tupl
         from exporters.simplify import simplify_mesh
 
         mesh = simplify_mesh(mesh, options.faces)
+        facts["faces_asked"] = options.faces
     moved = _in_frame(mesh, asset, options, name)
     data = {"ply": ply_bytes, "obj": obj_bytes, "glb": glb_bytes, "stl": stl_bytes}[name](moved)
     check_mesh_bytes(f".{name}", data, moved, str(target))

@@ -9,7 +9,7 @@
 | `normal.X .Y .Z` | colour | the density's, world frame, of unit length (`player.normals`) |
 | `opacity.V` | colour | A again, for programs that show a layer and not an alpha |
 | `samples.V` | float | density samples that the player took |
-| `features.00 ...` | colour | what the head was given: the sum of weight times feature, in units of the codes |
+| `features.00 ...` | colour | what the head was given: sum of weight times feature, in units of the codes |
 
 "colour" is half with `half=True`, else float. The depth is the MEAN of the distances along the ray, by
 compositing weight: between two surfaces that are both seen, it is between them. A pixel is met if its opacity

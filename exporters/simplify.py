@@ -1,7 +1,9 @@
 """Fewer faces: quadric edge collapse (Garland and Heckbert 1997) by Open3D, colours and normals kept.
 
-Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha: that is
-taken from the nearest vertex of the source.
+Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha: that
+is taken from the nearest vertex of the source. It stops early where every edge that is left would fold the
+surface: a mesh with many thin parts keeps more faces than were asked for (lego, 380,541 faces: 20,000 are
+reached, of 5,000 remain 11,721). The command says so.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ from player.errors import ConfigError, DataError, MissingExtraError
 
 
 def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
-    """The mesh with at most `n_faces` faces; itself if it has no more. The same mesh gives the same result.
+    """The mesh with `n_faces` faces, or as few as can be reached; itself if it has no more. The same mesh
+    gives the same result.
 
     Args:
         mesh: any mesh; parts that are not connected are simplified together.
