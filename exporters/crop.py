@@ -44,7 +44,7 @@ class CropBox:
         """[n] bool: which of the world points [n, 3] are in the box, its faces included (to 1e-6 of its size:
         what float32 does to a corner must not decide)."""
         local = (points - self.matrix[:3, 3]) @ self.matrix[:3, :3]
-        return (np.abs(local) <= self.size * (0.5 + 1e-6)).all(axis=-1)
+        return np.all(np.abs(local) <= self.size * (0.5 + 1e-6), axis=-1)
 
 
 def parse_crop(text: str) -> CropBox:
@@ -72,7 +72,7 @@ def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
     Raises ConfigError: none is inside; the message has the mesh's bounds.
     """
     inside = box.holds(mesh.vertices.astype(np.float64))
-    keep = inside[mesh.faces].all(axis=-1)
+    keep = np.all(inside[mesh.faces], axis=-1)
     if not keep.any():
         low, high = mesh.bounds.tolist()
         raise ConfigError(

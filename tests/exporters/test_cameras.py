@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from exporters import cli
+from exporters import cli, colmap
 from exporters.cameras import check_cameras, moved_cameras, transforms_bytes
 from exporters.colmap import colmap_files, quaternion, rotation_matrix
 from exporters.frames import FRAMES, frame_matrix
@@ -117,3 +118,16 @@ def test_parity() -> None:
         check_cameras([camera], [], "t.json", 0.0)
     with pytest.raises(ParityError, match="expected a 4x3, got a 8x6"):
         check_cameras([camera], [camera.resized(8, 6)], "t.json", 0.0)
+
+
+def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quaternion, a translation and a point that are not those of the source."""
+    camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
+    corners = box((0, 0, 0), (1, 1, 1))
+    monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))
+    with pytest.raises(ParityError, match=r"images\.txt: a: pose: 2 apart"):
+        colmap_files([camera], corners)
+    monkeypatch.undo()
+    monkeypatch.setattr(colmap, "_numbers", lambda values: " ".join(f"{value:.3f}" for value in values))
+    with pytest.raises(ParityError, match=r"points3D\.txt: expected 8 points as sampled"):
+        colmap_files([camera], replace(corners, vertices=corners.vertices + 1 / 3))
