@@ -61,7 +61,7 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    arguments = _parser().parse_args(_with_negative_crop(sys.argv[1:] if argv is None else argv))
+    arguments = _parser().parse_args(_joined_negatives(sys.argv[1:] if argv is None else argv))
     try:
         from exporters import export  # only now: `--help` needs no numpy
 
@@ -98,9 +98,7 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser(
         "vfr-export",
-        description=_DESCRIPTION.format(
-            files=table(FORMATS), folders=table({f"{k}": v for k, v in FOLDERS.items()})
-        ),
+        description=_DESCRIPTION.format(files=table(FORMATS), folders=table(FOLDERS)),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -122,16 +120,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _with_negative_crop(argv: list[str]) -> list[str]:
+def _joined_negatives(argv: list[str]) -> list[str]:
     """`--crop -1,0,...` as one word: argparse takes what begins with a minus for an option.
 
-    >>> _with_negative_crop(["out", "--crop", "-1,0,0,1,1,1", "a.ply"])
-    ['out', '--crop=-1,0,0,1,1,1', 'a.ply']
+    >>> _joined_negatives(["out", "--crop", "-.5,0,0,1,1,1", "a.ply", "--views", "-3:", "--force"])
+    ['out', '--crop=-.5,0,0,1,1,1', 'a.ply', '--views=-3:', '--force']
     """
     words = list(argv)
     for index in range(len(words) - 2, -1, -1):
-        if words[index] == "--crop" and words[index + 1][:2].strip("-")[:1].isdigit():
-            words[index : index + 2] = [f"--crop={words[index + 1]}"]
+        value = words[index + 1]
+        if words[index] in ("--crop", "--views") and value[:1] == "-" and value[1:2] in set(".0123456789"):
+            words[index : index + 2] = [f"{words[index]}={value}"]
     return words
 
 
