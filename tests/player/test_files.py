@@ -280,7 +280,7 @@ def test_target_in_a_file_or_a_read_only_folder(tmp_path: Path, monkeypatch: pyt
         check_target(tmp_path / "file" / "a" / "b.png")
     check_target(tmp_path / "a" / "b.png")
     monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)
-    with pytest.raises(OutputError, match="the folder .* is read-only"):
+    with pytest.raises(OutputError, match=r"the folder .* is read-only"):
         check_target(tmp_path / "a" / "b.png")
     monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != "file")
     with pytest.raises(OutputError, match="file: cannot write: it is read-only"):
