@@ -1,4 +1,4 @@
-"""`vfr-export ASSET FILE`: one file for another tool out of a baked asset; the suffix picks the format."""
+"""`vfr-export ASSET FILE`: files for other tools out of a baked asset; the suffix picks the format."""
 
 from __future__ import annotations
 
@@ -6,33 +6,54 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
-from player.errors import ConfigError, VfrError
-
-FORMATS = {
-    ".ply": "binary PLY; colours are sRGB bytes; the axes of the photographs' world (Blender's: Z up)",
-    ".obj": "Wavefront OBJ, `v x y z r g b` in sRGB; the same axes",
-    ".glb": "binary glTF 2.0; linear COLOR_0, unlit material; turned to Y up: (x, y, z) -> (x, z, -y)",
-}
+from exporters.formats import FOLDERS, FORMATS, POINTS, ExportOptions
+from player.errors import VfrError
 
 _DESCRIPTION = """\
-Write the mesh of a baked asset as one file for another program.
+Write a baked asset, or a part of it, for another program.
 
 The suffix of FILE picks the format:
-  {formats}
+  {files}
 
-Positions are in the units and axes of the world that the cameras of the data set are in, like the asset's
-own mesh.ply. Nothing is half written: FILE appears when it is complete and checked.
+Two formats are folders, and have to be named:
+  {folders}
+
+Places are in the world that the cameras of the data set are in, with its unit, unless --frame says otherwise.
+What is written is read back and compared before its name appears: nothing is half written.
 """
 
 _EPILOG = """\
-examples:
-  vfr-export out/ scene.glb             for Blender, Unreal, Unity, three.js
-  vfr-export out/ scene.ply --force     for MeshLab, CloudCompare, Open3D; replaces the file
-  vfr-export out/ scene.obj --json      and a summary for another program
+meshes and points:
+  vfr-export out/ scene.glb                          for Blender, Unreal, Unity, three.js
+  vfr-export out/ scene.obj --frame blender          Y up, as Blender's OBJ importer expects
+  vfr-export out/ scene.ply --faces 100000           fewer faces, colours kept
+  vfr-export out/ part.stl --crop 0,0,0.5,1,1,1      a box of 1 x 1 x 1 around (0, 0, 0.5)
+  vfr-export out/ part.stl --crop 0,0,0.5,2,1,1,30   the same, 2 long, turned by 30 degrees about Z
+  vfr-export out/ part.stl --crop box.json           {"matrix": 4 x 4 world from box, "size": [W, D, H]}
+  vfr-export out/ points.ply --points 200000         a point cloud with normals and colours
+
+cameras:
+  vfr-export out/ cameras.json --frame gltf          transforms.json, turned as the mesh is
+  vfr-export out/ sparse/ --format colmap            for Gaussian splatting, MVS
+
+pictures:
+  vfr-export out/ frames/ --format exr --cameras transforms_test.json
+  vfr-export out/ frames/ --format exr --views 0:10 --size 800x600 --half
+
+the head:
+  vfr-export out/ head.onnx                          features, dirs -> rgb
+  vfr-export out/ head.onnx --decode                 codes, weights, dirs -> rgb
+
+frames of --frame:
+  world    the photographs' (GLB files are turned to Y up in every frame, because glTF is)
+  model    the field's own, its box is -1..1
+  gltf     the world turned to Y up: (x, y, z) -> (x, z, -y)
+  blender  so that Blender's importers, left as they are, show the world: OBJ and GLB Y up, others Z up
 
 In Blender: PLY and GLB bring a colour attribute; show it with Viewport Shading > Color > Attribute, render it
-with a Color Attribute node.
+with a Color Attribute node. docs/exports.md has the layers of the pictures, and more programs.
 
 exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted
 """
@@ -40,79 +61,126 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_args(_joined_negatives(sys.argv[1:] if argv is None else argv))
     try:
-        summary = export_mesh(arguments.asset, arguments.file, arguments.force)
+        from exporters import export  # only now: `--help` needs no numpy
+
+        summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), _bar)
     except VfrError as error:
         print(f"vfr-export: error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("vfr-export: interrupted", file=sys.stderr)
         return 130
-    if arguments.json:
-        print(json.dumps(summary))
-    else:
-        print(
-            f"{summary['file']}: {summary['vertices']} vertices, {summary['faces']} faces, "
-            f"{summary['bytes'] / 1e6:.1f} MB, "
-            f"bounds {_corner(summary['bounds'][0])} to {_corner(summary['bounds'][1])}"
-        )
+    print(json.dumps(summary) if arguments.json else _sentence(summary))
     return 0
 
 
-def export_mesh(asset_path: Path, target: Path, force: bool = False) -> dict:
-    """Write the mesh of the asset in `asset_path` to `target` and describe it.
-
-    Returns:
-        `file`, `format`, `vertices`, `faces`, `bytes`, and `bounds` [2][3] in world units and the asset's own
-        (Z up) axes.
-
-    Raises:
-        ConfigError: the suffix names no format.
-        OutputError: the target exists and `force` is not set, or cannot be written.
-        FormatError: the asset or its mesh is damaged.
-        ParityError: the bytes do not hold the mesh.
-    """
-    suffix = target.suffix.lower()
-    if suffix not in FORMATS:
-        raise ConfigError(f"{target}: suffix: expected one of {', '.join(FORMATS)}, got {suffix or 'none'}")
-    from player.files import check_target, write_bytes
-
-    check_target(target, force)
-    from exporters.glb import glb_bytes
-    from exporters.obj import obj_bytes
-    from exporters.parity import check_mesh_bytes
-    from exporters.ply import ply_bytes, read_ply
-    from player.asset import Asset
-
-    # In the world's frame already: whoever opens mesh.ply itself sees the right place and size too.
-    mesh = read_ply(Asset.open(asset_path, verify=True).path("mesh.ply"))
-    data = {".ply": ply_bytes, ".obj": obj_bytes, ".glb": glb_bytes}[suffix](mesh)
-    check_mesh_bytes(suffix, data, mesh, str(target))
-    write_bytes(target, data)
-    return {
-        "file": str(target),
-        "format": suffix[1:],
-        "vertices": len(mesh.vertices),
-        "faces": len(mesh.faces),
-        "bytes": len(data),
-        "bounds": mesh.bounds.tolist() if len(mesh.vertices) else [[0.0] * 3] * 2,
-    }
+def _options(arguments: argparse.Namespace) -> ExportOptions:
+    return ExportOptions(
+        format=arguments.format,
+        frame=arguments.frame,
+        crop=arguments.crop,
+        faces=arguments.faces,
+        points=arguments.points,
+        cameras=arguments.cameras,
+        views=arguments.views,
+        size=arguments.size,
+        half=arguments.half,
+        decode=arguments.decode,
+        force=arguments.force,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
-    formats = "\n  ".join(f"{suffix}  {text}" for suffix, text in FORMATS.items())
+    def table(rows: dict[str, str]) -> str:
+        return "\n  ".join(f"{name:8}{text}" for name, text in rows.items())
+
     parser = argparse.ArgumentParser(
         "vfr-export",
-        description=_DESCRIPTION.format(formats=formats),
+        description=_DESCRIPTION.format(files=table(FORMATS), folders=table(FOLDERS)),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
-    parser.add_argument("file", type=Path, metavar="FILE", help="file to write: " + ", ".join(FORMATS))
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    parser.add_argument("--json", action="store_true", help="print the summary as one line of JSON")
+    add = parser.add_argument
+    add("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
+    add("file", type=Path, metavar="FILE", help="file or folder to write: " + ", ".join(FORMATS) + ", DIR/")
+    add("--format", metavar="NAME", help="exr or colmap for a folder; or a suffix without its dot")
+    add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
+    add("--crop", metavar="X,Y,Z,W,D,H[,YAW]", help="only what is in this box of the world; or a .json file")
+    add("--faces", type=int, metavar="N", help="simplify the mesh to N faces, or as few as can be reached")
+    add("--points", type=int, metavar="N", help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})")
+    add("--cameras", type=Path, metavar="FILE", help="views of a transforms.json (the training cameras)")
+    add("--views", type=_slice, metavar="A:B", help="a slice of the views, as in Python")
+    add("--size", type=_size, metavar="WxH", help="size of the pictures (the cameras' own)")
+    add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
+    add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
+    add("--force", action="store_true", help="replace FILE if it exists")
+    add("--json", action="store_true", help="print the summary as one line of JSON")
     return parser
+
+
+def _joined_negatives(argv: list[str]) -> list[str]:
+    """`--crop -1,0,...` as one word: argparse takes what begins with a minus for an option.
+
+    >>> _joined_negatives(["out", "--crop", "-.5,0,0,1,1,1", "a.ply", "--views", "-3:", "--force"])
+    ['out', '--crop=-.5,0,0,1,1,1', 'a.ply', '--views=-3:', '--force']
+    """
+    words = list(argv)
+    for index in range(len(words) - 2, -1, -1):
+        value = words[index + 1]
+        if words[index] in ("--crop", "--views") and value[:1] == "-" and value[1:2] in set(".0123456789"):
+            words[index : index + 2] = [f"{words[index]}={value}"]
+    return words
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, height = (int(part) for part in text.lower().split("x"))
+    if min(width, height) < 1:
+        raise ValueError
+    return width, height
+
+
+def _slice(text: str) -> slice:
+    """A slice as Python writes it; one number is one view.
+
+    >>> _slice("0:40"), _slice("-1")
+    (slice(0, 40, None), slice(-1, None, None))
+    """
+    parts = [int(part) if part.strip() else None for part in text.split(":")]
+    if len(parts) == 1 and parts[0] is not None:
+        return slice(parts[0], parts[0] + 1 or None)
+    if not 2 <= len(parts) <= 3 or (len(parts) == 3 and parts[2] == 0):
+        raise ValueError
+    return slice(*parts)
+
+
+def _bar(done: int, total: int) -> None:
+    """A progress bar on stderr, if that is a terminal."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r[{'#' * (24 * done // total):24}] picture {done}/{total}")
+        sys.stderr.write("\n" if done == total else "")
+        sys.stderr.flush()
+
+
+def _sentence(summary: dict[str, Any]) -> str:
+    counts = [f"{summary[key]} {key}" for key in ("pictures", "cameras", "vertices", "faces", "points")
+              if key in summary]  # fmt: skip
+    if "channels" in summary:
+        counts.append(f"{len(summary['channels'])} channels")
+    if "inputs" in summary:
+        counts.append(f"{', '.join(summary['inputs'])} -> {', '.join(summary['outputs'])}")
+    parts = [*counts, f"{summary['bytes'] / 1e6:.1f} MB"]
+    if "bounds" in summary:
+        low, high = summary["bounds"]
+        parts.append(f"bounds {_corner(low)} to {_corner(high)}")
+    if summary.get("frame", "world") != "world":
+        parts.append(f"written in the frame {summary['frame']}")
+    if summary.get("faces", 0) > summary.get("faces_asked", float("inf")):
+        parts.append(f"{summary['faces_asked']} were asked for, but no other edge can go without a fold")
+    if "removed" in summary:
+        parts.append(f"the crop removed {summary['removed']:.1%} of the faces")
+    return f"{summary['file']}: {', '.join(parts)}"
 
 
 def _corner(corner: list[float]) -> str:

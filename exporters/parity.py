@@ -1,62 +1,126 @@
-"""Does a written mesh hold what it was written from? Counts and bounds, read from the bytes and compared
-before any rename.
+"""Does a written mesh hold what it was written from? Every number is read from the bytes and compared, before
+any rename.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from exporters.colour import linear_from_srgb
 from exporters.glb import parse_glb, y_up
 from exporters.mesh import TriangleMesh
 from exporters.ply import parse_ply
+from exporters.points import parse_points
+from exporters.stl import parse_stl
 from player.errors import ParityError
 
 
-def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -> None:
-    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb) file, has other counts or
-    bounds than `mesh`.
+class _Arrays(NamedTuple):
+    """What a file holds, in the file's own axes."""
 
-    Bounds may differ by what the format rounds: float32 for PLY and GLB, nine digits for OBJ.
+    vertices: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+    """[n, 3 or 4], 0..1: sRGB, in a GLB linear."""
+    faces: np.ndarray
+
+
+COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6}
+"""Half a step of what the format writes: bytes, four decimals, 16 bits."""
+
+
+def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -> None:
+    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl) file, does not hold
+    `mesh`: counts, places, normals, colours, faces; of an STL, which has no vertices, the corners.
+
+    Places may differ by what the format rounds: float32 for PLY, GLB and STL, nine digits for OBJ. The
+    message names the worst.
     """
-    n_vertices, n_faces, bounds = {".ply": _ply, ".obj": _obj, ".glb": _glb}[suffix](data, where)
-    for name, expected, got in (
-        ("vertices", len(mesh.vertices), n_vertices),
-        ("faces", len(mesh.faces), n_faces),
-    ):
-        if expected != got:
-            raise ParityError(f"{where}: {name}: expected {expected}, got {got}")
-    expected = y_up(mesh.vertices) if suffix == ".glb" else mesh.vertices
-    if not len(expected):
+    if suffix == ".stl":
+        corners = parse_stl(data, where)["corners"].reshape(-1, 3)
+        _check_rows(where, "corners", mesh.vertices[mesh.faces].reshape(-1, 3), corners, _rounding(mesh))
         return
-    expected = np.stack([expected.min(0), expected.max(0)])
-    tolerance = 2e-7 * max(float(np.abs(expected).max()), 1e-30)
-    worst = float(np.abs(expected - bounds).max())
-    if not worst <= tolerance:
+    got = {".ply": _ply, ".obj": _obj, ".glb": _glb}[suffix](data, where)
+    n_colours = got.colours.shape[1]
+    colours = mesh.colours[:, :n_colours] / 255
+    vertices, normals = mesh.vertices, mesh.normals
+    if suffix == ".glb":
+        vertices, normals = y_up(vertices), y_up(normals)
+        colours[:, :3] = linear_from_srgb(colours[:, :3])
+    if len(mesh.faces) != len(got.faces):
+        raise ParityError(f"{where}: faces: expected {len(mesh.faces)}, got {len(got.faces)}")
+    _check_rows(where, "vertices", vertices, got.vertices, _rounding(mesh))
+    _check_rows(where, "normals", normals, got.normals, 1e-6)
+    _check_rows(where, "colours", colours, got.colours, COLOUR_TOLERANCE[suffix])
+    _check_rows(where, "faces", mesh.faces, got.faces, 0.0)
+
+
+def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
+    """Raises ParityError if `data`, the content of a point cloud's PLY, holds other points than `cloud`."""
+    points = parse_points(data, where)
+    _check_rows(where, "points", cloud.vertices, points["position"], _rounding(cloud))
+    _check_rows(where, "normals", cloud.normals, points["normal"], 1e-6)
+    _check_rows(where, "colours", cloud.colours, points["colour"], 0.0)
+
+
+def _rounding(mesh: TriangleMesh) -> float:
+    """What float32, and nine digits, may move the largest coordinate."""
+    return 2e-7 * max(float(np.abs(mesh.vertices).max(initial=0)), 1e-30)
+
+
+def _check_rows(where: str, what: str, expected: np.ndarray, got: np.ndarray, tolerance: float) -> None:
+    if expected.shape != got.shape:
+        raise ParityError(f"{where}: {what}: expected {len(expected)}, got {len(got)}")
+    apart = np.abs(expected - got.astype(np.float64)).max(axis=-1, initial=0)
+    if not (apart <= tolerance).all():
+        row = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
         raise ParityError(
-            f"{where}: bounds: expected {expected.tolist()}, got {bounds.tolist()}: "
-            f"{worst:g} apart, tolerance {tolerance:g}"
+            f"{where}: {what}: number {row}: expected {expected[row].tolist()}, got {got[row].tolist()}: "
+            f"{apart[row]:g} apart, tolerance {tolerance:g}"
         )
 
 
-def _ply(data: bytes, where: str) -> tuple[int, int, np.ndarray]:
+def _ply(data: bytes, where: str) -> _Arrays:
     mesh = parse_ply(data, where)
-    return len(mesh.vertices), len(mesh.faces), mesh.bounds.astype(np.float64)
+    return _Arrays(mesh.vertices, mesh.normals, mesh.colours / 255, mesh.faces)
 
 
-def _obj(data: bytes, where: str) -> tuple[int, int, np.ndarray]:
-    start, normals = data.find(b"\nv "), data.find(b"\nvn ")
-    rows = np.fromstring(data[start:normals].replace(b"v", b"").decode(), sep=" ").reshape(-1, 6)
-    return len(rows), data.count(b"\nf "), np.stack([rows[:, :3].min(0), rows[:, :3].max(0)])
+def _obj(data: bytes, where: str) -> _Arrays:
+    first, normals, faces = (data.find(start) for start in (b"\nv ", b"\nvn ", b"\nf "))
+    end = len(data)
+    faces = faces if faces >= 0 else end
+    normals = normals if normals >= 0 else faces
+    first = first if first >= 0 else normals
+
+    def numbers(part: bytes, letters: list[bytes], width: int) -> np.ndarray:
+        for letter in letters:
+            part = part.replace(letter, b" ")
+        return np.fromstring(part.decode(), sep=" ").reshape(-1, width)
+
+    rows = numbers(data[first:normals], [b"v"], 6)
+    corners = numbers(data[faces:], [b"f", b"//"], 6)
+    if not np.array_equal(corners[:, ::2], corners[:, 1::2]):
+        raise ParityError(f"{where}: faces: expected the normals of their vertices, got others")
+    turned = numbers(data[normals:faces], [b"vn"], 3)
+    return _Arrays(rows[:, :3], turned, rows[:, 3:], corners[:, ::2].astype(np.int64) - 1)
 
 
-def _glb(data: bytes, where: str) -> tuple[int, int, np.ndarray]:
+def _glb(data: bytes, where: str) -> _Arrays:
     document, buffer = parse_glb(data, where)
     primitive = document["meshes"][0]["primitives"][0]
-    position = document["accessors"][primitive["attributes"]["POSITION"]]
-    indices = document["accessors"][primitive["indices"]]
-    view = document["bufferViews"][position["bufferView"]]
-    values = np.frombuffer(buffer, "<f4", 3 * position["count"], view["byteOffset"]).reshape(-1, 3)
-    bounds = np.stack([values.min(0), values.max(0)]).astype(np.float64)
-    if bounds.tolist() != [position["min"], position["max"]]:
-        raise ParityError(f"{where}: POSITION: min and max: expected {bounds.tolist()}, got {position}")
-    return position["count"], indices["count"] // 3, bounds
+
+    def read(index: int, kind: str, width: int) -> np.ndarray:
+        accessor = document["accessors"][index]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        count = accessor["count"] * (1 if accessor["type"] == "SCALAR" else width)
+        return np.frombuffer(buffer, kind, count, start).reshape(-1, width)
+
+    names = primitive["attributes"]
+    vertices = read(names["POSITION"], "<f4", 3)
+    position = document["accessors"][names["POSITION"]]
+    if [vertices.min(0).tolist(), vertices.max(0).tolist()] != [position["min"], position["max"]]:
+        raise ParityError(f"{where}: POSITION: min and max: expected those of its numbers, got {position}")
+    colours = read(names["COLOR_0"], "<u2", 4) / 65535
+    return _Arrays(vertices, read(names["NORMAL"], "<f4", 3), colours, read(primitive["indices"], "<u4", 3))

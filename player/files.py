@@ -13,13 +13,25 @@ from player.errors import OutputError
 
 
 def check_target(path: Path, force: bool = False) -> None:
-    """Refuse a target that exists, unless `force`; called before long work, so that nobody waits for a
-    refusal.
+    """Refuse a target that exists, unless `force`, or that cannot be written because it or its folder is
+    read-only; called before long work, so that nobody waits for a refusal.
 
     >>> check_target(Path("surely/not/there.png"))
     """
-    if path.exists() and not force:
-        raise OutputError(f"{path}: already exists: add --force to replace it")
+    try:
+        if path.exists() and not force:
+            raise OutputError(f"{path}: already exists: add --force to replace it")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise OutputError(f"{path}: cannot write: it is read-only")
+        above = next(parent for parent in path.absolute().parents if parent.exists())
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+    if not above.is_dir():
+        raise OutputError(f"{path}: cannot write: {above} is a file, not a folder")
+    if not os.access(above, os.W_OK):
+        raise OutputError(f"{path}: cannot write: the folder {above} is read-only")
 
 
 def write_bytes(path: Path, data: bytes) -> None:

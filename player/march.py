@@ -78,7 +78,7 @@ def march(
     """
     n_rays = len(rays_o)
     entries = enter_box(grid, rays_o, rays_d)
-    samples, tau, counts = _collect(grid, entries, bounds)
+    samples, tau, counts = collect_samples(grid, entries, bounds)
     opacity = -np.expm1(-tau)
     heavy = samples.weights.astype(np.float64)
     total = np.bincount(samples.ray, heavy, n_rays)
@@ -90,10 +90,11 @@ def march(
     return MarchResult(opacity, depth, counts, hits, features)
 
 
-def _collect(
+def collect_samples(
     grid: SparseGrid, entries: Entries, bounds: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[Samples, np.ndarray, np.ndarray]:
-    """All rays in step: a ray in an empty brick jumps, a ray in another takes a chunk of the lattice.
+    """The samples of rays, all of them in step: a ray in an empty brick jumps, a ray in another takes a chunk
+    of the lattice.
 
     Returns the samples, and for each ray tau and the number of samples taken.
     """

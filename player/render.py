@@ -22,6 +22,7 @@ from player.cameras import Camera
 from player.errors import ConfigError, MissingExtraError
 from player.head import Head
 from player.march import MarchResult
+from player.normals import composited_normals
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
@@ -48,6 +49,12 @@ class Frame:
     """[h, w] int32, density samples taken."""
     background: Background
     """What is behind, or "transparent"."""
+    features: np.ndarray | None = None
+    """[h, w, n_channels] float32, what the head was given (in units of the codes), 0 where it was not run;
+    None unless asked for with `layers`."""
+    normals: np.ndarray | None = None
+    """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.normals`); None unless asked for with
+    `layers`."""
 
     def to_uint8(self) -> np.ndarray:
         """[h, w, 3], or [h, w, 4] with straight alpha if transparent; values rounded to the nearest level."""
@@ -94,7 +101,11 @@ class Renderer:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def render(
-        self, camera: Camera, n_samples: int | None = None, background: Background | None = None
+        self,
+        camera: Camera,
+        n_samples: int | None = None,
+        background: Background | None = None,
+        layers: bool = False,
     ) -> Frame:
         """One picture.
 
@@ -102,6 +113,8 @@ class Renderer:
             camera: in the WORLD frame.
             n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
             background: colour 0..1 or "transparent"; the asset's own if None.
+            layers: fill in the frame's `features` and `normals` too, at the cost of a second march; the
+                picture is the same.
 
         Raises:
             ConfigError: a picture over MAX_PIXELS, or n_samples out of range.
@@ -119,7 +132,9 @@ class Renderer:
         rgb[:] = behind
         opacity, depth = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.float32)
         counts = np.zeros(n_pixels, np.int32)
-        frame = Frame(rgb, opacity, depth, counts, background)
+        features = np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None
+        normals = np.zeros((n_pixels, 3), np.float32) if layers else None
+        frame = Frame(rgb, opacity, depth, counts, background, features, normals)
         model_camera = camera.transformed(self._model_from_world)
         near, far = block_bounds(self._grid, model_camera)
         blocks = np.flatnonzero(far >= near)
@@ -141,6 +156,8 @@ class Renderer:
             depth.reshape(shape),
             counts.reshape(shape),
             background,
+            None if features is None else features.reshape(*shape, -1),
+            None if normals is None else normals.reshape(*shape, 3),
         )
 
     def _task(
@@ -155,6 +172,11 @@ class Renderer:
         frame.opacity[index] = result.opacity
         frame.depth[index] = result.depth * np.float32(self.asset.scale)
         frame.n_samples[index] = result.n_samples
+        if frame.features is not None:
+            frame.features[index[result.hits]] = result.features
+        if frame.normals is not None:
+            rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
+            frame.normals[index] = composited_normals(self._grid, rays_o, rays_d, bounds) @ rotation.T
         rgb = self._head(result.features, rays_d[result.hits])
         if frame.background == "transparent":
             frame.rgb[index[result.hits]] = rgb

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporters import cli
+from exporters import cli, export
 from exporters.glb import parse_glb
 from exporters.ply import ply_bytes, read_ply
 from player.asset import GridArrays, write_asset
@@ -92,7 +92,9 @@ def test_existing_target(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_unknown_suffix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(tmp_path), str(tmp_path / "mesh.fbx")]) == 1
-    assert "suffix: expected one of .ply, .obj, .glb, got .fbx" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "suffix: expected one of .ply, .obj, .glb, .stl, .json, .onnx, or a folder with --format" in error
+    assert error.endswith("exr or colmap, got .fbx\n")
     assert cli.main([str(tmp_path), str(tmp_path / "mesh")]) == 1
     assert "got none" in capsys.readouterr().err
 
@@ -124,7 +126,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*arguments: object) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "export_mesh", interrupt)
+    monkeypatch.setattr(export, "export_asset", interrupt)
     assert cli.main([str(tmp_path), "mesh.glb"]) == 130
 
 
@@ -138,4 +140,4 @@ def test_help_needs_no_numpy() -> None:
     """So it is quick: importing numpy is most of what a start costs."""
     program = "import sys; sys.modules['numpy'] = None; from exporters.cli import main; main(['--help'])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert all(suffix in done.stdout for suffix in cli.FORMATS)
+    assert all(name in done.stdout for name in (*cli.FORMATS, *cli.FOLDERS))

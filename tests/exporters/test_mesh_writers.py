@@ -205,6 +205,10 @@ def test_limits() -> None:
     empty = TriangleMesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0], mesh.colours[:0])
     assert len(parse_ply(ply_bytes(empty), "empty.ply").vertices) == 0
     assert obj_bytes(empty).decode().count("\n") == 1
+    check_mesh_bytes(".obj", obj_bytes(empty), empty, "empty.obj")
+    check_mesh_bytes(
+        ".obj", obj_bytes(replace(mesh, faces=mesh.faces[:0])), replace(mesh, faces=mesh.faces[:0]), "a.obj"
+    )
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
@@ -214,5 +218,18 @@ def test_parity(suffix: str) -> None:
     check_mesh_bytes(suffix, data, mesh, "mesh")
     with pytest.raises(ParityError, match="faces: expected 89, got 90"):
         check_mesh_bytes(suffix, data, replace(mesh, faces=mesh.faces[:-1]), "mesh")
-    with pytest.raises(ParityError, match="bounds"):
+    with pytest.raises(ParityError, match="vertices: number"):
         check_mesh_bytes(suffix, data, replace(mesh, vertices=mesh.vertices + 1e-4), "mesh")
+    inner = mesh.vertices.copy()  # the bounds stay
+    place = int(np.argmin(np.abs(inner).max(axis=-1)))
+    inner[place] += 1e-3
+    with pytest.raises(ParityError, match=f"vertices: number {place}: expected"):
+        check_mesh_bytes(suffix, data, replace(mesh, vertices=inner), "mesh")
+    colours = mesh.colours.copy()
+    colours[7, 1] ^= 255
+    with pytest.raises(ParityError, match="colours: number 7: expected"):
+        check_mesh_bytes(suffix, data, replace(mesh, colours=colours), "mesh")
+    with pytest.raises(ParityError, match="normals: number"):
+        check_mesh_bytes(suffix, data, replace(mesh, normals=-mesh.normals), "mesh")
+    with pytest.raises(ParityError, match="faces: number"):
+        check_mesh_bytes(suffix, data, replace(mesh, faces=mesh.faces[:, ::-1].copy()), "mesh")

@@ -271,3 +271,17 @@ def test_permissions_are_those_of_anything_new(mask: int, tmp_path: Path) -> Non
         assert os.umask(mask) == mask  # asking for it did not change it
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "plain").stat().st_mode
     assert (tmp_path / "folder").stat().st_mode == (tmp_path / "plain folder").stat().st_mode
+
+
+def test_target_in_a_file_or_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused before any work; `os.access` answers as it does to anyone but root."""
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="file is a file, not a folder"):
+        check_target(tmp_path / "file" / "a" / "b.png")
+    check_target(tmp_path / "a" / "b.png")
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)
+    with pytest.raises(OutputError, match=r"the folder .* is read-only"):
+        check_target(tmp_path / "a" / "b.png")
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != "file")
+    with pytest.raises(OutputError, match="file: cannot write: it is read-only"):
+        check_target(tmp_path / "file", force=True)

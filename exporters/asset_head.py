@@ -1,0 +1,180 @@
+"""The head of an asset as an ONNX file for other programs: alone, or with the decode of features in front.
+
+| graph | inputs | output |
+|---|---|---|
+| alone | `features` float [n, n_channels], `dirs` float [n, 3] | `rgb` float [n, 3] |
+| with decode | `codes` int8 [n, k, n_channels], `weights` float [n, k], `dirs` float [n, 3] | the same |
+
+n, and k, are free. `features` are the sum of weight times code that a player composes; the scales of the
+codes are in the head's first layer since the asset was baked. With the decode, `codes` are k rows of
+features.npy and `weights` what each counts, compositing weight times the share of a corner: `features = sum_k
+weights codes` is part of the graph. `dirs` are unit, model frame, from the camera into the scene; `rgb` is
+0..1 in the asset's colour space, to be composed as `rgb A + (1 - A) background`.
+
+The file's metadata records the opset, the names, and what was compared and how far it was apart.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from player.asset import Asset
+from player.errors import FormatError, MissingExtraError, ParityError
+from player.head import Head
+
+TOLERANCE = 1e-6
+"""Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
+float32, so that only another order of float32 additions is allowed for."""
+
+N_FETCHES = 5
+"""k of the comparison."""
+
+
+def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> bytes:
+    """The file's content; the same asset gives the same bytes.
+
+    Checked by `onnx.checker`, run in onnxruntime, and compared with `player.head.Head` on random and extreme
+    inputs.
+
+    Args:
+        asset: an open asset.
+        decode: take codes and weights instead of composited features.
+        where: the file's name in error messages.
+
+    Raises:
+        FormatError: the asset's head is no valid ONNX.
+        ParityError: colours differ from the asset's own head.
+        MissingExtraError: the package `onnx` is not installed.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise MissingExtraError("ONNX: needs the package onnx: pip install 'vfr-bake[export]'") from error
+    source = asset.path("head.onnx")
+    Head(source, asset.manifest.n_channels)  # a head that does not open has its own message
+    model = onnx.load_from_string(source.read_bytes())
+    if decode:
+        _put_decode_in_front(onnx, model, asset.manifest.n_channels)
+    del model.metadata_props[:]
+    worst = _compare(asset, model.SerializeToString(deterministic=True), decode, where)
+    notes = {
+        "vfr.opset": str(
+            max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))
+        ),
+        "vfr.inputs": ", ".join(value.name for value in model.graph.input),
+        "vfr.outputs": "rgb",
+        "vfr.colour_space": asset.manifest.colour_space,
+        "vfr.layers": "int8" if any(n.op_type == "DequantizeLinear" for n in model.graph.node) else "float32",
+        "vfr.compared_with": "the asset's own head in onnxruntime, random and extreme inputs",
+        "vfr.tolerance": f"{TOLERANCE:g}",
+        "vfr.worst_difference": f"{worst:.3g}",
+    }
+    for key, value in sorted(notes.items()):
+        model.metadata_props.add(key=key, value=value)
+    try:
+        onnx.checker.check_model(model, full_check=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        raise FormatError(f"{where}: expected a valid ONNX graph: {str(error).splitlines()[0]}") from error
+    data = model.SerializeToString(deterministic=True)
+    _compare(asset, data, decode, where)
+    return data
+
+
+def _put_decode_in_front(onnx: Any, model: Any, n_channels: int) -> None:
+    """`features = squeeze(weights [n, 1, k] @ codes [n, k, c])`, instead of the input `features`."""
+    helper, graph = onnx.helper, model.graph
+    taken = {name for node in graph.node for name in (*node.input, *node.output)}
+    taken |= {tensor.name for tensor in graph.initializer}
+    assert not taken & {"codes", "weights", "decode_axis"}, "a head from elsewhere"
+    axis = onnx.numpy_helper.from_array(np.array([1], np.int64), "decode_axis")
+    nodes = [
+        helper.make_node("Cast", ["codes"], ["decode_codes"], "decode_codes", to=onnx.TensorProto.FLOAT),
+        helper.make_node("Unsqueeze", ["weights", "decode_axis"], ["decode_weights"], "decode_weights"),
+        helper.make_node("MatMul", ["decode_weights", "decode_codes"], ["decode_sum"], "decode_sum"),
+        helper.make_node("Squeeze", ["decode_sum", "decode_axis"], ["features"], "features"),
+    ]
+    old = list(graph.node)
+    del graph.node[:]
+    graph.node.extend([*nodes, *old])
+    graph.initializer.append(axis)
+    inputs = [
+        helper.make_tensor_value_info("codes", onnx.TensorProto.INT8, ["n", "k", n_channels]),
+        helper.make_tensor_value_info("weights", onnx.TensorProto.FLOAT, ["n", "k"]),
+        *(value for value in graph.input if value.name != "features"),
+    ]
+    del graph.input[:]
+    graph.input.extend(inputs)
+
+
+def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
+    """The largest difference of rgb to the asset's own head; ParityError over TOLERANCE."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+    worst = 0.0
+    for label, features, codes, weights, dirs in comparisons(asset.manifest.n_channels):
+        if decode and codes is None:
+            continue
+        inputs = {"codes": codes, "weights": weights} if decode else {"features": features}
+        got = np.asarray(session.run(["rgb"], {**inputs, "dirs": dirs})[0])
+        expected = head(features, dirs)
+        if got.shape != expected.shape:
+            raise ParityError(f"{where}: rgb, {label}: expected {expected.shape}, got {got.shape}")
+        if not len(got):
+            continue
+        difference = np.abs(got.astype(np.float64) - expected)
+        difference[np.isnan(got) & np.isnan(expected)] = 0  # beyond float32 both say so
+        if not (difference <= TOLERANCE).all():
+            pixel = int(np.argmax(np.where(np.isnan(difference), np.inf, difference).max(axis=-1)))
+            raise ParityError(
+                f"{where}: rgb, {label}: pixel {pixel}: expected {expected[pixel].tolist()}, "
+                f"got {got[pixel].tolist()}, tolerance {TOLERANCE:g}"
+            )
+        worst = max(worst, float(difference.max()))
+    return worst
+
+
+Comparison = tuple[str, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]
+"""Label, features [n, c], codes [n, k, c] and weights [n, k] that make them (or None), dirs [n, 3]."""
+
+
+def comparisons(n_channels: int) -> list[Comparison]:
+    """Random and extreme inputs. Weights are multiples of 1/64 and codes integers, so that every order of
+    addition gives the same float32 features: an 8-bit layer would turn a last bit into a whole level."""
+    random = np.random.default_rng(0)
+
+    def unit(n: int) -> np.ndarray:
+        dirs = random.normal(size=(n, 3))
+        dirs[:6] = np.concatenate([np.eye(3), -np.eye(3)])[: min(n, 6)]
+        return (dirs / np.linalg.norm(dirs, axis=-1, keepdims=True)).astype(np.float32)
+
+    def coded(label: str, codes: np.ndarray, weights: np.ndarray) -> Comparison:
+        features = np.einsum("nk,nkc->nc", weights, codes.astype(np.float64)).astype(np.float32)
+        return label, features, codes.astype(np.int8), weights.astype(np.float32), unit(len(codes))
+
+    def plain(label: str, features: np.ndarray) -> Comparison:
+        return label, features.astype(np.float32), None, None, unit(len(features))
+
+    n = 300
+    shape = (n, N_FETCHES, n_channels)
+    shares = random.multinomial(64, [1 / (N_FETCHES + 1)] * (N_FETCHES + 1), n)[:, :N_FETCHES] / 64
+    signs = np.where(random.random((n, n_channels)) < 0.5, -1.0, 1.0)
+    return [
+        coded("no pixel", np.zeros((0, *shape[1:])), np.zeros((0, N_FETCHES))),
+        coded("one pixel", random.integers(-128, 128, (1, *shape[1:])), shares[:1]),
+        coded("random", random.integers(-128, 128, shape), shares),
+        coded("one fetch", random.integers(-128, 128, (n, 1, n_channels)), np.ones((n, 1))),
+        coded("no light", random.integers(-128, 128, shape), np.zeros((n, N_FETCHES))),
+        coded("lowest codes", np.full(shape, -128), np.full((n, N_FETCHES), 0.1875)),
+        coded("highest codes", np.full(shape, 127), np.full((n, N_FETCHES), 0.1875)),
+        plain("random floats", random.normal(0, 40, (2000, n_channels))),
+        plain("subnormal", signs * 1e-40),
+        plain("ten thousand", signs * 1e4),
+        plain("1e30", signs * 1e30),
+    ]

@@ -1,0 +1,221 @@
+"""From an asset to the file or folder that was asked for: reads, changes, writes, compares.
+
+Order for meshes: crop (world units), then fewer faces, then the frame. Everything is made and read back in
+memory, or in a folder beside the target, before the target's name appears.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporters.formats import COLMAP_FILES, FOLDERS, POINTS, ExportOptions, check_options
+from exporters.mesh import TriangleMesh
+from player.asset import Asset
+from player.cameras import Camera
+from player.errors import OutputError
+from player.files import check_target, new_folder, write_bytes
+from player.transforms import frame_names, read_cameras
+
+Progress = Callable[[int, int], object]
+"""Called with the number done and the total."""
+
+
+def export_asset(
+    asset_path: Path,
+    target: Path,
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write one file or folder out of the asset in `asset_path` and describe it.
+
+    Args:
+        asset_path: the folder of an asset; every checksum is compared.
+        target: what to write.
+        options: what to write there, and how; by default the mesh, in the world's frame, as the suffix says.
+        progress: called after each picture.
+
+    Returns:
+        JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
+        in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
+        `faces_asked`;
+        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
+
+    Raises:
+        ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop.
+        OutputError: the target exists and `force` is not set, or cannot be written.
+        FormatError: the asset, its mesh or a file of cameras is damaged.
+        ParityError: what was written does not hold what was to be written.
+        MissingExtraError: the format needs a package that is not installed.
+    """
+    options = options or ExportOptions()
+    name = check_options(target, options)
+    force = _check_target(asset_path, target, name, options.force)
+    asset = Asset.open(asset_path, verify=True)
+    if name == "exr":
+        from exporters.pictures import export_pictures
+
+        cameras, names = _views(asset, options)
+        return export_pictures(asset, target, cameras, names, options.half, force, progress)
+    if name == "colmap":
+        return _export_colmap(asset, target, options, force)
+    if name == "json":
+        data, facts = _cameras(asset, target, options)
+    elif name == "onnx":
+        data, facts = _head(asset, target, options)
+    elif options.points is not None:
+        data, facts = _points(asset, target, options)
+    else:
+        data, facts = _mesh(asset, target, options, name)
+    write_bytes(target, data)
+    return {"file": str(target), "format": name, **facts, "bytes": len(data)}
+
+
+def _mesh(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
+    from exporters.glb import glb_bytes
+    from exporters.obj import obj_bytes
+    from exporters.parity import check_mesh_bytes
+    from exporters.ply import ply_bytes
+    from exporters.stl import stl_bytes
+
+    mesh, facts = _world_mesh(asset, options)
+    if options.faces is not None:
+        from exporters.simplify import simplify_mesh
+
+        mesh = simplify_mesh(mesh, options.faces)
+        facts["faces_asked"] = options.faces
+    moved = _in_frame(mesh, asset, options, name)
+    data = {"ply": ply_bytes, "obj": obj_bytes, "glb": glb_bytes, "stl": stl_bytes}[name](moved)
+    check_mesh_bytes(f".{name}", data, moved, str(target))
+    return data, {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "bounds": _bounds(mesh), **facts}
+
+
+def _points(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
+    from exporters.parity import check_points_bytes
+    from exporters.points import points_bytes
+
+    cloud, facts = _cloud(asset, options, options.points or POINTS)
+    moved = _in_frame(cloud, asset, options, "ply")
+    data = points_bytes(moved)
+    check_points_bytes(data, moved, str(target))
+    return data, {"points": len(cloud.vertices), "bounds": _bounds(cloud), **facts}
+
+
+def _cameras(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
+    from exporters.cameras import transforms_bytes
+
+    cameras = _trained(asset)
+    data = transforms_bytes(cameras, _matrix(asset, options, "json"), str(target))
+    return data, {"cameras": len(cameras), "frame": options.frame or "world"}
+
+
+def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
+    from exporters.asset_head import head_bytes
+
+    inputs = ["codes", "weights", "dirs"] if options.decode else ["features", "dirs"]
+    return head_bytes(asset, options.decode, str(target)), {"inputs": inputs, "outputs": ["rgb"]}
+
+
+def _export_colmap(asset: Asset, target: Path, options: ExportOptions, force: bool) -> dict[str, Any]:
+    from exporters.cameras import moved_cameras
+    from exporters.colmap import colmap_files
+
+    cloud, facts = _cloud(asset, options, options.points or POINTS)
+    cameras = moved_cameras(_trained(asset), _matrix(asset, options, "colmap"))
+    files = colmap_files(cameras, _in_frame(cloud, asset, options, "colmap"))
+    with new_folder(target, force) as folder:
+        for file_name, data in files.items():
+            (folder / file_name).write_bytes(data)
+    return {
+        "file": str(target),
+        "format": "colmap",
+        "cameras": len(cameras),
+        "points": len(cloud.vertices),
+        "bounds": _bounds(cloud),
+        **facts,
+        "bytes": sum(map(len, files.values())),
+    }
+
+
+def _world_mesh(asset: Asset, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
+    """The asset's mesh, cropped: it is in the world's frame already, whoever opens mesh.ply itself sees it
+    there."""
+    from exporters.ply import read_ply
+
+    box = None
+    if options.crop is not None:
+        from exporters.crop import parse_crop
+
+        box = parse_crop(options.crop)
+    mesh = read_ply(asset.path("mesh.ply"))
+    facts: dict[str, Any] = {"frame": options.frame or "world"}
+    if box is not None:
+        from exporters.crop import crop_mesh
+
+        mesh, removed = crop_mesh(mesh, box)
+        facts["removed"] = removed
+    return mesh, facts
+
+
+def _cloud(asset: Asset, options: ExportOptions, n_points: int) -> tuple[TriangleMesh, dict[str, Any]]:
+    from exporters.points import sample_points
+
+    mesh, facts = _world_mesh(asset, options)
+    return sample_points(mesh, n_points), facts
+
+
+def _in_frame(mesh: TriangleMesh, asset: Asset, options: ExportOptions, name: str) -> TriangleMesh:
+    matrix = _matrix(asset, options, name)
+    return mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)
+
+
+def _matrix(asset: Asset, options: ExportOptions, name: str) -> np.ndarray:
+    from exporters.frames import frame_matrix
+
+    return frame_matrix(options.frame or "world", asset.world_from_model, name)
+
+
+def _trained(asset: Asset) -> list[Camera]:
+    width, height = asset.manifest.view_size
+    return read_cameras(asset.path("cameras.json"), (width, height))
+
+
+def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str]]:
+    """The cameras to render, and the names of their files: as `vfr-play` would call them."""
+    width, height = asset.manifest.view_size
+    given = options.cameras
+    cameras = _trained(asset) if given is None else read_cameras(given, (width, height))
+    part = options.views or slice(None)
+    cameras, names = cameras[part], frame_names(cameras)[part]
+    return ([c.resized(*options.size) for c in cameras] if options.size else cameras), names
+
+
+def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> bool:
+    """Refuse a target before any work; returns whether what is there is to be replaced.
+
+    A folder is replaced as a whole, so it must hold nothing but an earlier export of its kind.
+    """
+    is_folder = name in FOLDERS
+    if target.is_dir() and is_folder:
+        belongs = {"exr": lambda file: file.endswith(".exr"), "colmap": COLMAP_FILES.__contains__}[name]
+        found = sorted(path.name for path in target.iterdir())
+        other = [file for file in found if not belongs(file)]
+        if other:
+            raise OutputError(
+                f"{target}: expected no folder, or one of {name} files alone, got {other[0]} in it"
+            )
+        force = force or not found
+    elif target.exists() and target.is_dir() != is_folder:
+        wanted, there = ("folder", "file") if is_folder else ("file", "folder")
+        raise OutputError(f"{target}: expected the name of a {wanted}, got a {there}")
+    if target.exists() and target.resolve().parent == asset_path.resolve():
+        raise OutputError(f"{target}: is part of the asset: expected a place outside {asset_path}")
+    check_target(target, force)
+    return force
+
+
+def _bounds(mesh: TriangleMesh) -> list[list[float]]:
+    return mesh.bounds.tolist() if len(mesh.vertices) else [[0.0] * 3] * 2

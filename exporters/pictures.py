@@ -1,0 +1,66 @@
+"""A folder of pictures for compositing: an asset seen by a list of cameras, one EXR each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from exporters.exr import exr_channels, exr_header, load_openexr, write_exr
+from player.asset import Asset
+from player.cameras import Camera
+from player.errors import ConfigError
+from player.files import check_target, new_folder
+from player.render import Renderer, check_size
+
+
+def export_pictures(
+    asset: Asset,
+    target: Path,
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    half: bool = False,
+    force: bool = False,
+    progress: Callable[[int, int], object] | None = None,
+) -> dict[str, Any]:
+    """Render each camera, with the asset's own number of fetches, and write `target/NAME.exr`.
+
+    Args:
+        asset: an open asset.
+        target: the new folder; it appears when every picture is in it.
+        cameras: WORLD frame, at least one.
+        names: of the files, without suffix, one a camera (`player.transforms.frame_names`).
+        half: see `exporters.exr`.
+        force: replace a folder that exists.
+        progress: called with the number done and the total after each picture.
+
+    Returns:
+        `file`, `format`, `pictures`, `channels`, `bytes`.
+
+    Raises:
+        ConfigError: no camera, or a picture that is too large.
+        OutputError, ParityError, MissingExtraError: as `exporters.exr.write_exr`.
+    """
+    load_openexr()
+    if not cameras:
+        raise ConfigError("--views: expected at least one view, got none")
+    for camera in cameras:
+        check_size(camera.width, camera.height)
+    check_target(target, force)
+    n_bytes, written = 0, []
+    with new_folder(target, force) as folder, Renderer(asset) as renderer:
+        for index, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+            frame = renderer.render(camera, background="transparent", layers=True)
+            channels = exr_channels(frame, camera, half)
+            path = folder / f"{name}.exr"
+            write_exr(path, channels, exr_header(camera))
+            n_bytes, written = n_bytes + path.stat().st_size, list(channels)
+            if progress is not None:
+                progress(index + 1, len(cameras))
+    return {
+        "file": str(target),
+        "format": "exr",
+        "pictures": len(cameras),
+        "channels": written,
+        "bytes": n_bytes,
+    }

@@ -1,0 +1,42 @@
+"""An asset that can be exported whole: the shells of the player's tests, with a box for a mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from exporters.ply import ply_bytes
+from player.asset import Asset, GridArrays, write_asset
+from player.bricks import pack_vertices
+from player.manifest import Manifest
+from tests.exporters.meshes import box
+from tests.player import conftest as shells
+
+BOX = ((1.25, 2.25, 3.0), (1.75, 2.5, 4.0))
+"""Corners of the asset's mesh, world frame: three edges of different length."""
+
+
+@pytest.fixture(scope="session")
+def shells_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Do not change it. World from model is a quarter turn, a scale of 2 and a translation."""
+    folder = tmp_path_factory.mktemp("exports") / "asset"
+    vertices, codes, features = shells.shells()
+    coords, masks, _ = pack_vertices(vertices)
+    manifest = Manifest(
+        generator="tests",
+        resolution=shells.RESOLUTION,
+        step=shells.STEP,
+        density_range=shells.DENSITY_RANGE,
+        n_channels=4,
+        view_size=(48, 40),
+        world_from_model=tuple(map(tuple, shells.WORLD_FROM_MODEL)),
+    )
+    arrays = GridArrays(coords, masks, codes, features)
+    write_asset(folder, manifest, arrays, shells.head_bytes(), ply_bytes(box(*BOX)), shells.cameras_bytes())
+    return folder
+
+
+@pytest.fixture(scope="session")
+def opened(shells_asset: Path) -> Asset:
+    return Asset.open(shells_asset)

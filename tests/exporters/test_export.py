@@ -1,0 +1,232 @@
+"""`vfr-export`: which settings go with which format, what it says, and what it refuses, in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from exporters import cli, export
+from exporters.formats import ExportOptions, check_options
+from exporters.ply import read_ply
+from player.asset import Asset
+from player.errors import ConfigError, ParityError
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run; exit code 1, and one line on stderr, which is returned."""
+    assert cli.main(arguments) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("vfr-export: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_crop_and_what_it_prints(
+    shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A centre that begins with a minus too: argparse would take it for an option."""
+    target = tmp_path / "part.ply"
+    arguments = [str(shells_asset), str(target), "--crop", "-8.5,2.375,3.5,20,4,4"]
+    assert cli.main(arguments) == 0
+    captured = capsys.readouterr()
+    assert "the crop removed 83.3% of the faces" in captured.out  # the two triangles at x = 1.25 stay
+    mesh = read_ply(target)
+    assert len(mesh.faces) == 2 and (mesh.vertices[:, 0] == 1.25).all()
+    assert cli.main([*arguments, "--json", "--force"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["removed"] == pytest.approx(10 / 12) and summary["frame"] == "world"
+
+
+def test_crop_is_in_world_units_in_every_frame(shells_asset: Path, tmp_path: Path) -> None:
+    for frame in ("world", "model", "gltf"):
+        summary = export.export_asset(
+            shells_asset, tmp_path / f"{frame}.stl", ExportOptions(frame=frame, crop="0,2.375,3.5,3,4,4")
+        )
+        assert summary["faces"] == 2 and summary["bounds"][1][0] == 1.25
+
+
+def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None:
+    target = tmp_path / "mesh.bin"
+    assert cli.main([str(shells_asset), str(target), "--format", "stl"]) == 0
+    assert target.read_bytes().startswith(b"vfr-bake: binary STL")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("a.fbx", "suffix: expected one of .ply, .obj, .glb, .stl, .json, .onnx, or a folder with --format"),
+        ("frames/", "got none"),
+        (
+            "a.ply --format usd",
+            "--format: expected one of ply, obj, glb, stl, json, onnx, exr, colmap, got usd",
+        ),
+        ("a.ply --faces 0", "--faces: expected 1 or more, got 0"),
+        ("a.ply --points 0", "--points: expected 1 or more, got 0"),
+        ("a.ply --crop 9,9,9,1,1,1", "--crop: expected a box with some of the mesh in it"),
+        ("a.ply --crop 1,2", "--crop: expected X,Y,Z,W,D,H[,YAW]"),
+        ("a.glb --crop none.json", "none.json: cannot read"),
+        ("a.obj --points 5", "--points does nothing for a obj mesh; it takes --crop, --faces, --frame"),
+        ("a.ply --points 5 --faces 5", "--faces does nothing for a point cloud"),
+        ("a.json --crop 0,0,0,9,9,9", "--crop does nothing for json; it takes --frame"),
+        ("a.onnx --half", "--half does nothing for onnx; it takes --decode"),
+        ("dir --format colmap --views 1", "--views does nothing for colmap"),
+    ],
+)
+def test_one_line_and_nothing_written(
+    arguments: str, message: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target, *more = shlex.split(arguments)
+    assert message in fails([str(shells_asset), str(tmp_path / target), *more], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", ["a.stl", "a.json", "a.onnx", "a.ply --points 9", "d --format colmap",
+                                       "d --format exr --size 5x4"])  # fmt: skip
+def test_targets_that_cannot_be_written(
+    arguments: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, *more = shlex.split(arguments)
+    (tmp_path / "file").write_text("mine")
+    error = fails([str(shells_asset), str(tmp_path / "file" / name), *more], capsys)
+    assert "is a file, not a folder" in error
+    assert (tmp_path / "file").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_read_only_folder_and_file(
+    shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the system answers to anyone but root, who may write everywhere."""
+
+    def access(path: str | Path, mode: int) -> bool:
+        return not mode & os.W_OK or bool(Path(path).stat().st_mode & stat.S_IWUSR)
+
+    monkeypatch.setattr(os, "access", access)
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    (locked / "old.stl").write_text("mine")
+    (locked / "old.stl").chmod(0o444)
+    assert "it is read-only" in fails([str(shells_asset), str(locked / "old.stl"), "--force"], capsys)
+    locked.chmod(0o555)
+    try:
+        error = fails([str(shells_asset), str(locked / "new" / "a.stl")], capsys)
+        assert f"the folder {locked} is read-only" in error
+        fails([str(shells_asset), str(locked / "frames"), "--format", "exr"], capsys)
+        assert [path.name for path in locked.iterdir()] == ["old.stl"]
+        assert (locked / "old.stl").read_text() == "mine"
+    finally:
+        locked.chmod(0o755)
+
+
+@pytest.mark.parametrize("kind", ["exr", "colmap"])
+def test_a_folder_with_other_things_is_not_replaced(
+    kind: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "pictures"
+    target.mkdir()
+    (target / "holiday.png").write_text("mine")
+    error = fails([str(shells_asset), str(target), "--format", kind, "--force"], capsys)
+    assert f"expected no folder, or one of {kind} files alone, got holiday.png in it" in error
+    assert (target / "holiday.png").read_text() == "mine"
+    error = fails([str(shells_asset), str(target), "--format", "stl", "--force"], capsys)
+    assert "expected the name of a file, got a folder" in error
+    error = fails([str(shells_asset), str(target / "holiday.png"), "--format", kind, "--force"], capsys)
+    assert "expected the name of a folder, got a file" in error
+
+
+def test_the_asset_is_not_overwritten(shells_asset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("mesh.ply", "head.onnx", "cameras.json"):
+        assert "is part of the asset" in fails(
+            [str(shells_asset), str(shells_asset / name), "--force"], capsys
+        )
+    Asset.open(shells_asset, verify=True)
+
+
+def test_an_export_that_fails_its_comparison_leaves_the_old_file(
+    shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from exporters import exr, stl
+
+    target = tmp_path / "a.stl"
+    target.write_text("old")
+    original = stl.stl_bytes
+    monkeypatch.setattr(stl, "stl_bytes", lambda mesh: original(mesh)[:-10] + b"\0\0\x80\x3f" * 2 + b"\0\0")
+    assert "corners: number" in fails([str(shells_asset), str(target), "--force"], capsys)
+    assert target.read_text() == "old"
+
+    def differs(*arguments: object) -> None:
+        raise ParityError("a.exr: Z: expected 1, got 2")
+
+    monkeypatch.setattr(exr, "check_channels", differs)
+    fails([str(shells_asset), str(tmp_path / "frames"), "--format", "exr", "--size", "5x4"], capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.stl"]
+
+
+def test_missing_extra_is_named(
+    shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import sys
+
+    for module in ("open3d", "OpenEXR", "onnx"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for arguments in (["a.ply", "--faces", "5"], ["d", "--format", "exr"], ["a.onnx"]):
+        error = fails([str(shells_asset), str(tmp_path / arguments[0]), *arguments[1:]], capsys)
+        assert "pip install 'vfr-bake[export]'" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_same_bytes_again(shells_asset: Path, tmp_path: Path) -> None:
+    for name, options in (
+        ("a.ply", {}), ("a.obj", {}), ("a.glb", {}), ("a.stl", {}), ("a.json", {"frame": "model"}),
+        ("b.ply", {"points": 40}), ("a.onnx", {}),
+    ):  # fmt: skip
+        for folder in ("one", "two"):
+            export.export_asset(shells_asset, tmp_path / folder / name, ExportOptions(**options))
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
+
+
+def test_views_and_sizes_are_python_s() -> None:
+    assert [np.arange(9)[cli._slice(text)].tolist() for text in ("2", "-1", "::4", "7:")] == [
+        [2], [8], [0, 4, 8], [7, 8]
+    ]  # fmt: skip
+    assert cli._size("12X5") == (12, 5)
+    for arguments in (["--size", "12"], ["--size", "0x4"], ["--views", "::0"], ["--frame", "unity"]):
+        with pytest.raises(SystemExit) as leave:
+            cli.main(["asset", "frames", "--format", "exr", *arguments])
+        assert leave.value.code == 2
+
+
+def test_options_of_every_format_are_checked() -> None:
+    assert check_options(Path("x"), ExportOptions(format="exr", half=True)) == "exr"
+    with pytest.raises(ConfigError, match="--decode does nothing for a ply mesh"):
+        check_options(Path("x.ply"), ExportOptions(decode=True))
+
+
+@pytest.mark.parametrize("source", ["help", "docs"])
+def test_examples_run(
+    source: str, shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every command of --help and of docs/exports.md, with the names that they use."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(shells_asset, "out")
+    Path("transforms_test.json").write_bytes((shells_asset / "cameras.json").read_bytes())
+    matrix = np.eye(4)
+    matrix[:3, 3] = 1.5, 2.375, 3.5
+    Path("box.json").write_text(json.dumps({"matrix": matrix.tolist(), "size": [9, 9, 9]}))
+    text = cli._EPILOG if source == "help" else (REPOSITORY / "docs/exports.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^ *vfr-export (.*?)(?:   +.*|  # .*)?$", text, re.MULTILINE)
+    assert len(lines) >= 10
+    for line in lines:
+        # the boxes of the examples are those of a scene around the origin
+        line = re.sub(r"--crop [-\d.,]+", "--crop 1.5,2.375,3.5,9,9,9,30", line)
+        small = ["--size", "6x5", "--views", "0:2"] if "--format exr" in line else []
+        assert cli.main([*shlex.split(line), *small, "--force"]) == 0, line
