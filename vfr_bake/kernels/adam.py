@@ -7,6 +7,10 @@ import numpy as np
 from numba import njit, prange
 
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
+from vfr_bake.kernels.prefetch import prefetch
+
+AHEAD = 16
+"""Rows asked for before they are stepped: a trip to memory takes about as long as so many steps."""
 
 
 @njit(inline="always")
@@ -62,5 +66,8 @@ def scatter_and_step(
             )  # fmt: skip
             first = np.uint64(offsets[level])
             for i in range(n):
+                ahead = first + np.uint64(rows[thread, min(i + AHEAD, n - 1)])
+                prefetch(table, ahead)
+                prefetch(moments, ahead)
                 row = np.uint64(rows[thread, i])
                 _step_row(first + row, table, moments, row, grad[thread], rate, beta1, beta2, epsilon)

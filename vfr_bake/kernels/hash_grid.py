@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from vfr_bake.kernels.prefetch import prefetch
+
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)
 ONE = np.uint32(1)
@@ -84,8 +86,22 @@ def corners(x, y, z, scale, offset, mask, hashed):
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
+def prefetch_point(x, y, z, table, scales, offsets, hashed, mask):
+    """Ask for the rows around a point of all levels that are too large to be in the cache anyway."""
+    for level in range(scales.shape[0]):
+        if hashed[level]:
+            scale = scales[level]
+            last = np.int32(scale) - np.int32(1)
+            ix, iy, iz = cell_of(x * scale, last), cell_of(y * scale, last), cell_of(z * scale, last)
+            rows = corner_rows(ix, iy, iz, last, offsets[level], mask, True)
+            for corner in range(8):
+                prefetch(table, rows[corner])
+
+
+@njit(fastmath=FLAGS, error_model="numpy")
 def encode_point(x, y, z, table, scales, offsets, hashed, mask, out):
     """Write the features [2 * n_levels] of one point of the unit cube to `out`."""
+    prefetch_point(x, y, z, table, scales, offsets, hashed, mask)
     for level in range(scales.shape[0]):
         r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
         for channel in range(2):

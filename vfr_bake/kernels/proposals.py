@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from vfr_bake.kernels.contraction import contracted_unit
-from vfr_bake.kernels.hash_grid import FLAGS, corners, encode_point
+from vfr_bake.kernels.hash_grid import FLAGS, corners, encode_point, prefetch_point
 from vfr_bake.kernels.march import density_logit
 
 PADDING = 1e-3
@@ -43,6 +43,7 @@ def distance(s):
 @njit(fastmath=FLAGS, error_model="numpy")
 def proposal_logit(x, y, z, table, scales, offsets, hashed, mask):
     """Log-density of a proposal at a point of the unit cube; `table` [n_entries, 1]."""
+    prefetch_point(x, y, z, table, scales, offsets, hashed, mask)
     total = table.dtype.type(0)
     for level in range(scales.shape[0]):
         r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
