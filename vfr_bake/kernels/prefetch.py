@@ -36,4 +36,4 @@ def _prefetch(typing_context: Any, array: Any, row: Any) -> Any:
 
 
 prefetch: Any = intrinsic(_prefetch)
-"""prefetch(array, row): ask for the start of a row of a two-dimensional array; a hint that changes no value."""
+"""prefetch(array, row): ask for the start of a row of a two-dimensional array; it changes no value."""
