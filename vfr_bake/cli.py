@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.trainer import Trainer
 
-EVAL_VIEWS = {False: 25, True: 3}
+EVAL_VIEWS = {False: 10, True: 3}
 """Test views rendered at the end by whether the scene is unbounded, where no number is asked for."""
 SECONDS_BETWEEN_LINES = 30.0
 """Where stderr is no terminal, progress is a line this often instead of a bar."""
