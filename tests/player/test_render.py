@@ -182,7 +182,7 @@ def test_png_wants_bytes() -> None:
 
 @pytest.mark.parametrize("distance", [1e4, 1e8])
 def test_a_camera_far_away_sees_what_a_parallel_one_sees(distance: float, asset: Asset) -> None:
-    """The focal length grows with the distance, so that the picture stays; at 1e8 a float32 is 8 units coarse."""
+    """The focal length grows with the distance, so that the picture stays; at 1e8 float32 has steps of 8."""
     frames = []
     for d in (distance, 3e3):
         pose = look_at((1 + d, 2, 3), (1, 2, 3))
