@@ -29,7 +29,7 @@ def test_layers(shells_folder: Path, tmp_path: Path) -> None:
         layers = np.split(np.asarray(picture).astype(int), 4, axis=1)
     opacity, depth, normals = layers[1][..., 0], layers[2][..., 0], layers[3]
     solid = opacity > 250
-    assert 0.1 < solid.mean() < 0.9 and not depth[opacity < 100].any() and np.ptp(depth[solid]) > 200
+    assert 0.05 < solid.mean() < 0.9 and not depth[opacity < 100].any() and np.ptp(depth[solid]) > 200
     length = np.linalg.norm(normals[solid] / 127.5 - 1, axis=-1)
     assert np.abs(length - 1).mean() < 0.02
 

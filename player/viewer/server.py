@@ -67,11 +67,12 @@ def open_windows(server: Any, renderer: Renderer, samples: int | None, backgroun
     server.scene.set_up_direction(world_up(trained))
     server.initial_camera.position = first.c2w[:3, 3]
     server.initial_camera.look_at = focus
-    server.initial_camera.fov = float(2 * np.arctan(first.height / 2 / first.fy))
+    server.initial_camera.fov = fov = float(2 * np.arctan(first.height / 2 / first.fy))
     windows: dict[int, Window] = {}
 
     @server.on_client_connect
     def _(client: Any) -> None:
+        client.camera.fov = fov
         window = Window(client, renderer, trained, focus, samples, background)
         windows[client.client_id] = window
         window.start()

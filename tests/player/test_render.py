@@ -186,7 +186,7 @@ def test_a_camera_far_away_sees_what_a_parallel_one_sees(distance: float, asset:
     frames = []
     for d in (distance, 3e3):
         pose = look_at((1 + d, 2, 3), (1, 2, 3))
-        frames.append(render(asset, Camera("far", pose, 40, 30, 12 * d, 12 * d, 20.0, 15.0)))
+        frames.append(render(asset, Camera("far", pose, 40, 30, 7 * d, 7 * d, 20.0, 15.0)))
     far, near = frames
     assert 0.1 < near.opacity.mean() < 0.9
     assert np.abs(far.opacity - near.opacity).mean() < 0.01
