@@ -50,7 +50,7 @@ def render_on_cluster(
             "pip install 'vfr-bake[cluster]'"
         ) from error
     try:
-        client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = distributed.Client(address, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"--dask: {address}: expected a scheduler to answer, got none: {error}") from error
     digest = _digest(folder)
@@ -62,7 +62,7 @@ def render_on_cluster(
         pending, alone = set(futures), 0
         while pending:
             try:
-                ready = distributed.wait(pending, timeout=POLL_SECONDS, return_when="FIRST_COMPLETED")
+                ready: Any = distributed.wait(pending, timeout=POLL_SECONDS, return_when="FIRST_COMPLETED")
             except TimeoutError:
                 alone = 0 if client.scheduler_info()["workers"] else alone + 1
                 if alone == PATIENCE:

@@ -35,7 +35,7 @@ class Head:
         options.inter_op_num_threads = 1
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # fatal alone: what fails is raised as well
         data = path.read_bytes()
         _check_content(path, data)
         self._path = path

@@ -14,25 +14,26 @@ def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
     """Cameras on a path through `views`: `n_between` steps from each view to the next, the last one included.
 
     Places lie on a Catmull-Rom spline, rotations turn evenly from view to view (slerp), the focal length
-    changes by equal factors. Size and name are those of the first view.
+    changes by equal factors. Size and name are those of the first view; the vertical field of view is each
+    view's own, whatever its size.
 
     >>> views = [Camera(str(x), np.eye(4), 4, 4, f, f, 2.0, 2.0) for x, f in enumerate((5.0, 20.0))]
-    >>> [camera.fx for camera in smooth_path(views, 2)]
+    >>> [round(camera.fx, 6) for camera in smooth_path(views, 2)]
     [5.0, 10.0, 20.0]
     """
     places = np.stack([view.c2w[:3, 3] for view in views])
     turns = _continuous([_quaternion(view.c2w[:3, :3]) for view in views])
+    focal = [view.fy / view.height * views[0].height for view in views]
     path = []
     for index in range(len(views) - 1):
         around = places[np.clip(np.arange(index - 1, index + 3), 0, len(views) - 1)]
-        a, b = views[index], views[index + 1]
         for step in range(n_between):
             share = step / n_between
             c2w = np.eye(4)
             c2w[:3, :3] = _rotation(_slerp(turns[index], turns[index + 1], share))
             c2w[:3, 3] = _spline(around, share)
-            path.append(_zoomed(views[0], c2w, a.fy ** (1 - share) * b.fy**share))
-    return [*path, _zoomed(views[0], views[-1].c2w, views[-1].fy)]
+            path.append(_zoomed(views[0], c2w, focal[index] ** (1 - share) * focal[index + 1] ** share))
+    return [*path, _zoomed(views[0], views[-1].c2w, focal[-1])]
 
 
 def _zoomed(camera: Camera, c2w: np.ndarray, fy: float) -> Camera:

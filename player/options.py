@@ -83,14 +83,15 @@ def _add_files(group: argparse._ArgumentGroup) -> None:
 def _check_together(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
     if a.info or a.check:
         return
+    output: Path | None = a.output
     has_views = a.cameras is not None or a.orbit is not None or a.view is not None
-    if has_views and a.output is None:
+    if has_views and output is None:
         parser.error("--output: add where the pictures go: --output DIR, FILE.png, FILE.webp or FILE.mp4")
-    if a.output is not None and not has_views:
+    if output is not None and not has_views:
         parser.error("--output: add the views: --cameras FILE, --orbit N or --view N")
     files = {"--size": a.size, "--format": a.format, "--fps": a.fps, "--resume": a.resume, "--json": a.json,
              "--force": a.force, "--dask": a.dask}  # fmt: skip
-    if not has_views:
+    if output is None:
         lost = [name for name, value in files.items() if value]
         if lost:
             parser.error(f"{lost[0]}: add the views and --output: the viewer has no use for it")
@@ -99,11 +100,11 @@ def _check_together(parser: argparse.ArgumentParser, a: argparse.Namespace) -> N
         parser.error("--host, --port: they are of the viewer, which opens without views and --output")
     if a.resume and a.force:
         parser.error("--resume: not allowed with --force, which renders everything anew")
-    suffix = a.output.suffix.lower()
+    suffix = output.suffix.lower()
     if a.format is not None and suffix in (*PICTURES, VIDEO):
-        parser.error(f"--format: {a.output.name} says which format it is")
+        parser.error(f"--format: {output.name} says which format it is")
     if a.fps is not None and suffix != VIDEO:
-        parser.error(f"--fps: expected a video, got --output {a.output}")
+        parser.error(f"--fps: expected a video, got --output {output}")
     if a.background == "transparent" and suffix == VIDEO:
         parser.error("--background: a video has no transparency")
 

@@ -232,8 +232,12 @@ def wrong_rows() -> bytes:
 
 
 def fails_at_run_time() -> bytes:
-    shape = helper.make_tensor("shape", TensorProto.INT64, [2], [7, 3])
-    return head([helper.make_node("Reshape", ["dirs", "shape"], ["rgb"])], [shape])
+    """A reshape of n x 3 numbers to n x n x 3, whose shape is not known before."""
+    nodes = [
+        helper.make_node("Shape", ["features"], ["shape"]),
+        helper.make_node("Reshape", ["dirs", "shape"], ["rgb"]),
+    ]
+    return head(nodes)
 
 
 @pytest.mark.parametrize(
