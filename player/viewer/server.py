@@ -47,7 +47,9 @@ def serve(arguments: argparse.Namespace) -> None:
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
             sys.stdout.flush()
             sys.stderr.write(_advice(files, server.get_port()))
-            threading.Event().wait()
+            forever = threading.Event()
+            while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
+                pass
         finally:
             for window in list(windows.values()):
                 window.close()

@@ -6,6 +6,7 @@ import io
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -147,7 +148,8 @@ class Server:
         self.address = found[0]
 
     def stop(self) -> int:
-        self.process.terminate()
+        """End it, by Ctrl-C; the exit code."""
+        self.process.send_signal(signal.SIGINT)
         code = self.process.wait(SECONDS)
         assert self.process.stdout is not None
         self.process.stdout.close()
@@ -319,6 +321,12 @@ def test_two_clients_and_one_that_vanishes(browser: Browser, server: Server) -> 
     assert changed(first, settle(one)) > 0.05
     one.close()
     assert server.process.poll() is None and "Traceback" not in server.errors.read_text()
+
+
+def test_ctrl_c_ends_it(shells_folder: Path, tmp_path: Path) -> None:
+    server = Server(shells_folder, tmp_path / "errors.txt")
+    assert server.stop() == 130
+    assert server.errors.read_text().endswith("vfr-play: stopped\n")
 
 
 def test_what_it_prints(server: Server, shells_folder: Path) -> None:
