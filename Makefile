@@ -7,6 +7,8 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INPUTS := pyproject.toml constraints.txt
+# Programs that a test runs, and the Debian package of each: the browser that looks at the viewer.
+SYSTEM_PROGRAMS := chromium:chromium
 # What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d), and the
 # Debian package of each. Only what is missing is installed, and nothing that is there is upgraded.
 SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6 \
@@ -41,21 +43,24 @@ clean:  ## remove the environment and what tools left behind (not demo/)
 
 # Shell lines, not make functions: asked each time, because libraries come and go without a file that make could watch.
 # Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
-system-libraries: $(VENV)/.dev  ## install the system libraries that a test needs, or say which
+system-libraries: $(VENV)/.dev  ## install the system libraries and programs that a test needs, or say which
 	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
 	missing=; for pair in $(SYSTEM_LIBRARIES); do \
 	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
 	    || missing="$$missing $${pair#*:}"; \
 	done; \
+	for pair in $(SYSTEM_PROGRAMS); do \
+	  command -v $${pair%%:*} >/dev/null || missing="$$missing $${pair#*:}"; \
+	done; \
 	test -n "$$missing" || exit 0; \
 	command="apt-get install -y --no-upgrade --no-install-recommends$$missing"; \
-	echo "missing system libraries, by their Debian packages:$$missing"; \
+	echo "missing on this system, by their Debian packages:$$missing"; \
 	if command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
 	  $$command || { apt-get update && $$command; }; \
 	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
 	  sudo $$command || { sudo apt-get update && sudo $$command; }; \
 	else \
-	  echo "please run: sudo $$command    (or your system's packages of the same libraries)" >&2; exit 1; \
+	  echo "please run: sudo $$command    (or your system's packages of the same)" >&2; exit 1; \
 	fi
 
 # The stamps: an extra is installed again only when what it is installed from has changed.

@@ -56,7 +56,7 @@ def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, 
     Raises:
         ShapeError: the frame has a background, or no layers.
     """
-    if frame.background != "transparent" or frame.features is None or frame.normals is None:
+    if frame.background != "transparent" or frame.features is None:
         raise ShapeError("EXR: frame: expected one over no background and with layers, got another")
     met = frame.opacity > MIN_OPACITY
     cosines, rays_d = _rays(camera)

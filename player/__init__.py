@@ -1,8 +1,12 @@
 """Plays a baked Volume Feature Rendering asset on a CPU: numpy, onnxruntime and Pillow, nothing heavier.
 
->>> import player
->>> player.Camera.__name__
-'Camera'
+>>> from player import Asset
+>>> from player.render import render
+>>> from player.views import read_views
+>>> asset = Asset.open("out/")
+>>> frame = render(asset, read_views("out/cameras.json")[0])
+>>> frame.rgb.shape
+(40, 48, 3)
 """
 
 from __future__ import annotations
@@ -14,18 +18,19 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from player.asset import Asset
     from player.cameras import Camera
-    from player.render import Renderer
+    from player.render import Frame, Renderer
 
 try:
     __version__ = version("vfr-bake")
 except PackageNotFoundError:  # the folder alone, copied somewhere: it works there too
     __version__ = "0"
 
-__all__ = ["Asset", "Camera", "Renderer", "__version__"]
+__all__ = ["Asset", "Camera", "Frame", "Renderer", "__version__"]
 
 _PLACES = {
     "Asset": "player.asset",
     "Camera": "player.cameras",
+    "Frame": "player.render",
     "Renderer": "player.render",
 }
 

@@ -155,7 +155,7 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
     if n_frames < 1:
         raise FormatError(f"orbit: frames: expected at least 1, got {n_frames}")
     focus = focus_point(cameras)
-    up = _up(cameras)
+    up = world_up(cameras)
     arms = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
     radii = np.linalg.norm(arms, axis=-1)
     radius = float(np.median(radii))
@@ -183,7 +183,7 @@ def _axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
     return c2w[:, :3, 3], -c2w[:, :3, 2] / np.linalg.norm(c2w[:, :3, 2], axis=-1, keepdims=True)
 
 
-def _up(cameras: Sequence[Camera]) -> np.ndarray:
+def world_up(cameras: Sequence[Camera]) -> np.ndarray:
     """The world's up [3], of unit length.
 
     Nobody holds a camera crooked for long: up is at right angles to the cameras' right hands as well as it

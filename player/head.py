@@ -35,16 +35,20 @@ class Head:
         options.inter_op_num_threads = 1
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
-        failures = (
+        options.log_severity_level = 4  # fatal alone: what fails is raised as well
+        data = path.read_bytes()
+        _check_content(path, data)
+        self._path = path
+        self._failures = failures = (
             state.Fail,
+            state.RuntimeException,
             state.InvalidProtobuf,
             state.InvalidGraph,
             state.InvalidArgument,
             state.NotImplemented,
         )
         try:
-            session = ort.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         except (*failures, RuntimeError, ValueError) as error:
             raise FormatError(f"{path}: expected an ONNX graph, got: {_first_line(error)}") from error
         _check_ports(path, "input", session.get_inputs(), {"features": n_channels, "dirs": 3})
@@ -60,13 +64,59 @@ class Head:
 
         Returns:
             rgb: [n, 3] float32, 0..1, in the manifest's colour space.
+
+        Raises:
+            FormatError: the graph fails, or what it gives is not one finite colour a pixel.
         """
         rgb = np.empty((len(features), 3), np.float32)
         for start in range(0, len(features), CHUNK):
             part = slice(start, start + CHUNK)
-            outputs = self._session.run(["rgb"], {"features": features[part], "dirs": dirs[part]})
-            rgb[part] = np.asarray(outputs[0])
+            rgb[part] = self._run(features[part], dirs[part])
         return rgb
+
+    def _run(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+        try:
+            out = np.asarray(self._session.run(["rgb"], {"features": features, "dirs": dirs})[0])
+        except self._failures as error:
+            raise FormatError(
+                f"{self._path}: expected a head that runs, got: {_first_line(error)}"
+            ) from error
+        if out.shape != (len(features), 3) or not np.isfinite(out).all():
+            raise FormatError(
+                f"{self._path}: rgb: expected {len(features)} finite colours, got "
+                f"{'NaN or infinity' if out.shape == (len(features), 3) else list(out.shape)}"
+            )
+        return out
+
+
+class _ProtobufError(FormatError):
+    """Bytes that are no protobuf message."""
+
+
+def _check_content(path: Path, data: bytes) -> None:
+    """Refuse what no head of ours has: operators with graphs of their own, which may never end, and numbers
+    in other files. Before the file is loaded, because loading runs what is constant."""
+    try:
+        for field, graph in _fields(data):
+            if field == 25:  # ModelProto.functions
+                raise FormatError(f"{path}: operators: expected none of the file's own, got a function")
+            if field == 7 and isinstance(graph, bytes):
+                _check_graph(path, graph)
+    except _ProtobufError as error:
+        raise FormatError(f"{path}: expected an ONNX graph, got: {error}") from error
+
+
+def _check_graph(path: Path, graph: bytes) -> None:
+    for field, item in _fields(graph):
+        if field not in (1, 5) or not isinstance(item, bytes):
+            continue
+        parts = list(_fields(item))
+        if field == 5 and any(inner in (13, 14) and value for inner, value in parts):  # TensorProto
+            raise FormatError(f"{path}: expected its numbers in the file itself, got a reference to another")
+        if field == 1:  # NodeProto
+            name = b"".join(value for inner, value in parts if inner == 4 and isinstance(value, bytes))
+            if name in (b"Loop", b"Scan", b"If"):
+                raise FormatError(f"{path}: operators: expected no {name.decode()} in a head")
 
 
 def _check_ports(path: Path, kind: str, ports: Sequence[Any], expected: dict[str, int]) -> None:
@@ -122,7 +172,7 @@ def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
         elif wire in (1, 5):
             size = 8 if wire == 1 else 4
         else:
-            raise FormatError(f"head.onnx: expected a protobuf message, got wire type {wire}")
+            raise _ProtobufError(f"head.onnx: expected a protobuf message, got wire type {wire}")
         yield key >> 3, data[at : at + size]
         at += size
 
@@ -135,4 +185,4 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
         if data[at - 1] < 128:
             return value, at
         shift += 7
-    raise FormatError("head.onnx: expected a protobuf message, got one cut short")
+    raise _ProtobufError("head.onnx: expected a protobuf message, got one cut short")

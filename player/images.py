@@ -1,4 +1,4 @@
-"""Pictures to PNG files."""
+"""Pictures to PNG and WebP files, which remember what they show."""
 
 from __future__ import annotations
 
@@ -7,16 +7,70 @@ from pathlib import Path
 
 import numpy as np
 
-from player.errors import ShapeError
+from player.errors import OutputError, ShapeError
 from player.files import write_bytes
 
+KEY = "vfr-play"
+"""Name of the entry in a picture's metadata that says what was rendered (`player.frame_files`)."""
 
-def png_bytes(pixels: np.ndarray) -> bytes:
-    """PNG of [h, w, 3] or [h, w, 4] uint8.
+
+def png_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
+    """PNG of [h, w, 3] or [h, w, 4] uint8; `key` is kept in it as text.
 
     >>> png_bytes(np.zeros((2, 3, 3), np.uint8))[:4]
     b'\\x89PNG'
     """
+    from PIL.PngImagePlugin import PngInfo
+
+    info = PngInfo()
+    if key is not None:
+        info.add_text(KEY, key)
+    return _encode(pixels, "PNG", compress_level=4, pnginfo=info)
+
+
+def webp_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
+    """Lossless WebP of [h, w, 3] or [h, w, 4] uint8, at most 16383 pixels a side; `key` is kept in its XMP.
+
+    >>> webp_bytes(np.zeros((2, 3, 3), np.uint8))[8:12]
+    b'WEBP'
+    """
+    if max(pixels.shape[:2]) > 16383:
+        raise OutputError(
+            f"WebP: expected at most 16383 pixels a side, got {pixels.shape[1]}x{pixels.shape[0]}: write PNG"
+        )
+    # exact: colours behind zero alpha stay as they are. method 2: a quarter of the time, 2 % larger.
+    return _encode(
+        pixels, "WEBP", lossless=True, exact=True, method=2, xmp=f"{KEY}={key}".encode() if key else b""
+    )
+
+
+ENCODERS = {".png": png_bytes, ".webp": webp_bytes}
+
+
+def read_key(path: Path) -> str | None:
+    """The key that a picture was written with; None if there is none, or no whole picture."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+            text = picture.info.get(KEY)
+            xmp = picture.info.get("xmp")
+    except (OSError, ValueError, SyntaxError):
+        return None
+    if isinstance(text, str):
+        return text
+    if isinstance(xmp, bytes) and xmp.startswith(KEY.encode() + b"="):
+        return xmp.decode(errors="replace").partition("=")[2]
+    return None
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write a PNG; the name appears when the file is complete."""
+    write_bytes(path, png_bytes(pixels))
+
+
+def _encode(pixels: np.ndarray, form: str, **options: object) -> bytes:
     from PIL import Image
 
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.dtype != np.uint8:
@@ -24,10 +78,5 @@ def png_bytes(pixels: np.ndarray) -> bytes:
             f"pixels: expected [h, w, 3] or [h, w, 4] uint8, got {pixels.dtype} {list(pixels.shape)}"
         )
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=4)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, form, **options)
     return buffer.getvalue()
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write a PNG; the name appears when the file is complete."""
-    write_bytes(path, png_bytes(pixels))

@@ -8,11 +8,12 @@ on the size of a task.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import ModuleType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,12 +24,23 @@ from player.errors import ConfigError, MissingExtraError
 from player.head import Head
 from player.march import MarchResult
 from player.normals import composited_normals
+from player.sparse_grid import SparseGrid
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
+Bounds = tuple[np.ndarray, np.ndarray]
 
 MAX_PIXELS = 1 << 26
-"""Largest picture, 8192 x 8192: a frame takes 24 bytes a pixel."""
+"""Largest picture, 8192 x 8192."""
+
+FRAME_BYTES = 30
+"""Memory of a frame, bytes a pixel: colour 12, opacity, depth and samples 4 each, and its 8-bit picture
+with what rounds it 6."""
+
+FAR_AWAY = 64.0
+"""Camera distance, in half diagonals of the box, from which rays start beside the box: their float32
+origins would be too coarse at the camera, by a sixteenth of a pixel of 8192 here and by everything at 1e8
+units."""
 
 TASK_BLOCKS = {"numba": 96, "numpy": 128}
 """Blocks a task: enough rays for the head's chunks and, in numpy, for its calls; few enough to share out
@@ -52,9 +64,19 @@ class Frame:
     features: np.ndarray | None = None
     """[h, w, n_channels] float32, what the head was given (in units of the codes), 0 where it was not run;
     None unless asked for with `layers`."""
-    normals: np.ndarray | None = None
-    """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.normals`); None unless asked for with
-    `layers`."""
+    find_normals: Callable[[], np.ndarray] | None = None
+    """What `normals` asks."""
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.normals`).
+
+        Found when first asked for, at the cost of a second march, unless the frame was rendered with
+        `layers`. Raises ConfigError for a frame that no renderer has made.
+        """
+        if self.find_normals is None:
+            raise ConfigError("normals: expected the frame of a renderer, got one that was put together")
+        return self.find_normals()
 
     def to_uint8(self) -> np.ndarray:
         """[h, w, 3], or [h, w, 4] with straight alpha if transparent; values rounded to the nearest level."""
@@ -113,7 +135,7 @@ class Renderer:
             camera: in the WORLD frame.
             n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
             background: colour 0..1 or "transparent"; the asset's own if None.
-            layers: fill in the frame's `features` and `normals` too, at the cost of a second march; the
+            layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
         Raises:
@@ -134,15 +156,11 @@ class Renderer:
         counts = np.zeros(n_pixels, np.int32)
         features = np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None
         normals = np.zeros((n_pixels, 3), np.float32) if layers else None
-        frame = Frame(rgb, opacity, depth, counts, background, features, normals)
-        model_camera = camera.transformed(self._model_from_world)
-        near, far = block_bounds(self._grid, model_camera)
-        blocks = np.flatnonzero(far >= near)
+        frame = Frame(rgb, opacity, depth, counts, background, features)
+        view = _View.of(self._grid, camera.transformed(self._model_from_world))
         size = TASK_BLOCKS[self.march]
-        futures = [
-            self._pool.submit(self._task, frame, model_camera, blocks[i : i + size], near, far, k)
-            for i in range(0, len(blocks), size)
-        ]
+        tasks = [view.blocks[i : i + size] for i in range(0, len(view.blocks), size)]
+        futures = [self._pool.submit(self._task, frame, normals, view, blocks, k) for blocks in tasks]
         try:
             for future in futures:
                 future.result()
@@ -157,26 +175,35 @@ class Renderer:
             counts.reshape(shape),
             background,
             None if features is None else features.reshape(*shape, -1),
-            None if normals is None else normals.reshape(*shape, 3),
+            lambda: self._all_normals(view, tasks) if normals is None else normals.reshape(*shape, 3),
         )
 
+    def _all_normals(self, view: _View, tasks: list[np.ndarray]) -> np.ndarray:
+        """[h, w, 3] normals, on the caller's thread: the renderer may have been closed."""
+        normals = np.zeros((view.camera.height * view.camera.width, 3), np.float32)
+        for blocks in tasks:
+            index, rays_o, rays_d, bounds = view.rays(blocks)
+            normals[index] = self._normals(rays_o, rays_d, bounds)
+        return normals.reshape(view.camera.height, view.camera.width, 3)
+
+    def _normals(self, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds) -> np.ndarray:
+        rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
+        return composited_normals(self._grid, rays_o, rays_d, bounds) @ rotation.T
+
     def _task(
-        self, frame: Frame, camera: Camera, blocks: np.ndarray, near: np.ndarray, far: np.ndarray, k: int
+        self, frame: Frame, normals: np.ndarray | None, view: _View, blocks: np.ndarray, k: int
     ) -> None:
-        """March and shade the pixels of some blocks, into the flat arrays of `frame`."""
-        columns, rows, owner = _pixels(camera, blocks, near.shape[1])
-        rays_o, rays_d = _rays(camera, columns, rows)
-        bounds = (near.reshape(-1)[owner], far.reshape(-1)[owner])
+        """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
+        index, rays_o, rays_d, bounds = view.rays(blocks)
         result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
-        index = rows * camera.width + columns
+        depth = result.depth if view.start == 0 else np.where(result.depth > 0, result.depth + view.start, 0)
         frame.opacity[index] = result.opacity
-        frame.depth[index] = result.depth * np.float32(self.asset.scale)
+        frame.depth[index] = depth * np.float32(self.asset.scale)
         frame.n_samples[index] = result.n_samples
         if frame.features is not None:
             frame.features[index[result.hits]] = result.features
-        if frame.normals is not None:
-            rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
-            frame.normals[index] = composited_normals(self._grid, rays_o, rays_d, bounds) @ rotation.T
+        if normals is not None:
+            normals[index] = self._normals(rays_o, rays_d, bounds)
         rgb = self._head(result.features, rays_d[result.hits])
         if frame.background == "transparent":
             frame.rgb[index[result.hits]] = rgb
@@ -185,6 +212,38 @@ class Renderer:
         colours = (1 - result.opacity)[:, None] * behind
         colours[result.hits] += rgb * result.opacity[result.hits][:, None]
         frame.rgb[index] = colours
+
+
+class _View(NamedTuple):
+    """What a camera, in the model frame, may see of the grid."""
+
+    camera: Camera
+    start: float
+    """Way along each ray, model units, that is known to be empty: 0 unless the camera is far away."""
+    blocks: np.ndarray
+    """[n] the blocks of pixels that may meet a brick."""
+    near: np.ndarray
+    far: np.ndarray
+    """[rows, columns] float32 bounds of t for each block, from `start` on."""
+
+    @classmethod
+    def of(cls, grid: SparseGrid, camera: Camera) -> _View:
+        near, far = block_bounds(grid, camera)
+        seen = far >= near
+        size = grid.resolution / grid.cells_per_unit.astype(np.float64)
+        radius = float(np.linalg.norm(size)) / 2
+        distance = float(np.linalg.norm(camera.c2w[:3, 3] - (grid.aabb_min + size / 2)))
+        start = distance - radius if distance > FAR_AWAY * radius else 0.0
+        if start:  # the bounds are as coarse there as the origins
+            near, far = np.where(seen, np.float32(0), near), np.where(seen, np.float32(np.inf), far)
+        return cls(camera, start, np.flatnonzero(seen), near, far)
+
+    def rays(self, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bounds]:
+        """Of the pixels in some blocks: their index in the picture, origins, directions and bounds."""
+        columns, rows, owner = _pixels(self.camera, blocks, self.near.shape[1])
+        rays_o, rays_d = _rays(self.camera, columns, rows, self.start)
+        bounds = (self.near.reshape(-1)[owner], self.far.reshape(-1)[owner])
+        return rows * self.camera.width + columns, rays_o, rays_d, bounds
 
 
 def _pixels(camera: Camera, blocks: np.ndarray, per_row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -202,8 +261,10 @@ def _pixels(camera: Camera, blocks: np.ndarray, per_row: int) -> tuple[np.ndarra
     return columns[inside], rows[inside], owner[inside]
 
 
-def _rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through pixel centres, as `Camera.rays` defines them, for pixels in any order."""
+def _rays(
+    camera: Camera, columns: np.ndarray, rows: np.ndarray, start: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays through pixel centres, as `Camera.rays` defines them, for pixels in any order; from `start` on."""
     x = (columns + (0.5 - camera.cx)) / camera.fx
     y = (rows + (0.5 - camera.cy)) / -camera.fy
     rotation = camera.c2w[:3, :3]
@@ -212,13 +273,19 @@ def _rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.nda
         rays[axis] = x * rotation[axis, 0] + y * rotation[axis, 1] - rotation[axis, 2]
     rays /= np.sqrt(rays[0] * rays[0] + rays[1] * rays[1] + rays[2] * rays[2])
     rays_d = np.ascontiguousarray(rays.T, np.float32)
+    if start:
+        rays_o = camera.c2w[:3, 3] + start * rays.T
+        return np.ascontiguousarray(rays_o, np.float32), rays_d
     return np.broadcast_to(camera.c2w[:3, 3].astype(np.float32), rays_d.shape), rays_d
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise ConfigError for a picture over MAX_PIXELS."""
+    """Raise ConfigError for a picture over MAX_PIXELS; says what it would take."""
     if width * height > MAX_PIXELS:
-        raise ConfigError(f"size: expected at most {MAX_PIXELS} pixels (8192x8192), got {width}x{height}")
+        raise ConfigError(
+            f"size: expected at most {MAX_PIXELS} pixels (8192x8192), got {width}x{height}, "
+            f"which would take {width * height * FRAME_BYTES / 1e9:.1f} GB of memory"
+        )
 
 
 def _choose_march(name: March) -> tuple[str, ModuleType]:
@@ -249,5 +316,29 @@ def render(
     n_threads: int | None = None,
     march: March = "auto",
 ) -> Frame:
-    """One picture of an asset; keeps its threads and head for the next call. Arguments as in `Renderer`."""
+    """One picture of an asset; its threads and head are kept for the next call.
+
+    Args:
+        asset: an open asset.
+        camera: in the WORLD frame, the photographs' own.
+        n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
+        background: colour, 3 numbers 0..1, or "transparent"; the asset's own if None.
+        n_threads: one for each core if None.
+        march: "numba", "numpy", or "auto": numba where it is installed.
+
+    Returns:
+        The frame: `rgb` [h, w, 3], `opacity` [h, w], `depth` [h, w] in world units, `normals` [h, w, 3].
+
+    Raises:
+        ConfigError: a picture over MAX_PIXELS, or a setting out of range.
+        FormatError: the asset's head is not one.
+        MissingExtraError: `march` is "numba", which is not installed.
+
+    >>> from player.transforms import read_cameras
+    >>> asset = Asset.open("out/")
+    >>> camera = read_cameras("out/cameras.json")[0]
+    >>> frame = render(asset, camera, background=(0.0, 0.0, 0.0))
+    >>> frame.rgb.shape, frame.opacity.shape, frame.depth.shape, frame.normals.shape
+    ((40, 48, 3), (40, 48), (40, 48), (40, 48, 3))
+    """
     return _renderer(asset, n_threads, march).render(camera, n_samples, background)

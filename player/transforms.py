@@ -14,9 +14,9 @@ import numpy as np
 
 from player.cameras import Camera
 from player.errors import FormatError
+from player.json_files import as_float, brief, parse_json, read_json
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
-MAX_FILE_BYTES = 64 * 2**20
 MAX_PIXELS_A_SIDE = 65536
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 
@@ -28,16 +28,7 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
     Raises FormatError: no such file, over 64 MB, not JSON (NaN and Infinity are not), no frames, not a
     pinhole model.
     """
-    path = Path(path)
-    try:
-        n_bytes = path.stat().st_size
-        if n_bytes > MAX_FILE_BYTES:
-            raise FormatError(f"{path}: size: expected at most {MAX_FILE_BYTES} bytes, got {n_bytes}")
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such file: expected a transforms.json") from error
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+    data = read_json(path, "a transforms.json")
     return parse_transforms(data, str(path))
 
 
@@ -48,26 +39,23 @@ def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
     Traceback (most recent call last):
     player.errors.FormatError: cameras: frames: expected a list of at least one frame, got []
     """
-    try:
-        document = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{where}: expected JSON, got {_brief(str(error))}") from error
+    document = parse_json(data, where)
     if not isinstance(document, dict):
-        raise FormatError(f"{where}: expected a JSON object with frames, got {_brief(document)}")
+        raise FormatError(f"{where}: expected a JSON object with frames, got {brief(document)}")
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise FormatError(f"{where}: frames: expected a list of at least one frame, got {_brief(frames)}")
+        raise FormatError(f"{where}: frames: expected a list of at least one frame, got {brief(frames)}")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
-            raise FormatError(f"{where}: frame {index}: expected an object, got {_brief(frame)}")
+            raise FormatError(f"{where}: frame {index}: expected an object, got {brief(frame)}")
         name = frame.get("file_path")
         if not isinstance(name, str) or not name or any(_unwritable(c) for c in name):
-            raise FormatError(f"{where}: frame {index}: file_path: expected a path, got {_brief(name)}")
+            raise FormatError(f"{where}: frame {index}: file_path: expected a path, got {brief(name)}")
         place = f"{where}: frame {index} ({name})"
         model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
         if model not in PINHOLE_MODELS:
             expected = ", ".join(PINHOLE_MODELS)
-            raise FormatError(f"{place}: camera_model: expected one of {expected}, got {_brief(model)}")
+            raise FormatError(f"{place}: camera_model: expected one of {expected}, got {brief(model)}")
         if frame.get("is_fisheye", document.get("is_fisheye", False)):
             raise FormatError(f"{place}: is_fisheye: expected a pinhole camera, got a fisheye")
     return document
@@ -114,9 +102,9 @@ def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str,
     value = frame.get(key, document.get(key))
     if value is None:
         return None
-    number = _as_float(value)
+    number = as_float(value)
     if number is None:
-        raise FormatError(f"{where}: {key}: expected a finite number, got {_brief(value)}")
+        raise FormatError(f"{where}: {key}: expected a finite number, got {brief(value)}")
     return number
 
 
@@ -248,40 +236,18 @@ def _matrix(rows: Any) -> np.ndarray:
     """`transform_matrix` as [4, 4] float64; three rows of four are completed."""
     expected = "camera matrix: expected 4 rows of 4 numbers"
     if not isinstance(rows, list):
-        raise FormatError(f"{expected}, got {_brief(rows)}")
+        raise FormatError(f"{expected}, got {brief(rows)}")
     if len(rows) not in (3, 4):
         raise FormatError(f"{expected}, got {len(rows)} rows")
     for index, row in enumerate(rows):
-        if not isinstance(row, list) or len(row) != 4 or any(_as_float(value) is None for value in row):
-            raise FormatError(f"{expected}, got row {index}: {_brief(row)}")
+        if not isinstance(row, list) or len(row) != 4 or any(as_float(value) is None for value in row):
+            raise FormatError(f"{expected}, got row {index}: {brief(row)}")
     return np.array([*rows, [0, 0, 0, 1]][:4], np.float64)
-
-
-def _as_float(value: Any) -> float | None:
-    """A finite number as float, None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if np.isfinite(number) else None
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name}, which is not a number of JSON")
 
 
 def _unwritable(character: str) -> bool:
     """Whether no file name has it: a control character, a line's end, half a surrogate pair."""
     return character < " " or character in "\x7f\x85\u2028\u2029" or "\ud800" <= character <= "\udfff"
-
-
-def _brief(value: Any) -> str:
-    """What was found, in one short line of plain characters."""
-    text = ascii(value) if not isinstance(value, str) else value
-    text = text.encode("ascii", "backslashreplace").decode().replace("\n", " ").replace("\r", " ")
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def _name_parts(name: str) -> list[str]:

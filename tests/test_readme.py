@@ -49,6 +49,8 @@ def test_the_commands_and_the_python_run(
             for word in shlex.split(line, comments=True)
         ]
         main, smaller = COMMANDS[words[0]]
+        if words == ["vfr-play", "out/"]:  # serves until Ctrl-C: tests/player/test_viewer.py
+            continue
         assert main(words[1:] + (smaller if "--info" not in words else [])) == 0, line
         seen.add(words[0])
     assert seen == set(COMMANDS)

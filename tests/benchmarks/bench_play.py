@@ -23,7 +23,8 @@ import numpy as np
 
 from player.asset import Asset
 from player.cameras import orbit
-from player.cli import _positive, _size, peak_rss_mb
+from player.options import _positive, _size
+from player.play import peak_rss_mb
 from player.render import Renderer
 from player.transforms import read_cameras
 

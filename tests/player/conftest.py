@@ -90,10 +90,8 @@ def scene() -> Scene:
     return Scene(RESOLUTION, box, STEP, DENSITY_RANGE, *by_key)
 
 
-@pytest.fixture(scope="session")
-def shells_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The asset; do not change it, take `broken_folder` for that."""
-    folder = tmp_path_factory.mktemp("assets") / "shells"
+def write_shells(folder: Path) -> Path:
+    """Write the asset; returns its folder."""
     vertices, codes, features = shells()
     coords, masks, _ = pack_vertices(vertices)
     manifest = Manifest(

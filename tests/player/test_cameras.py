@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from player import transforms as module
+from player import json_files
 from player.cameras import Camera, focus_point, orbit
 from player.errors import FormatError
 from player.transforms import frame_names, read_cameras, write_cameras
@@ -226,7 +226,7 @@ def test_missing_file_and_folder_in_its_place(tmp_path: Path):
 
 def test_a_file_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write(tmp_path, blender())
-    monkeypatch.setattr(module, "MAX_FILE_BYTES", 10)
+    monkeypatch.setattr(json_files, "MAX_FILE_BYTES", 10)
     with pytest.raises(FormatError, match="size: expected at most 10 bytes, got"):
         read_cameras(path)
 

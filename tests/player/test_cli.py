@@ -119,8 +119,8 @@ def test_output_that_is_not_empty(
     assert cli.main([*views(shells_folder), *options]) == 1
     error = capsys.readouterr().err
     assert (
-        error == f"vfr-play: error: {out}: not empty: "
-        "add --force to write into it, replacing frames of equal name\n"
+        error == f"vfr-play: error: {out}: not empty: add --force to write into it, replacing frames of "
+        "equal name, or --resume to go on with a run that was interrupted\n"
     )
     assert (out / "r_0.png").read_text() == "old"
     assert cli.main([*views(shells_folder), *options, "--force"]) == 0
@@ -133,7 +133,7 @@ def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(shells_folder), "--info"]) == 0
     page = capsys.readouterr().out
     for text in ("vfr-asset 1.0", "64 cells per axis", "4 channels", "at 5 places a ray", "21 parameters",
-                 "training cameras   5, pictures of 48x40", "psnr", "from -1, 0, 1 to 3, 4, 5",
+                 "5 training views of 48x40", "psnr", "4 x 4 x 4 units, from -1, 0, 1 to 3, 4, 5",
                  "head.onnx"):  # fmt: skip
         assert text in page, text
     assert cli.main([str(shells_folder), "--info", "--json", "-"]) == 0
@@ -162,8 +162,17 @@ def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "nothing to do: add --cameras FILE --output DIR"),
-        (["--orbit", "3"], "--output: add the folder"),
+        (["--orbit", "3"], "--output: add where the pictures go"),
+        (["--force"], "--force: add the views and --output"),
+        (["--orbit", "3", "--output", "o", "--port", "1"], "--host, --port: they are of the viewer"),
+        (["--port", "65536"], "expected a port, 1 to 65535, got '65536'"),
+        (["--orbit", "3", "--output", "o", "--resume", "--force"], "--resume: not allowed with --force"),
+        (["--orbit", "3", "--output", "o.mp4", "--format", "png"], "--format: o.mp4 says"),
+        (["--orbit", "3", "--output", "o", "--fps", "3"], "--fps: expected a video"),
+        (["--orbit", "3", "--output", "o.mp4", "--fps", "0"], "expected 0 to 1000 frames a second, got '0'"),
+        (["--orbit", "3", "--output", "o.mp4", "--background", "transparent"], "a video has no transparency"),
+        (["--orbit", "3", "--output", "o", "--size", "0x0"], "WIDTHxHEIGHT, from 1x1 on, got '0x0'"),
+        (["--view", "x", "--output", "o"], "expected a whole number, got 'x'"),
         (["--output", "o"], "--output: add the views"),
         (["--orbit", "0", "--output", "o"], "--orbit"),
         (["--orbit", "3", "--info"], "not allowed with"),
@@ -186,7 +195,8 @@ def test_usage(
     ("options", "message"),
     [
         (["--cameras", "nowhere.json"], "nowhere.json"),
-        (["--orbit", "1", "--size", "20000x20000"], "size: expected at most"),
+        (["--orbit", "1", "--size", "20000x20000"], "got 20000x20000, which would take 12.0 GB of memory"),
+        (["--view", "5"], "--view: expected 0 to 4, got 5"),
         (["--orbit", "1", "--frames", "5:9"], "--frames: expected at least one of the 1 views"),
     ],
 )
@@ -231,7 +241,7 @@ def test_ctrl_c_keeps_finished_frames(
     monkeypatch.setattr(Renderer, "render", stop)
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o")]) == 130
     assert sorted(p.name for p in (tmp_path / "o").iterdir()) == ["r_0.png", "r_1.png"]
-    assert "kept" in capsys.readouterr().err
+    assert f"kept in {tmp_path / 'o'}; --resume goes on" in capsys.readouterr().err
 
 
 def test_progress_on_a_terminal(shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

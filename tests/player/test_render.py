@@ -178,3 +178,30 @@ def test_heads_that_do_not_fit(tmp_path: Path) -> None:
 def test_png_wants_bytes() -> None:
     with pytest.raises(ShapeError, match="pixels: expected"):
         png_bytes(np.zeros((2, 2, 3), np.float32))
+
+
+@pytest.mark.parametrize("distance", [1e4, 1e8])
+def test_a_camera_far_away_sees_what_a_parallel_one_sees(distance: float, asset: Asset) -> None:
+    """The focal length grows with the distance, so that the picture stays; at 1e8 float32 has steps of 8."""
+    frames = []
+    for d in (distance, 3e3):
+        pose = look_at((1 + d, 2, 3), (1, 2, 3))
+        frames.append(render(asset, Camera("far", pose, 40, 30, 7 * d, 7 * d, 20.0, 15.0)))
+    far, near = frames
+    assert 0.1 < near.opacity.mean() < 0.9
+    assert np.abs(far.opacity - near.opacity).mean() < 0.01
+    met = (far.opacity > 0.5) & (near.opacity > 0.5)
+    assert np.abs((far.depth - distance) - (near.depth - 3e3))[met].max() < (0.02 if distance < 1e5 else 9)
+    assert (far.depth[far.opacity == 0] == 0).all()
+
+
+def test_a_camera_far_away_with_an_ordinary_lens_sees_background(asset: Asset, camera: Camera) -> None:
+    far = replace(camera, c2w=look_at((1e8, 2, 3), (1, 2, 3)))
+    assert (render(asset, far, background=(0.0, 0.5, 1.0)).to_uint8() == [0, 128, 255]).all()
+
+
+def test_a_frame_that_was_put_together_has_no_normals() -> None:
+    zeros = np.zeros((2, 1), np.float32)
+    frame = render_module.Frame(np.zeros((2, 1, 3), np.float32), zeros, zeros, zeros, (0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="normals: expected the frame of a renderer"):
+        frame.normals  # noqa: B018

@@ -1,0 +1,27 @@
+"""What the tests and the examples in docstrings share: a small asset, to be opened as "out/" in the
+latter."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shells_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An analytic asset; do not change it, take `broken_folder` for that."""
+    from tests.player.conftest import write_shells
+
+    return write_shells(tmp_path_factory.mktemp("assets") / "shells")
+
+
+@pytest.fixture(autouse=True)
+def asset_of_examples(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Examples that open "out/" find the asset there."""
+    node = request.node
+    if isinstance(node, pytest.DoctestItem) and node.dtest is not None and '"out/' in node.dtest.docstring:
+        folder = tmp_path_factory.mktemp("example")
+        shutil.copytree(request.getfixturevalue("shells_folder"), folder / "out")
+        request.getfixturevalue("monkeypatch").chdir(folder)

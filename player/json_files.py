@@ -1,0 +1,68 @@
+"""JSON from outside: read with a bound on its size, and what was found there in one short line."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from player.errors import FormatError
+
+MAX_FILE_BYTES = 64 * 2**20
+
+
+def read_json(path: str | Path, what: str) -> bytes:
+    """The bytes of a JSON file; `what` it should be is for the message.
+
+    Raises FormatError: no such file, not a plain file, over 64 MB.
+    """
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise FormatError(f"{path}: cannot read: expected a file, {what}, got something else")
+        n_bytes = path.stat().st_size
+        if n_bytes > MAX_FILE_BYTES:
+            raise FormatError(f"{path}: size: expected at most {MAX_FILE_BYTES} bytes, got {n_bytes}")
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: no such file: expected {what}") from error
+    except FormatError:
+        raise
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def parse_json(data: bytes, where: str) -> Any:
+    """What the bytes say; NaN and Infinity are not JSON. Raises FormatError.
+
+    >>> parse_json(b"[1, NaN]", "numbers")
+    Traceback (most recent call last):
+    player.errors.FormatError: numbers: expected JSON, got NaN, which is not a number of JSON
+    """
+    try:
+        return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{where}: expected JSON, got {brief(str(error))}") from error
+
+
+def as_float(value: Any) -> float | None:
+    """A finite number as float, None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def brief(value: Any) -> str:
+    """What was found, in one short line of plain characters."""
+    text = ascii(value) if not isinstance(value, str) else value
+    text = text.encode("ascii", "backslashreplace").decode().replace("\n", " ").replace("\r", " ")
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name}, which is not a number of JSON")

@@ -1,0 +1,48 @@
+"""A picture in a terminal that has 16 million colours: two pixels a character, as upper half blocks."""
+
+from __future__ import annotations
+
+import os
+from typing import TextIO
+
+import numpy as np
+
+from player.asset import Asset
+
+ROWS = 16
+"""Lines of the picture on the `--info` page."""
+
+
+def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
+    """The asset from its first training view, as lines for `stream`; none where it cannot show colours."""
+    encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
+    if not (stream.isatty() and encoding == "utf8" and os.environ.get("COLORTERM") in ("truecolor", "24bit")):
+        return []
+    from player.render import render
+    from player.transforms import read_cameras
+
+    width, height = asset.manifest.view_size
+    camera = read_cameras(asset.path("cameras.json"), (width, height))[0]
+    columns = min(
+        round(2 * ROWS * camera.width / camera.height), os.get_terminal_size(stream.fileno()).columns
+    )
+    small = camera.resized(2 * columns, 4 * ROWS)
+    frame = render(asset, small, march="numpy")  # nothing to compile: 64 rows take a moment
+    halves = frame.to_uint8().reshape(2 * ROWS, 2, columns, 2, 3).mean(axis=(1, 3))
+    return [*half_blocks((halves + 0.5).astype(np.uint8)), ""]
+
+
+def half_blocks(pixels: np.ndarray) -> list[str]:
+    """Lines of upper half blocks: [2 n, columns, 3] uint8 to n lines.
+
+    >>> half_blocks(np.uint8([[[1, 2, 3]], [[4, 5, 6]]]))
+    ['\\x1b[38;2;1;2;3;48;2;4;5;6m▀\\x1b[0m']
+    """
+    lines = []
+    for above, below in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True):
+        cells = (
+            "\x1b[38;2;{};{};{};48;2;{};{};{}m▀".format(*top, *bottom)
+            for top, bottom in zip(above, below, strict=True)
+        )
+        lines.append("".join(cells) + "\x1b[0m")
+    return lines

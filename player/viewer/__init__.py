@@ -1,0 +1,1 @@
+"""The interactive viewer, on viser: needs the extra `viewer`."""

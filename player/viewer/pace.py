@@ -1,0 +1,62 @@
+"""How large the next picture is: small while the camera moves, so that it moves smoothly, whole once it
+stands still.
+
+The size while moving is found by feedback: the time that the last picture took, against the time that it
+may take, says how many pixels the next one gets. Nothing is assumed about machine, asset or view.
+"""
+
+from __future__ import annotations
+
+import math
+
+FRAME_SECONDS = 1 / 15
+"""A picture while moving may take this long."""
+
+SHARE = 0.8
+"""Of that, what rendering may take; the rest is for encoding and sending."""
+
+STILL_SECONDS = 0.15
+"""Without a move for this long, the camera counts as standing still."""
+
+SHARP_SECONDS = 0.5
+"""Of rendering, for the first picture after that: it is on the screen within a second."""
+
+LEAST = 64 * 48
+"""Pixels of the smallest picture: with less nobody knows where he is."""
+
+
+class Pace:
+    """Sizes of pictures for one window.
+
+    >>> pace = Pace()
+    >>> pace.measured(10_000, 0.04)  # a quarter less than it may take
+    >>> pace.moving(400, 300)
+    (133, 100)
+    """
+
+    def __init__(self) -> None:
+        self._pixels = 20_000.0
+
+    def measured(self, pixels: int, seconds: float) -> None:
+        """Learn from a picture that was rendered while moving."""
+        wanted = pixels * SHARE * FRAME_SECONDS / max(seconds, 1e-4)
+        # At most twice or half of it at a time: one hiccup of the machine does not blur the next ten.
+        self._pixels = max(min(wanted, 2 * self._pixels), self._pixels / 2, LEAST)
+
+    def moving(self, width: int, height: int) -> tuple[int, int]:
+        """Size of the next picture while the camera moves, for a window of `width` x `height`."""
+        return fitted(width, height, self._pixels)
+
+    def sharp(self, width: int, height: int) -> tuple[int, int]:
+        """Size of the first picture after the camera has come to a stand."""
+        return fitted(width, height, self._pixels * SHARP_SECONDS / (SHARE * FRAME_SECONDS))
+
+
+def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
+    """The window's size, made smaller to at most about so many pixels, in its proportions.
+
+    >>> fitted(800, 600, 120_000), fitted(800, 600, 1e9)
+    ((400, 300), (800, 600))
+    """
+    scale = min(1.0, math.sqrt(pixels / (width * height)))
+    return max(1, round(width * scale)), max(1, round(height * scale))

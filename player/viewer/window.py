@@ -1,0 +1,251 @@
+"""One browser window: its controls, its camera, and the thread that renders for it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from player.camera_path import write_camera_path
+from player.cameras import Camera
+from player.errors import VfrError
+from player.images import png_bytes
+from player.keyframes import smooth_path
+from player.render import Frame, Renderer
+from player.viewer.layers import LAYERS, layer_picture
+from player.viewer.pace import STILL_SECONDS, Pace
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+PATH_FPS = 30
+STRIP_PIXELS = 50_000
+"""The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
+
+
+class Window:
+    """What one client sees; `start` begins, `close` ends it, also when the client is gone."""
+
+    def __init__(
+        self,
+        client: Any,
+        renderer: Renderer,
+        trained: Sequence[Camera],
+        focus: np.ndarray,
+        samples: int | None,
+        background: tuple[float, float, float] | None,
+    ) -> None:
+        self._client = client
+        self._renderer = renderer
+        self._trained = trained
+        self._focus = focus
+        self._pace = Pace()
+        self._views: list[Camera] = []
+        self._changed = threading.Condition()
+        self._version = 0
+        self._moved = 0.0
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
+        own = renderer.asset.manifest
+        self._add_controls(
+            own.n_samples if samples is None else samples,
+            own.background if background is None else background,
+        )
+        client.camera.on_update(lambda _: self.touch())
+
+    def start(self) -> None:
+        """Begin to render."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread; returns at once."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def touch(self) -> None:
+        """Something has changed: the picture on the screen is out of date."""
+        with self._changed:
+            self._version += 1
+            self._moved = time.monotonic()
+            self._changed.notify()
+
+    # --- controls ---
+
+    def _add_controls(self, samples: int, background: Sequence[float]) -> None:
+        gui = self._client.gui
+        with gui.add_folder("Picture"):
+            self._layer = gui.add_dropdown("Show", LAYERS, initial_value="colour")
+            self._samples = gui.add_slider(
+                "Fetches",
+                0,
+                max(16, samples),
+                1,
+                samples,
+                hint="places along a ray where features are fetched; 0: all",
+            )
+            behind = tuple(round(255 * value) for value in background)
+            self._background = gui.add_rgb("Background", behind)
+            degrees = round(math.degrees(self._client.camera.fov), 1)
+            self._fov = gui.add_slider("Field of view", 1.0, 150.0, 0.1, min(max(degrees, 1.0), 150.0))
+            self._state = gui.add_text("Now", "", disabled=True)
+        for control in (self._layer, self._samples, self._background):
+            control.on_update(lambda _: self.touch())
+        self._fov.on_update(lambda _: self._set_fov())
+        with gui.add_folder("Views"):
+            last = len(self._trained) - 1
+            self._view = gui.add_slider("Training view", 0, max(last, 1), 1, 0, disabled=last < 1)
+            jump = gui.add_button("Jump to it")
+            picture = gui.add_button("Screenshot")
+        self._view.on_update(lambda _: self._jump())
+        jump.on_click(lambda _: self._jump())
+        picture.on_click(lambda _: self._screenshot())
+        with gui.add_folder("Camera path"):
+            record = gui.add_button("Record this view")
+            self._seconds = gui.add_slider("Seconds a view", 0.5, 10.0, 0.5, 2.0)
+            self._save = gui.add_button("Save path", disabled=True)
+            self._clear = gui.add_button("Clear path", disabled=True)
+        record.on_click(lambda _: self._record())
+        self._save.on_click(lambda _: self._save_path())
+        self._clear.on_click(lambda _: self._clear_path())
+
+    def _set_fov(self) -> None:
+        self._client.camera.fov = math.radians(self._fov.value)
+        self.touch()
+
+    def _jump(self) -> None:
+        camera = self._trained[min(self._view.value, len(self._trained) - 1)]
+        place, handle = camera.c2w[:3, 3], self._client.camera
+        ahead = max(float(-camera.c2w[:3, 2] @ (self._focus - place)), 1e-3)
+        with self._client.atomic():
+            handle.position = place
+            handle.look_at = place - ahead * camera.c2w[:3, 2]
+            handle.wxyz = _wxyz(camera.c2w[:3, :3] @ OPENGL_FROM_OPENCV)
+        self._fov.value = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+        self._set_fov()
+
+    def _screenshot(self) -> None:
+        frame = self._frame(self._camera())
+        data = png_bytes(layer_picture(frame, self._layer.value))
+        self._client.send_file_download("screenshot.png", data, save_immediately=True)
+
+    def _record(self) -> None:
+        self._views.append(self._camera())
+        self._show_path()
+
+    def _clear_path(self) -> None:
+        self._views.clear()
+        self._show_path()
+
+    def _show_path(self) -> None:
+        n = len(self._views)
+        self._save.disabled, self._clear.disabled = n < 2, n == 0
+        self._save.label = f"Save path of {n} views" if n else "Save path"
+
+    def _save_path(self) -> None:
+        steps = max(1, round(self._seconds.value * PATH_FPS))
+        data = write_camera_path(smooth_path(self._views, steps), PATH_FPS)
+        self._client.send_file_download("camera_path.json", data, save_immediately=True)
+
+    # --- pictures ---
+
+    def _camera(self) -> Camera:
+        """The camera of the window as it is now, in the world frame."""
+        seen = self._client.camera
+        c2w = np.eye(4)
+        c2w[:3, :3] = _matrix(seen.wxyz) @ OPENGL_FROM_OPENCV
+        c2w[:3, 3] = seen.position
+        width, height = max(int(seen.image_width), 1), max(int(seen.image_height), 1)
+        focal = height / 2 / math.tan(seen.fov / 2)
+        return Camera("viewer", c2w, width, height, focal, focal, width / 2, height / 2)
+
+    def _frame(self, camera: Camera) -> Frame:
+        red, green, blue = (value / 255 for value in self._background.value)
+        return self._renderer.render(camera, int(self._samples.value), (red, green, blue))
+
+    def _run(self) -> None:
+        version = -1
+        while True:
+            if not self._wait(version, None):
+                return
+            version = self._version
+            try:
+                self._show_moving()
+                self._sharpen(version)
+            except VfrError as error:
+                self._state.value = str(error)
+
+    def _wait(self, version: int, seconds: float | None) -> bool:
+        """Wait for something newer than `version`; whether there is, and the window still open."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._version != version, seconds)
+            return self._version != version and not self._closed
+
+    def _show_moving(self) -> None:
+        camera = self._camera()
+        start = time.perf_counter()
+        small = camera.resized(*self._pace.moving(camera.width, camera.height))
+        picture = layer_picture(self._frame(small), self._layer.value)
+        seconds = time.perf_counter() - start
+        self._pace.measured(small.width * small.height, seconds)
+        self._send(picture, 75, f"{small.width}x{small.height}, {seconds * 1000:.0f} ms")
+
+    def _sharpen(self, version: int) -> None:
+        """After a moment of standing still: a picture that half a second allows, then the whole one; given
+        up as soon as something changes."""
+        if self._wait(version, STILL_SECONDS) or self._closed:
+            return
+        camera = self._camera()
+        window = (camera.width, camera.height)
+        size = self._pace.sharp(*window)
+        for width, height in dict.fromkeys([size, window]):
+            start = time.perf_counter()
+            picture = self._in_strips(camera.resized(width, height), version)
+            if picture is None:
+                return
+            seconds = time.perf_counter() - start
+            self._send(picture, 95, f"{width}x{height}, {seconds * 1000:.0f} ms")
+
+    def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
+        """The picture, or None if something changed meanwhile."""
+        layer = self._layer.value
+        rows = max(1, STRIP_PIXELS // camera.width)
+        frames = []
+        for top in range(0, camera.height, rows):
+            if self._closed or self._version != version:
+                return None
+            strip = replace(camera, height=min(rows, camera.height - top), cy=camera.cy - top)
+            frames.append(self._frame(strip))
+        return layer_picture(_joined(frames, layer), layer)
+
+    def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
+        self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        self._state.value = state
+
+
+def _joined(frames: Sequence[Frame], layer: str) -> Frame:
+    """Strips, the uppermost first, as one frame."""
+
+    def all_of(name: str) -> np.ndarray:
+        return np.concatenate([getattr(frame, name) for frame in frames])
+
+    normals = all_of("normals") if layer == "normals" else None
+    return Frame(
+        all_of("rgb"), all_of("opacity"), all_of("depth"), all_of("n_samples"), frames[0].background,
+        find_normals=None if normals is None else lambda: normals,
+    )  # fmt: skip
+
+
+def _wxyz(rotation: np.ndarray) -> np.ndarray:
+    from viser.transforms import SO3
+
+    return SO3.from_matrix(rotation).wxyz
+
+
+def _matrix(wxyz: np.ndarray) -> np.ndarray:
+    from viser.transforms import SO3
+
+    return SO3(np.asarray(wxyz)).as_matrix()
