@@ -218,7 +218,9 @@ def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
         path = folder / _FILES[name]
         return unpack_codes(path.read_bytes(), shape, _DTYPES[name], str(path))
 
-    return GridArrays(coords, masks, codes("density", n_vertices), codes("features", n_vertices, manifest.n_channels))
+    return GridArrays(
+        coords, masks, codes("density", n_vertices), codes("features", n_vertices, manifest.n_channels)
+    )
 
 
 def _read_manifest(folder: Path) -> Manifest:

@@ -1,8 +1,9 @@
-"""How rows of 8-bit codes are written in few bytes: one encoder, one decoder, shared by the bake and the player.
+"""How rows of 8-bit codes are written in few bytes: one encoder, one decoder, shared by the bake and the
+player.
 
-Rows follow each other along z in a brick, so that neighbours in space are mostly neighbours in the file and their
-codes lie close together. Each channel is written by itself, as the differences between successive rows modulo 256,
-and the whole is a zlib stream (RFC 1950).
+Rows follow each other along z in a brick, so that neighbours in space are mostly neighbours in the file and
+their codes lie close together. Each channel is written by itself, as the differences between successive rows
+modulo 256, and the whole is a zlib stream (RFC 1950).
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ def pack_codes(codes: np.ndarray) -> bytes:
     """Codes [n] or [n, n_channels], int8 or uint8, as bytes.
 
     >>> codes = np.repeat(np.arange(200, dtype=np.uint8), 50)
-    >>> len(pack_codes(codes)) < 300 and np.array_equal(unpack_codes(pack_codes(codes), (10000,), "u1", ""), codes)
-    True
+    >>> packed = pack_codes(codes)
+    >>> len(packed) < 300, np.array_equal(unpack_codes(packed, (10000,), "u1", "codes"), codes)
+    (True, True)
     """
     planes = np.ascontiguousarray((codes if codes.ndim == 2 else codes[:, None]).T).view(np.uint8)
     steps = planes.copy()

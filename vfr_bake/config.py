@@ -3,7 +3,7 @@ units."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
@@ -258,44 +258,126 @@ class TrainConfig:
         return Pace(**(defaults | {name: value for name, value in given.items() if value is not None}))
 
 
+Preset = Literal["fidelity", "balanced", "fast"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeChoice:
+    """What a preset decides, with what was given instead in its place."""
+
+    cells_per_pixel: float
+    """Resolution of the grid where none is given: cells for each pixel that the training pictures see across
+    the middle of the box, at most the field's finest level."""
+    n_channels: int
+    """Most feature channels."""
+    channel_loss_db: float
+    """Fewer channels are taken where they lose no more than this, before refinement, dB."""
+    n_samples: int
+    weight_floor: float
+    code_levels: int
+    head_width: int
+    head_bits: int
+    refine_steps: int
+    mesh_resolution: int
+    target_loss_db: float
+    """Expected loss that the preset aims at, dB."""
+
+
+PRESETS: dict[Preset, BakeChoice] = {
+    "fidelity": BakeChoice(
+        cells_per_pixel=4.0, n_channels=18, channel_loss_db=0.05, n_samples=16, weight_floor=0.01,
+        code_levels=63, head_width=0, head_bits=32, refine_steps=500, mesh_resolution=128,
+        target_loss_db=0.05,
+    ),
+    "balanced": BakeChoice(
+        cells_per_pixel=1.25, n_channels=10, channel_loss_db=0.5, n_samples=8, weight_floor=0.01,
+        code_levels=31, head_width=64, head_bits=32,
+        refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
+    ),
+    "fast": BakeChoice(
+        cells_per_pixel=0.9, n_channels=8, channel_loss_db=1.5, n_samples=4, weight_floor=0.02,
+        code_levels=31, head_width=32, head_bits=32, refine_steps=2000, mesh_resolution=96,
+        target_loss_db=1.0,
+    ),
+}  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
-    """Settings of `vfr-bake`."""
+    """Settings of `vfr-bake`; what is None follows from the preset (`choice`)."""
 
-    resolution: int = 0
-    """Cells per axis of the baked grid, at most the field's finest level; 0: 1.25 cells for each pixel that
-    the training pictures see across the middle of the box."""
-    n_channels: int = 16
-    """Feature channels kept of the field's; the projection is folded into the head."""
-    n_samples: int = 5
-    """Feature lookups per ray, k; the player can be asked for another number."""
-    weight_floor: float = 0.005
-    """A cell is stored if some training ray gives one of its samples at least this weight."""
-    refine_steps: int = 1500
-    """Steps in which the head is adapted to the baked features, the full model being the teacher; 0: none."""
-    head_bits: int = 8
-    """Bits of the head's wide layers: 8 is about twice as fast to play as 32 (float32)."""
-    mesh_resolution: int = 192
+    preset: Preset = "balanced"
+    """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: the
+    fewest bytes and the smallest head."""
+    resolution: int | None = None
+    """Cells per axis of the baked grid, at most the field's finest level."""
+    n_channels: int | None = None
+    """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
+    few as the preset's loss allows."""
+    n_samples: int | None = None
+    """Feature lookups per ray, k; 0 looks up every sample. The player can be asked for another number."""
+    weight_floor: float | None = None
+    """A cell is stored if some view gives one of its samples at least this weight."""
+    no_cull: bool = False
+    """Store what no view sees as well: every cell that the model holds matter in."""
+    code_levels: int | None = None
+    """Largest feature code, 7 to 127: fewer levels take fewer bytes."""
+    head_width: int | None = None
+    """Width of a smaller head, which learns from the model's own; 0 keeps that one."""
+    head_bits: int | None = None
+    """Bits of the wide layers of the model's own head: 8 is about twice as fast to play as 32 (float32)."""
+    refine_steps: int | None = None
+    """Steps of each round in which head and stored values are adapted to each other, the full model being the
+    teacher; 0: none."""
+    mesh_resolution: int | None = None
     """Voxels along each side of the box for the mesh; 0 leaves the mesh at the grid's own resolution."""
+    max_loss_db: float | None = None
+    """Fail, and write nothing, if the written files are expected to lose more than this against
+    photographs."""
+    max_mb: float | None = None
+    """Fail, and write nothing, if the asset takes more megabytes than this."""
     check_views: int = 4
-    """Training views played from the written files and compared with the full model."""
+    """Views between the training cameras on which each step of the bake is measured."""
 
     def __post_init__(self) -> None:
+        _check(self.preset in PRESETS, "preset", f"one of {tuple(PRESETS)}", self.preset)
         _check(
-            self.resolution == 0 or 8 <= self.resolution <= 2048,
+            self.resolution is None or 8 <= self.resolution <= 2048,
             "resolution",
-            "0 or 8 to 2048",
+            "8 to 2048",
             self.resolution,
         )
-        _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
-        _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
-        _check(0 <= self.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", self.refine_steps)
-        _check(self.head_bits in (8, 32), "head_bits", "8 or 32", self.head_bits)
-        _check(0 < self.weight_floor < 1, "weight_floor", "between 0 and 1", self.weight_floor)
         _check(
-            self.mesh_resolution == 0 or 8 <= self.mesh_resolution <= 1024,
+            self.max_loss_db is None or self.max_loss_db > 0, "max_loss_db", "more than 0", self.max_loss_db
+        )
+        _check(self.max_mb is None or self.max_mb > 0, "max_mb", "more than 0", self.max_mb)
+        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
+        choice = self.choice()
+        _check(1 <= choice.n_channels <= 64, "n_channels", "1 to 64", choice.n_channels)
+        _check(0 <= choice.n_samples <= 64, "n_samples", "0 to 64", choice.n_samples)
+        _check(7 <= choice.code_levels <= 127, "code_levels", "7 to 127", choice.code_levels)
+        _check(
+            choice.head_width == 0 or 8 <= choice.head_width <= 256,
+            "head_width",
+            "0 or 8 to 256",
+            choice.head_width,
+        )
+        _check(0 <= choice.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", choice.refine_steps)
+        _check(choice.head_bits in (8, 32), "head_bits", "8 or 32", choice.head_bits)
+        _check(0 < choice.weight_floor < 1, "weight_floor", "between 0 and 1", choice.weight_floor)
+        _check(
+            choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024,
             "mesh_resolution",
             "0 or 8 to 1024",
-            self.mesh_resolution,
+            choice.mesh_resolution,
         )
-        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
+
+    def choice(self) -> BakeChoice:
+        """The preset, with what is given in its place.
+
+        >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
+        (5, 64)
+        """
+        preset = PRESETS[self.preset]
+        given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
+        return replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -1,4 +1,5 @@
-"""What the player composes on rays, taken apart so that it can be learned, and what the full model shows there.
+"""What the player composes on rays, taken apart so that it can be learned, and what the full model shows
+there.
 
 Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
 densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
@@ -8,7 +9,7 @@ of samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,59 +52,76 @@ class Lessons:
         return len(self.opacity)
 
     def composed(self, codes: np.ndarray, some: np.ndarray | None = None, rounded: bool = True) -> np.ndarray:
-        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, of all lessons or of
-        those whose numbers are in `some`."""
+        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, of all lessons or
+        of those whose numbers are in `some`."""
         some = np.arange(len(self)) if some is None else some
         out = np.empty((len(some), codes.shape[1]), np.float32)
         compose(some, self.starts, self.rows, self.shares, self.weights, codes, rounded, out)
         return out
 
 
-def collect_lessons(
-    model: Model, grid: SparseGrid, n_samples: int, cameras: list[Camera], n_rays: int, seed: int
-) -> Lessons:
-    """Lessons from random pixels of `cameras` (model frame), `n_rays` in all, of which those count that meet
-    something in the grid; n_samples as the player's k, 0 for every sample.
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """n rays and what the full model shows on them."""
+
+    rays_o: np.ndarray
+    """[n, 3] float32, model frame."""
+    rays_d: np.ndarray
+    """[n, 3] float32, of unit length."""
+    features: np.ndarray
+    """[n, n_channels] float32 composited features of the model."""
+    colours: np.ndarray
+    """[n, 3] float32 colours times opacity."""
+    opacity: np.ndarray
+    """[n] float32."""
+
+
+def teach(
+    model: Model, cameras: list[Camera], n_rays: int, seed: int, progress: Callable[[int, int], object]
+) -> Taught:
+    """The full model on about `n_rays` random pixels of `cameras` (model frame); those at which it has
+    nothing to show are left out."""
+    random = np.random.default_rng(seed)
+    parts = []
+    for done, camera in enumerate(cameras):
+        rays_o, rays_d = camera.rays()
+        some = random.choice(len(rays_o), min(len(rays_o), max(n_rays // len(cameras), 1)), replace=False)
+        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[some], rays_d[some])
+        met = np.flatnonzero(opacity > 0)
+        some, features, opacity = some[met], features[met], opacity[met]
+        colours = head_colours(model.field, features, rays_d[some]) * opacity[:, None]
+        parts.append((rays_o[some], rays_d[some], features, colours, opacity))
+        progress(done + 1, len(cameras))
+    return Taught(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def collect_lessons(taught: Taught, grid: SparseGrid, n_samples: int) -> Lessons:
+    """Lessons from those rays that meet something in the grid; n_samples as the player's k, 0 for every
+    sample.
 
     Raises TrainingError where none does.
     """
-    random = np.random.default_rng(seed)
-    parts = [
-        part
-        for camera in cameras
-        for part in _lessons_of_view(model, grid, n_samples, *_pixels(camera, n_rays // len(cameras), random))
-    ]
+    parts = []
+    for first in range(0, len(taught.opacity), RAYS_AT_ONCE):
+        rows = slice(first, first + RAYS_AT_ONCE)
+        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_samples)
+        of_hits = (column[rows][hits] for column in (taught.rays_d, taught.colours, taught.opacity))
+        dirs, colours, full_opacity = of_hits
+        parts.append((*fetches, dirs, opacity, colours, full_opacity))
     if sum(len(part[0]) for part in parts) == 0:
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    starts = np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)])
-    return Lessons(starts, *columns[1:])
-
-
-def _pixels(camera: Camera, n: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    rays_o, rays_d = camera.rays()
-    rows = random.choice(len(rays_o), min(len(rays_o), max(n, 1)), replace=False)
-    return rays_o[rows], rays_d[rows]
-
-
-def _lessons_of_view(
-    model: Model, grid: SparseGrid, n_samples: int, rays_o: np.ndarray, rays_d: np.ndarray
-) -> Iterator[tuple[np.ndarray, ...]]:
-    for first in range(0, len(rays_o), RAYS_AT_ONCE):
-        o, d = rays_o[first : first + RAYS_AT_ONCE], rays_d[first : first + RAYS_AT_ONCE]
-        hits, opacity, fetches = player_fetches(grid, o, d, n_samples)
-        features, full_opacity, _ = model.occupancy.composited_features(model.field, o[hits], d[hits])
-        colours = head_colours(model.field, features, d[hits]) * full_opacity[:, None]
-        yield *fetches, d[hits], opacity, colours, full_opacity
+    return Lessons(np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)]), *columns[1:])
 
 
 def player_fetches(
     grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """The linear map from stored codes to the composites of the rays that hit, as `player.march` composes them.
+    """The linear map from stored codes to the composites of the rays that hit, as `player.march` composes
+    them.
 
-    Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8], shares
-    [n_fetches, 8], weights [n_fetches]).
+    Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8],
+    shares [n_fetches, 8], weights [n_fetches]).
     """
     entries = enter_box(grid, rays_o, rays_d)
     samples, tau, _ = collect_samples(grid, entries, None)
@@ -136,7 +154,9 @@ def player_fetches(
     return hits, opacity[hits], (counts, rows, shares, weights)
 
 
-def _corners(grid: SparseGrid, entries: Entries, ray: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _corners(
+    grid: SparseGrid, entries: Entries, ray: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     points = entries.point[:, ray] + s * entries.direction[:, ray]
     rows, shares = np.empty((len(ray), 8), np.int32), np.empty((len(ray), 8), np.float32)
     corner_rows(

@@ -56,14 +56,25 @@ class HeldOut:
         self.rays_o, self.rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         self.background = model.background
         features, opacity, _ = model.occupancy.composited_features(model.field, self.rays_o, self.rays_d)
-        colours = np.zeros((len(opacity), 3), np.float32)
-        hits = np.flatnonzero(opacity > 0)
-        colours[hits] = head_colours(model.field, features[hits], self.rays_d[hits]) * opacity[hits, None]
-        self.wanted = colours + (1 - opacity[:, None]) * self.background
+        self._hits = np.flatnonzero(opacity > 0)
+        self._features, self._opacity = features[self._hits], opacity[self._hits, None]
+        self._field = model.field
+        self.wanted = (1 - opacity[:, None]) * self.background
+        self.wanted[self._hits] += self._opacity * self._colours(self._features)
         self.model_psnr = float(
             model.figures.get("test_psnr") or model.figures.get("training_psnr") or DEFAULT_PSNR
         )
         self.stages: list[Stage] = []
+
+    def _colours(self, features: np.ndarray) -> np.ndarray:
+        return head_colours(self._field, features, self.rays_d[self._hits])
+
+    def channel_loss(self, kept: np.ndarray) -> float:
+        """Expected loss in dB if the model's own rendered features x went through `kept` [n_channels,
+        n_channels], a projection of them."""
+        shown = self._colours((self._features @ kept.T).astype(np.float32))
+        off = self._opacity * (shown - self._colours(self._features))
+        return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
 
     def shown(self, grid: SparseGrid, head: Head, n_samples: int) -> tuple[np.ndarray, np.ndarray]:
         """Colours [n, 3] over the background as played, and the samples taken of each ray that hits."""

@@ -96,9 +96,7 @@ def refine(
     return Stored(head.weights(), features, density)
 
 
-def _loss(
-    head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray
-) -> Tensor:
+def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray) -> Tensor:
     """Mean squared error of the colours of the lessons `some` over random backgrounds."""
     dirs, colours, full_opacity = (
         torch.from_numpy(column[some]) for column in (lessons.dirs, lessons.colours, lessons.full_opacity)

@@ -19,8 +19,8 @@ from vfr_bake.training.comparison import BRIGHTEST_ERROR, comparison
 BAR_WIDTH = 420
 """Pixels of the longest bar of a plot."""
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0 }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #222
+} table { border-collapse: collapse; margin: 1em 0 }
 td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top }
 td.number { text-align: right; font-variant-numeric: tabular-nums }
 svg text { font: 13px system-ui, sans-serif }
@@ -67,8 +67,8 @@ class BakeReport:
         megabytes = sum(self.n_bytes.values()) / 1e6
         parts = [
             f"<p>{megabytes:.1f} MB, baked in {sum(self.seconds.values()):.0f} s; the written files play "
-            f"{last['psnr']:.1f} dB from the model's own pictures, an expected loss of {last['loss_db']:.2f} dB "
-            "against photographs.</p>",
+            f"{last['psnr']:.1f} dB from the model's own pictures, an expected loss of "
+            f"{last['loss_db']:.2f} dB against photographs.</p>",
             *(f'<p class="missed">Missed: {escape(text)}</p>' for text in self.missed),
             "<h2>Loss, stage by stage</h2>",
             bars({stage["name"]: stage["loss_db"] for stage in self.stages}, "dB", 3),

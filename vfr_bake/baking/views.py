@@ -14,8 +14,9 @@ LARGEST_TURN = np.deg2rad(15.0)
 
 
 def views_between(model: Model, n_views: int, seed: int) -> list[Camera]:
-    """`n_views` training cameras (model frame), spread evenly, each turned around what all cameras look at by up
-    to half the angle to its nearest neighbour. The same seed gives the same views, another one others."""
+    """`n_views` training cameras (model frame), spread evenly, each turned around what all cameras look at
+    by up to half the angle to its nearest neighbour. The same seed gives the same views, another one
+    others."""
     cameras = model.model_cameras()
     random = np.random.default_rng(seed)
     focus = focus_point(cameras)

@@ -2,11 +2,11 @@
 
 Letters: lesson i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
 weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
-x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples of a
-ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) step, T_j = exp(-sum_{i<j} delta_i),
-weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as the integer nearest to a float
-`latent`; what is composed is the integers, and the gradient is applied to the latent as if there were no
-rounding (straight through).
+x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
+of a ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) step, T_j = exp(-sum_{i<j}
+delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as the integer
+nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the latent as
+if there were no rounding (straight through).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ BLOCK = 64
 
 @njit(parallel=True, cache=True)
 def compose(lessons, starts, rows, shares, weights, latent, rounded, out):
-    """out [n, n_channels] of `lessons` [n], from the latent codes [n_vertices, n_channels], rounded or not."""
+    """out [n, n_channels] of `lessons` [n], from the latent codes [n_vertices, n_channels], rounded or
+    not."""
     n_channels = latent.shape[1]
     for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
@@ -67,8 +68,8 @@ def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, stee
 
 @njit(parallel=True, cache=True)
 def weigh(lessons, starts, rows, shares, latent, low, slope, step, opaque, weights, opacity):
-    """Weights of the fetches of `lessons`, and their opacity, from the latent density codes [n_vertices]; both
-    in place. Behind the optical depth `opaque` nothing weighs."""
+    """Weights of the fetches of `lessons`, and their opacity, from the latent density codes [n_vertices];
+    both in place. Behind the optical depth `opaque` nothing weighs."""
     for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
             lesson = lessons[i]
@@ -94,8 +95,8 @@ def descend_density(
     """One step of Adagrad on the latent density codes [n_vertices], in place, kept within 0..255.
 
     dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
-    n_channels] are the latent feature codes; `gradient` [n, n_channels] and `gradient_of_opacity` [n] are those
-    of x and A.
+    n_channels] are the latent feature codes; `gradient` [n, n_channels] and `gradient_of_opacity` [n] are
+    those of x and A.
     """
     n_channels = values.shape[1]
     along = np.zeros(4096, np.float32)
@@ -140,8 +141,8 @@ def descend_density(
 
 @njit(parallel=True, cache=True)
 def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, rows, shares):
-    """The stored corners around `points` [3, n] float32 of the grid (cells): `rows` [n, 8] of features.npy and
-    trilinear `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states."""
+    """The stored corners around `points` [3, n] float32 of the grid (cells): `rows` [n, 8] of features.codes
+    and trilinear `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states."""
     size = np.float32(resolution)
     one = np.float32(1)
     last = resolution - 1
@@ -163,6 +164,4 @@ def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, row
             if rank == absent:
                 continue
             rows[i, corner] = base[brick] + rank
-            shares[i, corner] = (
-                (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
-            )
+            shares[i, corner] = (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
