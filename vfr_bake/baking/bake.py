@@ -34,7 +34,7 @@ from vfr_bake.baking.lessons import Taught, collect_lessons, teach
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.projection import Projection, code_scales, head_sensitivity, project
-from vfr_bake.baking.refinement import FoldedHead, Stored, refine
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, FoldedHead, Stored, refine
 from vfr_bake.baking.report import BakeReport
 from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, visible_cells
@@ -202,7 +202,7 @@ class _Bake:
         choice, n_steps = self.choice, self.choice.refine_steps
         if n_steps == 0:
             return stored
-        rate = {}
+        head_rate = HEAD_RATE
         with self._part("refinement"):
             grid = layout.grid(stored.density, stored.features)
             lessons = collect_lessons(taught, grid, 0)
@@ -214,15 +214,16 @@ class _Bake:
                 stored = replace(stored, head=new)
                 stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
                 self.held_out.measure("small head", grid, runner(stored.head), choice.n_samples)
-                rate = {"head_rate": NEW_HEAD_RATE / 2}
+                head_rate = NEW_HEAD_RATE / 2
                 width = self.model.field.config.head_width
                 self.left_out["head"] = f"a head {width} wide: this one is {choice.head_width} wide"
-            stored = refine(stored, lessons, n_steps, self._progress("refinement"), grid=grid, **rate)
+            stored = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, grid=grid)
             grid = layout.grid(stored.density, stored.features)
             self.held_out.measure("refined", grid, runner(stored.head), choice.n_samples)
             if choice.n_samples:
                 lessons = collect_lessons(taught, grid, choice.n_samples)
-                stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), **rate)
+                rates = head_rate / 2, CODE_RATE / 2  # what is left to learn is little
+                stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
                 grid = layout.grid(stored.density, stored.features)
                 self.held_out.measure("refined at k", grid, runner(stored.head), choice.n_samples)
         return stored

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from player.errors import TrainingError
+from player.march import MIN_OPACITY
 from player.march_compiled import march
 from player.sparse_grid import SparseGrid
 from vfr_bake.baking.views import views_between
@@ -59,6 +61,10 @@ class HeldOut:
         self._hits = np.flatnonzero(opacity > 0)
         self._features, self._opacity = features[self._hits], opacity[self._hits, None]
         self._field = model.field
+        if not (self._opacity > MIN_OPACITY).any():
+            raise TrainingError(
+                "model: expected something to see from its cameras, got nothing: train longer"
+            )
         self.wanted = (1 - opacity[:, None]) * self.background
         self.wanted[self._hits] += self._opacity * self._colours(self._features)
         self.model_psnr = float(

@@ -350,13 +350,17 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path
     assert colours.std(axis=0).min() > 10, "a colourful scene has colourful vertices"
 
 
-def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("logit", "message"), [(-30, "got nothing: train longer"), (-2, "or a thin fog")])
+def test_an_empty_model_and_one_of_fog_are_refused_and_leave_nothing(
+    model: Model, tmp_path: Path, logit: float, message: str
+) -> None:
     empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
     with torch.no_grad():
-        empty.field.density.out.bias.fill_(-30)
+        empty.field.density.out.weight.fill_(0)
+        empty.field.density.out.bias.fill_(logit)
     hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
-    with pytest.raises(TrainingError, match="empty or a thin fog"):
-        bake(hollow, tmp_path / "asset", BakeConfig(), quiet)
+    with pytest.raises(TrainingError, match=message):
+        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
     assert list(tmp_path.iterdir()) == []
 
 
