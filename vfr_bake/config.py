@@ -276,6 +276,11 @@ class BakeChoice:
     weight_floor: float
     code_levels: int
     head_width: int
+    head_layers: int
+    """Directional layers of a smaller head after the first."""
+    head_bands: int
+    """Bands of spherical harmonics of a smaller head, at most the model's; 1 where nothing depends on the
+    direction."""
     head_bits: int
     refine_steps: int
     mesh_resolution: int
@@ -286,18 +291,18 @@ class BakeChoice:
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=4.0, n_channels=18, channel_loss_db=0.05, n_samples=16, weight_floor=0.01,
-        code_levels=63, head_width=0, head_bits=32, refine_steps=500, mesh_resolution=128,
-        target_loss_db=0.05,
+        code_levels=63, head_width=0, head_layers=3, head_bands=4, head_bits=32,
+        refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.25, n_channels=10, channel_loss_db=0.5, n_samples=8, weight_floor=0.01,
-        code_levels=31, head_width=64, head_bits=32,
+        code_levels=31, head_width=64, head_layers=3, head_bands=4, head_bits=32,
         refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=0.9, n_channels=8, channel_loss_db=1.5, n_samples=4, weight_floor=0.02,
-        code_levels=31, head_width=32, head_bits=32, refine_steps=2000, mesh_resolution=96,
-        target_loss_db=1.0,
+        code_levels=31, head_width=32, head_layers=1, head_bands=3, head_bits=32,
+        refine_steps=2000, mesh_resolution=96, target_loss_db=1.0,
     ),
 }  # fmt: skip
 
@@ -335,7 +340,8 @@ class BakeConfig:
     """Fail, and write nothing, if the written files are expected to lose more than this against
     photographs."""
     max_mb: float | None = None
-    """Fail, and write nothing, if the asset takes more megabytes than this."""
+    """Take so many channels as fit into this many megabytes, the report not counted; fail, and write nothing,
+    if the asset takes more all the same."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is measured."""
 

@@ -25,6 +25,7 @@ from player.errors import ConfigError, TrainingError
 from player.files import check_target
 from player.head import Head
 from player.manifest import Manifest
+from player.packing import pack_codes
 from player.render import Renderer
 from player.transforms import write_cameras
 from vfr_bake import __version__
@@ -52,6 +53,12 @@ N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
 NEW_HEAD_RATE = 3e-3
 """Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
+DIRECTION_LOSS_DB = 0.02
+"""A small head leaves the direction out where that is expected to lose no more."""
+SMALL_FILES = 200_000
+"""Bytes kept for a small head and the manifest where the asset has to fit into a budget."""
+REFINED_GROWTH = 1.1
+"""Refined codes are rougher than the field's, and pack less well."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PLAYS_NOTHING = 6.0
@@ -64,6 +71,7 @@ class BakeResult:
 
     n_vertices: int
     n_bytes: int
+    """Without the report."""
     seconds: float
     figures: dict[str, Any]
     missed: list[str]
@@ -104,12 +112,13 @@ class _Bake:
 
     def run(self, folder: Path, force: bool) -> BakeResult:
         visible, layout = self._cells()
-        stored, taught = self._store(layout)
-        stored = self._refine(stored, layout, taught)
-        head = self._head(stored, layout, taught)
         with self._part("mesh"):
             size = self.choice.mesh_resolution or layout.resolution
             mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
+        mesh_bytes = ply_bytes(mesh)
+        stored, taught = self._store(layout, len(mesh_bytes))
+        stored = self._refine(stored, layout, taught)
+        head = self._head(stored, layout, taught)
         figures = {
             "n_vertices": len(layout.vertices),
             "mesh_faces": len(mesh.faces),
@@ -127,11 +136,11 @@ class _Bake:
             arrays = layout.arrays(stored.density, stored.features)
             manifest = self._manifest(layout, arrays.features.shape[1], figures)
             cameras = write_cameras(self.model.cameras)
-            write_asset(folder, manifest, arrays, head, ply_bytes(mesh), cameras, force, finish)
+            write_asset(folder, manifest, arrays, head, mesh_bytes, cameras, force, finish)
         last: Stage = result["last"]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
-        n_bytes = sum(path.stat().st_size for path in folder.iterdir())
+        n_bytes = sum(_file_sizes(folder).values())
         seconds = sum(self.seconds.values())
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
@@ -153,8 +162,11 @@ class _Bake:
                 )
         return visible, make_layout(visible, float(model.occupancy.step))
 
-    def _store(self, layout: Layout) -> tuple[Stored, Taught]:
-        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
+    def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
+        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
+
+        `mesh_size` is what the mesh takes of the budget, bytes.
+        """
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
@@ -168,7 +180,9 @@ class _Bake:
             features = features @ projection.matrix.T.astype(np.float32)
             scales = code_scales(features, choice.code_levels).astype(np.float32)
             features /= scales
-            first = model.field.head.first_weights().astype(np.float64) @ projection.back
+            n_fit = self._channels_that_fit(layout, density, features, mesh_size)
+            features, scales = np.ascontiguousarray(features[:, :n_fit]), scales[:n_fit]
+            first = model.field.head.first_weights().astype(np.float64) @ projection.back[:, :n_fit]
             head = fold_head(model.field.head, first * scales)
             held_out.measure("rank", layout.float_grid(density, features), runner(head), 0)
             grid = layout.grid(density, features)
@@ -197,6 +211,27 @@ class _Bake:
                 return projection
         return project(sensitivity, taught.features, most)
 
+    def _channels_that_fit(
+        self, layout: Layout, density: np.ndarray, features: np.ndarray, mesh_size: int
+    ) -> int:
+        """How many of the channels, the most important of which come first, fit into the budget."""
+        if self.config.max_mb is None:
+            return features.shape[1]
+        arrays = layout.arrays(density, features)
+        rest = mesh_size + arrays.brick_coords.nbytes + arrays.brick_masks.nbytes + SMALL_FILES
+        rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
+        if not self.choice.head_width:
+            rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
+        sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
+        totals = rest + REFINED_GROWTH * np.cumsum(sizes)
+        n_fit = int(np.searchsorted(totals, self.config.max_mb * 1e6, "right"))
+        if n_fit == 0:
+            raise TrainingError(
+                f"bake: size: expected at most {self.config.max_mb:g} MB, got {totals[0] / 1e6:.2f} MB with "
+                "one channel: nothing was written: allow more, or lower --resolution or --mesh-resolution"
+            )
+        return n_fit
+
     def _refine(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
         """Head and stored values adapted to each other: at every sample, then at the k that are played."""
         choice, n_steps = self.choice, self.choice.refine_steps
@@ -210,7 +245,7 @@ class _Bake:
                 typical = float(
                     np.abs(lessons.composed(stored.features, np.arange(1000) % len(lessons))).mean()
                 )
-                new = small_head(stored.head, choice.head_width, max(typical, 1e-3))
+                new = self._new_head(stored.head, max(typical, 1e-3))
                 stored = replace(stored, head=new)
                 stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
                 self.held_out.measure("small head", grid, runner(stored.head), choice.n_samples)
@@ -227,6 +262,17 @@ class _Bake:
                 grid = layout.grid(stored.density, stored.features)
                 self.held_out.measure("refined at k", grid, runner(stored.head), choice.n_samples)
         return stored
+
+    def _new_head(self, own: HeadWeights, code_scale: float) -> HeadWeights:
+        """A small head that has not learned yet; without directions where the colours do not need them."""
+        choice, n_bands = self.choice, min(self.choice.head_bands, own.sh_degree)
+        lost = self.held_out.direction_loss()
+        if lost < DIRECTION_LOSS_DB:
+            n_bands = 1
+            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
+        elif n_bands < own.sh_degree:
+            self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
+        return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
 
     def _head(self, stored: Stored, layout: Layout, taught: Taught) -> bytes:
         """The head as ONNX."""
@@ -267,7 +313,7 @@ class _Bake:
         asset = Asset.open(folder, verify=True)
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.choice.n_samples)
-        n_bytes = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
+        n_bytes = _file_sizes(folder)
         if last.loss_db > PLAYS_NOTHING:
             raise TrainingError(
                 f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
@@ -318,6 +364,12 @@ class _Bake:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin
+
+
+def _file_sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each of the asset's files; the report is not among them."""
+    paths = sorted(path for path in folder.iterdir() if path.stem != "report")
+    return {path.name: path.stat().st_size for path in paths}
 
 
 def runner(weights: HeadWeights) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

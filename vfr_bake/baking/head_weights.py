@@ -41,24 +41,25 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
     )
 
 
-def small_head(like: HeadWeights, width: int, code_scale: float) -> HeadWeights:
-    """A head of `like`'s form, `width` wide, with random weights: it has everything to learn.
+def small_head(like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: float) -> HeadWeights:
+    """A head of `like`'s form with random weights, which has everything to learn.
 
-    `code_scale` is the size of the features that it will be given, in codes.
+    It is `width` wide, has `n_layers` directional layers after the first and `n_bands` bands of spherical
+    harmonics; `code_scale` is the size of the features that it will be given, in codes.
     """
     random = np.random.default_rng(0)
 
     def layer(n_in: int, n_out: int, gain: float = np.sqrt(2)) -> Layer:
         return random.normal(0, gain / np.sqrt(n_in), (n_in, n_out)), np.zeros(n_out)
 
-    n_encoded = like.sh_degree**2 * like.n_sh_features
+    n_encoded = n_bands**2 * like.n_sh_features
     first, bias = layer(like.n_channels, width)
     return HeadWeights(
         spatial=((first / code_scale, bias),),
         to_sh=layer(width, n_encoded, 1.0),
         directional_first=(layer(width, width)[0], layer(n_encoded, width, 1.0)[0], np.zeros(width)),
-        directional=tuple(layer(width, width) for _ in like.directional),
+        directional=tuple(layer(width, width) for _ in range(n_layers)),
         output=layer(width, 3, 1.0),
-        sh_degree=like.sh_degree,
+        sh_degree=n_bands,
         n_sh_features=like.n_sh_features,
     )

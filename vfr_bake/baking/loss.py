@@ -22,6 +22,8 @@ from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
 RAYS_OF_A_VIEW = 20_000
+N_DIRECTIONS = 6
+"""Other directions from which a colour is looked at, to see whether it depends on them."""
 SEED = 2
 """Of the views that are kept for measuring; learning uses others."""
 DEFAULT_PSNR = 30.0
@@ -80,6 +82,18 @@ class HeldOut:
         n_channels], a projection of them."""
         shown = self._colours((self._features @ kept.T).astype(np.float32))
         off = self._opacity * (shown - self._colours(self._features))
+        return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
+
+    def direction_loss(self) -> float:
+        """Expected loss in dB if every colour were the mean of those seen from N_DIRECTIONS other rays'
+        directions."""
+        random = np.random.default_rng(SEED)
+        own = self._colours(self._features)
+        mean = np.zeros_like(own)
+        for _ in range(N_DIRECTIONS):
+            others = self.rays_d[random.permutation(self._hits)]
+            mean += head_colours(self._field, self._features, others) / N_DIRECTIONS
+        off = self._opacity * (mean - own)
         return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
 
     def shown(self, grid: SparseGrid, head: Head, n_samples: int) -> tuple[np.ndarray, np.ndarray]:

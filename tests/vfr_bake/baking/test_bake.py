@@ -19,7 +19,7 @@ from player.asset import Asset
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march_compiled import march
 from player.render import render
-from vfr_bake.baking.bake import bake
+from vfr_bake.baking.bake import SMALL_FILES, bake
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
 from vfr_bake.baking.projection import code_scales, encode_features, head_sensitivity, project
@@ -313,6 +313,19 @@ def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tm
     for name in ("max_mb", "max_loss_db"):
         with pytest.raises(ConfigError, match=f"{name}: expected more than 0, got 0"):
             BakeConfig(**{name: 0})
+
+
+def test_a_budget_takes_the_channels_that_fit(model: Model, tmp_path: Path) -> None:
+    small: dict[str, Any] = {"resolution": 96, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    small |= {"n_channels": 14}
+    bake(model, tmp_path / "all", BakeConfig(**small), quiet)
+    sizes = {name: entry.bytes for name, entry in Asset.open(tmp_path / "all").manifest.files.items()}
+    del sizes["report.json"], sizes["report.html"]
+    # Room for about half of the features, beside what is kept for the head.
+    limit = (sum(sizes.values()) - sizes["features.codes"] / 2 + SMALL_FILES) / 1e6
+    result = bake(model, tmp_path / "half", BakeConfig(max_mb=limit, **small), quiet)
+    assert 4 <= Asset.open(tmp_path / "half").manifest.n_channels <= 9
+    assert result.n_bytes / 1e6 <= limit
 
 
 def test_views_between_lie_between(model: Model) -> None:
