@@ -29,6 +29,7 @@ from player.packing import pack_codes
 from player.render import Renderer
 from player.transforms import write_cameras
 from vfr_bake import __version__
+from vfr_bake.baking.budget import channels_that_fit, check_budget
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
@@ -55,10 +56,8 @@ NEW_HEAD_RATE = 3e-3
 """Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
 DIRECTION_LOSS_DB = 0.02
 """A small head leaves the direction out where that is expected to lose no more."""
-SMALL_FILES = 200_000
-"""Bytes kept for a small head and the manifest where the asset has to fit into a budget."""
-REFINED_GROWTH = 1.1
-"""Refined codes are rougher than the field's, and pack less well."""
+MOST_FLOATS = 600_000_000
+"""Features held at once, 2.4 GB: a cell stores about one vertex of its own."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PLAYS_NOTHING = 6.0
@@ -160,6 +159,13 @@ class _Bake:
                     f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
                     f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
                 )
+        n_cells, most = int(visible.sum()), MOST_FLOATS // model.field.config.n_channels
+        if n_cells > most:
+            raise TrainingError(
+                f"bake: cells: expected at most {most:,} that hold something, which fit into memory, got "
+                f"{n_cells:,} of {visible.size:,}: is the model a fog? Lower --resolution, or raise "
+                "--weight-floor"
+            )
         return visible, make_layout(visible, float(model.occupancy.step))
 
     def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
@@ -218,19 +224,12 @@ class _Bake:
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
-        rest = mesh_size + arrays.brick_coords.nbytes + arrays.brick_masks.nbytes + SMALL_FILES
+        rest = mesh_size + arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
         rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
         if not self.choice.head_width:
             rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
         sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
-        totals = rest + REFINED_GROWTH * np.cumsum(sizes)
-        n_fit = int(np.searchsorted(totals, self.config.max_mb * 1e6, "right"))
-        if n_fit == 0:
-            raise TrainingError(
-                f"bake: size: expected at most {self.config.max_mb:g} MB, got {totals[0] / 1e6:.2f} MB with "
-                "one channel: nothing was written: allow more, or lower --resolution or --mesh-resolution"
-            )
-        return n_fit
+        return channels_that_fit(self.config.max_mb, rest, sizes)
 
     def _refine(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
         """Head and stored values adapted to each other: at every sample, then at the k that are played."""
@@ -321,7 +320,7 @@ class _Bake:
                 "--weight-floor"
             )
         megabytes = sum(n_bytes.values()) / 1e6
-        self._check_budget(last.loss_db, megabytes)
+        check_budget(self.config, last.loss_db, megabytes)
         missed = []
         if last.loss_db > self.choice.target_loss_db:
             missed.append(
@@ -333,19 +332,6 @@ class _Bake:
             f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(), n_bytes,
             self.seconds, self.left_out, missed, list(self._pictures(asset)),
         )  # fmt: skip
-
-    def _check_budget(self, loss_db: float, megabytes: float) -> None:
-        limits = (
-            ("loss", self.config.max_loss_db, loss_db, "dB"),
-            ("size", self.config.max_mb, megabytes, "MB"),
-        )
-        for name, limit, got, unit in limits:
-            if limit is not None and got > limit:
-                raise TrainingError(
-                    f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} "
-                    f"({loss_db:.2f} dB in {megabytes:.1f} MB): nothing was written: allow more, or "
-                    "change the preset"
-                )
 
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         with Renderer(asset) as renderer:

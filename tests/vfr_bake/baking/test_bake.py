@@ -19,7 +19,8 @@ from player.asset import Asset
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march_compiled import march
 from player.render import render
-from vfr_bake.baking.bake import SMALL_FILES, bake
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.budget import SMALL_FILES
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
 from vfr_bake.baking.projection import code_scales, encode_features, head_sensitivity, project
@@ -374,6 +375,17 @@ def test_an_empty_model_and_one_of_fog_are_refused_and_leave_nothing(
     hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
     with pytest.raises(TrainingError, match=message):
         bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_cells_than_memory_holds_are_refused(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vfr_bake.baking.bake.MOST_FLOATS", 16 * 1000)
+    with pytest.raises(
+        TrainingError, match=r"expected at most 1,000 .* got [\d,]+ of 110,592: is the model a fog"
+    ):
+        bake(model, tmp_path / "asset", BakeConfig(resolution=48), quiet)
     assert list(tmp_path.iterdir()) == []
 
 
