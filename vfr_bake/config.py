@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
+from vfr_bake.baking.presets import PRESETS, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
 Compositing = Literal["features", "colour"]
@@ -258,55 +259,6 @@ class TrainConfig:
         return Pace(**(defaults | {name: value for name, value in given.items() if value is not None}))
 
 
-Preset = Literal["fidelity", "balanced", "fast"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BakeChoice:
-    """What a preset decides, with what was given instead in its place."""
-
-    cells_per_pixel: float
-    """Resolution of the grid where none is given: cells for each pixel that the training pictures see across
-    the middle of the box, at most the field's finest level."""
-    n_channels: int
-    """Most feature channels."""
-    channel_loss_db: float
-    """Fewer channels are taken where they lose no more than this, before refinement, dB."""
-    n_samples: int
-    weight_floor: float
-    code_levels: int
-    head_width: int
-    head_layers: int
-    """Directional layers of a smaller head after the first."""
-    head_bands: int
-    """Bands of spherical harmonics of a smaller head, at most the model's; 1 where nothing depends on the
-    direction."""
-    head_bits: int
-    refine_steps: int
-    mesh_resolution: int
-    target_loss_db: float
-    """Expected loss that the preset aims at, dB."""
-
-
-PRESETS: dict[Preset, BakeChoice] = {
-    "fidelity": BakeChoice(
-        cells_per_pixel=4.0, n_channels=18, channel_loss_db=0.05, n_samples=16, weight_floor=0.01,
-        code_levels=63, head_width=0, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
-    ),
-    "balanced": BakeChoice(
-        cells_per_pixel=1.25, n_channels=10, channel_loss_db=0.5, n_samples=8, weight_floor=0.01,
-        code_levels=31, head_width=64, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
-    ),
-    "fast": BakeChoice(
-        cells_per_pixel=0.9, n_channels=8, channel_loss_db=1.5, n_samples=4, weight_floor=0.02,
-        code_levels=31, head_width=32, head_layers=1, head_bands=3, head_bits=32,
-        refine_steps=2000, mesh_resolution=96, target_loss_db=1.0,
-    ),
-}  # fmt: skip
-
-
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
     """Settings of `vfr-bake`; what is None follows from the preset (`choice`)."""
@@ -320,7 +272,8 @@ class BakeConfig:
     """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
     few as the preset's loss allows."""
     n_samples: int | None = None
-    """Feature lookups per ray, k; 0 looks up every sample. The player can be asked for another number."""
+    """Feature lookups per ray, k, exactly; 0 looks up every sample. Not given: as few as the preset's loss
+    allows. The player can be asked for another number."""
     weight_floor: float | None = None
     """A cell is stored if some view gives one of its samples at least this weight."""
     no_cull: bool = False

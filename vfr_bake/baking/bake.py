@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, head_onnx
@@ -27,6 +26,7 @@ from player.head import Head
 from player.manifest import Manifest
 from player.packing import pack_codes
 from player.render import Renderer
+from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
@@ -36,7 +36,7 @@ from vfr_bake.baking.lessons import Taught, collect_lessons, teach
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.projection import Projection, code_scales, head_sensitivity, project
-from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, FoldedHead, Stored, refine
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
 from vfr_bake.baking.report import BakeReport
 from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, visible_cells
@@ -58,6 +58,8 @@ DIRECTION_LOSS_DB = 0.02
 """A small head leaves the direction out where that is expected to lose no more."""
 MOST_FLOATS = 600_000_000
 """Features held at once, 2.4 GB: a cell stores about one vertex of its own."""
+LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
+"""Lookups per ray that are tried."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PLAYS_NOTHING = 6.0
@@ -105,6 +107,8 @@ class _Bake:
         self.model, self.config, self.choice = model, config, config.choice()
         self.seconds: dict[str, float] = {}
         self.left_out: dict[str, str] = {}
+        self.lookups: dict[str, float] = {}
+        self.n_samples = self.choice.n_samples
         self._report = report
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)
@@ -193,8 +197,6 @@ class _Bake:
             held_out.measure("rank", layout.float_grid(density, features), runner(head), 0)
             grid = layout.grid(density, features)
             held_out.measure("codes", grid, runner(head), 0)
-            if choice.n_samples:
-                held_out.measure("k", grid, runner(head), choice.n_samples)
         n_all = model.field.config.n_channels
         self.left_out["channels"] = (
             f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
@@ -235,6 +237,7 @@ class _Bake:
         """Head and stored values adapted to each other: at every sample, then at the k that are played."""
         choice, n_steps = self.choice, self.choice.refine_steps
         if n_steps == 0:
+            self._choose_lookups(layout.grid(stored.density, stored.features), stored.head)
             return stored
         head_rate = HEAD_RATE
         with self._part("refinement"):
@@ -247,20 +250,36 @@ class _Bake:
                 new = self._new_head(stored.head, max(typical, 1e-3))
                 stored = replace(stored, head=new)
                 stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
-                self.held_out.measure("small head", grid, runner(stored.head), choice.n_samples)
+                self.held_out.measure("small head", grid, runner(stored.head), 0)
                 head_rate = NEW_HEAD_RATE / 2
                 width = self.model.field.config.head_width
                 self.left_out["head"] = f"a head {width} wide: this one is {choice.head_width} wide"
             stored = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, grid=grid)
             grid = layout.grid(stored.density, stored.features)
-            self.held_out.measure("refined", grid, runner(stored.head), choice.n_samples)
-            if choice.n_samples:
-                lessons = collect_lessons(taught, grid, choice.n_samples)
+            self.held_out.measure("refined", grid, runner(stored.head), 0)
+            self._choose_lookups(grid, stored.head)
+            if self.n_samples:
+                lessons = collect_lessons(taught, grid, self.n_samples)
                 rates = head_rate / 2, CODE_RATE / 2  # what is left to learn is little
                 stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
                 grid = layout.grid(stored.density, stored.features)
-                self.held_out.measure("refined at k", grid, runner(stored.head), choice.n_samples)
+                self.held_out.measure("refined at k", grid, runner(stored.head), self.n_samples)
         return stored
+
+    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
+        """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
+        each number loses is kept in `lookups`."""
+        most = self.choice.n_samples
+        if self.config.n_samples is None:
+            every = self.held_out.look("all", grid, runner(head), 0).loss_db
+            for k in (*(k for k in LOOKUPS if k < most), most):
+                self.n_samples = k
+                self.lookups[str(k)] = self.held_out.look(str(k), grid, runner(head), k).loss_db - every
+                if self.lookups[str(k)] <= self.choice.sample_loss_db:
+                    break
+        if self.n_samples:
+            self.held_out.measure("k", grid, runner(head), self.n_samples)
+            self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
 
     def _new_head(self, own: HeadWeights, code_scale: float) -> HeadWeights:
         """A small head that has not learned yet; without directions where the colours do not need them."""
@@ -281,7 +300,7 @@ class _Bake:
         some = Taught(
             *(column[:: max(len(taught.opacity) // N_CALIBRATION, 1)] for column in vars(taught).values())
         )
-        lessons = collect_lessons(some, grid, self.choice.n_samples)
+        lessons = collect_lessons(some, grid, self.n_samples)
         ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
         self.left_out["head bits"] = "24 of 32 bits of the head's wide layers; part of the loss after 'files'"
         return head_onnx(stored.head, ranges)
@@ -297,7 +316,7 @@ class _Bake:
             n_channels=n_channels,
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
-            n_samples=self.choice.n_samples,
+            n_samples=self.n_samples,
             background=tuple(model.background.tolist()),
             provenance={
                 "bake": asdict(self.config) | asdict(self.choice),
@@ -311,7 +330,7 @@ class _Bake:
         """Play the written files; raises TrainingError where they miss what was asked."""
         asset = Asset.open(folder, verify=True)
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
-        last = self.held_out.measure("files", asset.grid, head, self.choice.n_samples)
+        last = self.held_out.measure("files", asset.grid, head, self.n_samples)
         n_bytes = _file_sizes(folder)
         if last.loss_db > PLAYS_NOTHING:
             raise TrainingError(
@@ -330,7 +349,7 @@ class _Bake:
         asked = asdict(self.config) | asdict(self.choice)
         return BakeReport(
             f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(), n_bytes,
-            self.seconds, self.left_out, missed, list(self._pictures(asset)),
+            self.seconds, self.left_out, self.lookups, missed, list(self._pictures(asset)),
         )  # fmt: skip
 
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -356,18 +375,3 @@ def _file_sizes(folder: Path) -> dict[str, int]:
     """Bytes of each of the asset's files; the report is not among them."""
     paths = sorted(path for path in folder.iterdir() if path.stem != "report")
     return {path.name: path.stat().st_size for path in paths}
-
-
-def runner(weights: HeadWeights) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The head as a function of composited features [n, n_channels] and unit dirs [n, 3]."""
-    head = FoldedHead(weights)
-
-    @torch.no_grad()
-    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-        parts = [
-            head(torch.from_numpy(features[i : i + 8192]), torch.from_numpy(dirs[i : i + 8192])).numpy()
-            for i in range(0, len(features), 8192)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
-
-    return colours

@@ -106,17 +106,21 @@ class HeldOut:
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""
+        stage = self.look(name, grid, head, n_samples)
+        self.stages.append(stage)
+        return stage
+
+    def look(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
+        """Play `grid` with `head`, without keeping the result."""
         rgb, samples = self.shown(grid, head, n_samples)
         error = float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
-        stage = Stage(
+        return Stage(
             name,
             -10 * float(np.log10(max(error, 1e-12))),
             expected_loss(error, self.model_psnr),
             float(np.median(samples)) if len(samples) else 0.0,
             float(np.percentile(samples, 95)) if len(samples) else 0.0,
         )
-        self.stages.append(stage)
-        return stage
 
     def table(self) -> list[dict[str, Any]]:
         """The stages so far, for a report."""

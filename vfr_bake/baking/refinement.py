@@ -159,3 +159,18 @@ class FoldedHead(nn.Module):
             sh_degree=self._like.sh_degree,
             n_sh_features=self._like.n_sh_features,
         )
+
+
+def runner(weights: HeadWeights) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """The head as a function of composited features [n, n_channels] and unit dirs [n, 3]."""
+    head = FoldedHead(weights)
+
+    @torch.no_grad()
+    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+        parts = [
+            head(torch.from_numpy(features[i : i + 8192]), torch.from_numpy(dirs[i : i + 8192])).numpy()
+            for i in range(0, len(features), 8192)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+    return colours

@@ -44,6 +44,8 @@ class BakeReport:
     """Time of each part."""
     left_out: dict[str, str]
     """What is not in the asset, and what that changed."""
+    lookups: dict[str, float]
+    """dB that each number of lookups a ray loses against all; none where the number was given."""
     missed: list[str]
     """Limits that were not met, in words; none if all were."""
     pictures: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
@@ -57,6 +59,7 @@ class BakeReport:
             "bytes": self.n_bytes,
             "seconds": self.seconds,
             "left_out": self.left_out,
+            "lookups": self.lookups,
             "missed": self.missed,
         }
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
@@ -73,6 +76,11 @@ class BakeReport:
             "<h2>Loss, stage by stage</h2>",
             bars({stage["name"]: stage["loss_db"] for stage in self.stages}, "dB", 3),
             _stage_table(self.stages),
+            *(
+                ["<h2>Lookups a ray: loss against all</h2>", bars(self.lookups, "dB", 3)]
+                if self.lookups
+                else []
+            ),
             "<h2>Bytes</h2>",
             bars({name: size / 1e6 for name, size in self.n_bytes.items()}, "MB", 2),
             "<h2>Time</h2>",

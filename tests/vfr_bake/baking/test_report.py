@@ -22,6 +22,7 @@ def report(**changes: object) -> BakeReport:
         "n_bytes": {"features.codes": 2_000_000},
         "seconds": {"grid": 1.5},
         "left_out": {"head": "256 wide, this one is <64>"},
+        "lookups": {"1": 0.5, "2": 0.125},
         "missed": [],
         "pictures": [("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
     }
@@ -56,7 +57,7 @@ def test_the_page_is_whole_and_escapes_what_it_is_given() -> None:
     tags.feed(page)
     assert tags.open == []
     text = " ".join(tags.texts)
-    for said in ("a <scene> & more", "size: <1 MB", "this one is <64>", "0.250 dB", "2.00 MB"):
+    for said in ("a <scene> & more", "size: <1 MB", "this one is <64>", "0.250 dB", "2.00 MB", "0.125 dB"):
         assert said in text, said
     assert "Missed" not in report().html().decode()
 
