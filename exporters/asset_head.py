@@ -7,9 +7,9 @@
 
 n, and k, are free. `features` are the sum of weight times code that a player composes; the scales of the
 codes are in the head's first layer since the asset was baked. With the decode, `codes` are k rows of
-features.npy and `weights` what each counts, compositing weight times the share of a corner: `features = sum_k
-weights codes` is part of the graph. `dirs` are unit, model frame, from the camera into the scene; `rgb` is
-0..1 in the asset's colour space, to be composed as `rgb A + (1 - A) background`.
+features.codes and `weights` what each counts, compositing weight times the share of a corner: `features =
+sum_k weights codes` is part of the graph. `dirs` are unit, model frame, from the camera into the scene;
+`rgb` is 0..1 in the asset's colour space, to be composed as `rgb A + (1 - A) background`.
 
 The file's metadata records the opset, the names, and what was compared and how far it was apart.
 """

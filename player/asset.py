@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,9 +16,16 @@ from player.bricks import bricks_per_axis, unpack_vertices
 from player.errors import FormatError, IntegrityError, OutputError
 from player.files import new_folder
 from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
+from player.packing import pack_codes, unpack_codes
 from player.sparse_grid import SparseGrid, build_grid
 
 _DTYPES = {"brick_coords": "<u2", "brick_masks": "<u8", "density": "|u1", "features": "|i1"}
+_FILES = {
+    "brick_coords": "brick_coords.npy",
+    "brick_masks": "brick_masks.npy",
+    "density": "density.codes",
+    "features": "features.codes",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +54,7 @@ class GridArrays:
             dtype = np.dtype(_DTYPES[name])
             if array.dtype != dtype or array.shape != shape:
                 raise FormatError(
-                    f"{where}{name}.npy: expected {dtype.name} {list(shape)}, "
+                    f"{where}{_FILES[name]}: expected {dtype.name} {list(shape)}, "
                     f"got {array.dtype.name} {list(array.shape)}"
                 )
         coords = np.asarray(self.brick_coords, np.int64)
@@ -67,8 +74,7 @@ class GridArrays:
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """An opened asset; the arrays are mapped into memory, not read. `asset.grid` arranges them for the
-    march."""
+    """An opened asset, its arrays unpacked. `asset.grid` arranges them for the march."""
 
     folder: Path
     manifest: Manifest
@@ -92,7 +98,7 @@ class Asset:
             _check_size(folder / name, entry)
             if verify:
                 _check_sum(folder / name, entry)
-        arrays = GridArrays(**{name: _map_array(folder / f"{name}.npy") for name in _DTYPES})
+        arrays = _read_arrays(folder, manifest)
         arrays.check(manifest, f"{folder}/")
         return cls(folder, manifest, arrays)
 
@@ -157,6 +163,7 @@ def write_asset(
     mesh: bytes,
     cameras: bytes,
     force: bool = False,
+    finish: Callable[[Path], dict[str, bytes]] | None = None,
 ) -> None:
     """Write an asset; it appears under `folder` complete or not at all.
 
@@ -168,6 +175,8 @@ def write_asset(
         mesh: bytes of `mesh.ply`, world frame.
         cameras: bytes of `cameras.json`, world frame.
         force: replace a folder that exists.
+        finish: called with the complete asset while it still has another name, so that it can be played; the
+            files that it returns, content by name, are added. What it raises leaves nothing.
 
     Raises:
         FormatError: the arrays contradict the manifest.
@@ -175,16 +184,43 @@ def write_asset(
     """
     arrays.check(manifest, "")
     with new_folder(folder, force) as new:
-        for name, dtype in _DTYPES.items():
-            with (new / f"{name}.npy").open("wb") as file:
-                array = np.ascontiguousarray(getattr(arrays, name), dtype)
+        for name in ("brick_coords", "brick_masks"):
+            with (new / _FILES[name]).open("wb") as file:
+                array = np.ascontiguousarray(getattr(arrays, name), _DTYPES[name])
                 np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
+        for name in ("density", "features"):
+            (new / _FILES[name]).write_bytes(pack_codes(getattr(arrays, name)))
         for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
             (new / name).write_bytes(data)
-        files = {path.name: FileEntry(path.stat().st_size, _digest(path)) for path in sorted(new.iterdir())}
-        data = manifest_bytes(replace(manifest, files=files))
-        parse_manifest(data, NAME)
-        (new / NAME).write_bytes(data)
+        _write_manifest(new, manifest)
+        if finish is not None:
+            for name, data in finish(new).items():
+                (new / name).write_bytes(data)
+            _write_manifest(new, manifest)
+
+
+def _write_manifest(folder: Path, manifest: Manifest) -> None:
+    """The manifest of what is in the folder."""
+    paths = sorted(path for path in folder.iterdir() if path.name != NAME)
+    files = {path.name: FileEntry(path.stat().st_size, _digest(path)) for path in paths}
+    data = manifest_bytes(replace(manifest, files=files))
+    parse_manifest(data, NAME)
+    (folder / NAME).write_bytes(data)
+
+
+def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
+    coords, masks = (_map_array(folder / _FILES[name]) for name in ("brick_coords", "brick_masks"))
+    if masks.dtype != np.dtype(_DTYPES["brick_masks"]):
+        raise FormatError(f"{folder / _FILES['brick_masks']}: expected uint64, got {masks.dtype.name}")
+    n_vertices = int(np.bitwise_count(masks).sum())
+
+    def codes(name: str, *shape: int) -> np.ndarray:
+        path = folder / _FILES[name]
+        return unpack_codes(path.read_bytes(), shape, _DTYPES[name], str(path))
+
+    return GridArrays(
+        coords, masks, codes("density", n_vertices), codes("features", n_vertices, manifest.n_channels)
+    )
 
 
 def _read_manifest(folder: Path) -> Manifest:

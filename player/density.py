@@ -1,6 +1,6 @@
 """How a density is written in eight bits: one encoder, one decoder, shared by the bake and the player.
 
-Letters: sigma is the volume density in 1/model unit, a code is what `density.npy` holds, 0..255. The
+Letters: sigma is the volume density in 1/model unit, a code is what `density.codes` holds, 0..255. The
 logarithm of sigma is linear in the code, `log sigma = lo + (hi - lo) * code / 255` with `(lo, hi) =
 density_range`, and it is the CODE that is interpolated between vertices: the density is stored before its
 activation.

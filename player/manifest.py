@@ -1,4 +1,4 @@
-"""The format `vfr-asset`, version 1.0: this docstring is its specification, the module parses and writes
+"""The format `vfr-asset`, version 2.0: this docstring is its specification, the module parses and writes
 the manifest.
 
 An asset is a folder. It holds no absolute path and plays wherever it is moved.
@@ -8,11 +8,12 @@ An asset is a folder. It holds no absolute path and plays wherever it is moved.
 | `manifest.json` | what is described below; UTF-8, keys sorted, at most 16 MiB |
 | `brick_coords.npy` | uint16 [n_bricks, 3], sorted by (x, y, z), each at most once |
 | `brick_masks.npy` | uint64 [n_bricks, 8], which vertices of a brick are stored |
-| `density.npy` | uint8 [n_vertices], codes |
-| `features.npy` | int8 [n_vertices, n_channels], codes |
+| `density.codes` | uint8 [n_vertices], codes, packed as `player.packing` describes |
+| `features.codes` | int8 [n_vertices, n_channels], codes, packed in the same way |
 | `head.onnx` | `features` [n, n_channels], `dirs` [n, 3] -> `rgb` [n, 3], float32 |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
+| `report.json`, `report.html` | what the bake measured; for people, no player reads them; may be absent |
 
 GRID. The box `aabb`, in the model frame, has `resolution` R cells and R + 1 vertices along each axis;
 vertex i is at `lo + i (hi - lo) / R`. Vertices are stored in bricks of 8 x 8 x 8 as `player.bricks`
@@ -31,7 +32,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [1, 0]; unknown keys of a newer minor are ignored |
+| `version` | [major, minor] | [2, 0]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
 | `resolution` | integer, 1..2048 | cells per axis |
 | `aabb` | 2 x 3 numbers | box, model frame |
@@ -47,7 +48,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | `provenance` | object | settings and measured figures, free form |
 
 Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
-History: 1.0, the first.
+History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports.
 """
 
 from __future__ import annotations
@@ -62,13 +63,13 @@ from typing import Any
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
-VERSION = (1, 0)
+VERSION = (2, 0)
 NAME = "manifest.json"
 FILES = (
     "brick_coords.npy",
     "brick_masks.npy",
-    "density.npy",
-    "features.npy",
+    "density.codes",
+    "features.codes",
     "head.onnx",
     "mesh.ply",
     "cameras.json",

@@ -237,9 +237,12 @@ def _bake(options: Any) -> int:
         options.json,
         figures,
         f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
-        f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; "
-        f"as played it agrees with the full model to {result.figures['psnr_to_full_model']:.1f} dB",
+        f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; as played it agrees "
+        f"with the full model to {result.figures['psnr_to_full_model']:.1f} dB, an expected loss of "
+        f"{result.figures['expected_loss_db']:.2f} dB: see {options.asset / 'report.html'}",
     )
+    for missed in result.missed:
+        print(f"vfr-bake: warning: {missed}: see report.html for where it goes", file=sys.stderr)
     return 0
 
 

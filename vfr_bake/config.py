@@ -3,10 +3,11 @@ units."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
+from vfr_bake.baking.presets import PRESETS, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
 Compositing = Literal["features", "colour"]
@@ -260,42 +261,82 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
-    """Settings of `vfr-bake`."""
+    """Settings of `vfr-bake`; what is None follows from the preset (`choice`)."""
 
-    resolution: int = 0
-    """Cells per axis of the baked grid, at most the field's finest level; 0: 1.25 cells for each pixel that
-    the training pictures see across the middle of the box."""
-    n_channels: int = 16
-    """Feature channels kept of the field's; the projection is folded into the head."""
-    n_samples: int = 5
-    """Feature lookups per ray, k; the player can be asked for another number."""
-    weight_floor: float = 0.005
-    """A cell is stored if some training ray gives one of its samples at least this weight."""
-    refine_steps: int = 1500
-    """Steps in which the head is adapted to the baked features, the full model being the teacher; 0: none."""
-    head_bits: int = 8
-    """Bits of the head's wide layers: 8 is about twice as fast to play as 32 (float32)."""
-    mesh_resolution: int = 192
+    preset: Preset = "balanced"
+    """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: the
+    fewest bytes and the smallest head."""
+    resolution: int | None = None
+    """Cells per axis of the baked grid, at most the field's finest level."""
+    n_channels: int | None = None
+    """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
+    few as the preset's loss allows."""
+    n_samples: int | None = None
+    """Feature lookups per ray, k, exactly; 0 looks up every sample. Not given: as few as the preset's loss
+    allows. The player can be asked for another number."""
+    weight_floor: float | None = None
+    """A cell is stored if some view gives one of its samples at least this weight."""
+    no_cull: bool = False
+    """Store what no view sees as well: every cell that the model holds matter in."""
+    code_levels: int | None = None
+    """Largest feature code, 7 to 127: fewer levels take fewer bytes."""
+    head_width: int | None = None
+    """Width of a smaller head, which learns from the model's own; 0 keeps that one."""
+    head_bits: int | None = None
+    """Bits of the wide layers of the model's own head: 8 is about twice as fast to play as 32 (float32)."""
+    refine_steps: int | None = None
+    """Steps of each round in which head and stored values are adapted to each other, the full model being the
+    teacher; 0: none."""
+    mesh_resolution: int | None = None
     """Voxels along each side of the box for the mesh; 0 leaves the mesh at the grid's own resolution."""
+    max_loss_db: float | None = None
+    """Fail, and write nothing, if the written files are expected to lose more than this against
+    photographs."""
+    max_mb: float | None = None
+    """Take so many channels as fit into this many megabytes, the report not counted; fail, and write nothing,
+    if the asset takes more all the same."""
     check_views: int = 4
-    """Training views played from the written files and compared with the full model."""
+    """Views between the training cameras on which each step of the bake is measured."""
 
     def __post_init__(self) -> None:
+        _check(self.preset in PRESETS, "preset", f"one of {tuple(PRESETS)}", self.preset)
         _check(
-            self.resolution == 0 or 8 <= self.resolution <= 2048,
+            self.resolution is None or 8 <= self.resolution <= 2048,
             "resolution",
-            "0 or 8 to 2048",
+            "8 to 2048",
             self.resolution,
         )
-        _check(1 <= self.n_channels <= 64, "n_channels", "1 to 64", self.n_channels)
-        _check(1 <= self.n_samples <= 64, "n_samples", "1 to 64", self.n_samples)
-        _check(0 <= self.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", self.refine_steps)
-        _check(self.head_bits in (8, 32), "head_bits", "8 or 32", self.head_bits)
-        _check(0 < self.weight_floor < 1, "weight_floor", "between 0 and 1", self.weight_floor)
         _check(
-            self.mesh_resolution == 0 or 8 <= self.mesh_resolution <= 1024,
+            self.max_loss_db is None or self.max_loss_db > 0, "max_loss_db", "more than 0", self.max_loss_db
+        )
+        _check(self.max_mb is None or self.max_mb > 0, "max_mb", "more than 0", self.max_mb)
+        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
+        choice = self.choice()
+        _check(1 <= choice.n_channels <= 64, "n_channels", "1 to 64", choice.n_channels)
+        _check(0 <= choice.n_samples <= 64, "n_samples", "0 to 64", choice.n_samples)
+        _check(7 <= choice.code_levels <= 127, "code_levels", "7 to 127", choice.code_levels)
+        _check(
+            choice.head_width == 0 or 8 <= choice.head_width <= 256,
+            "head_width",
+            "0 or 8 to 256",
+            choice.head_width,
+        )
+        _check(0 <= choice.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", choice.refine_steps)
+        _check(choice.head_bits in (8, 32), "head_bits", "8 or 32", choice.head_bits)
+        _check(0 < choice.weight_floor < 1, "weight_floor", "between 0 and 1", choice.weight_floor)
+        _check(
+            choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024,
             "mesh_resolution",
             "0 or 8 to 1024",
-            self.mesh_resolution,
+            choice.mesh_resolution,
         )
-        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
+
+    def choice(self) -> BakeChoice:
+        """The preset, with what is given in its place.
+
+        >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
+        (5, 64)
+        """
+        preset = PRESETS[self.preset]
+        given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
+        return replace(preset, **{name: value for name, value in given.items() if value is not None})

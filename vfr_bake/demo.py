@@ -67,7 +67,7 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     seconds = {
         "train": run("vfr-train", train_main, "demo", model, "--minutes", str(minutes),
                      "--json", f"{output}/train.json"),
-        "bake": run("vfr-bake", bake_main, model, asset, "--refine-steps", "600",
+        "bake": run("vfr-bake", bake_main, model, asset, "--refine-steps", "300",
                     "--json", f"{output}/bake.json"),
         "play": run("vfr-play", play, asset, "--cameras", f"{output}/cameras_test.json", "--output", frames,
                     "--json", f"{output}/play.json"),

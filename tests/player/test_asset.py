@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 from player.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.errors import FormatError, IntegrityError, OutputError, VersionError
 from player.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
+from player.packing import pack_codes, unpack_codes
 
 
 def parts(asset: Asset) -> tuple[Manifest, GridArrays, bytes, bytes, bytes]:
@@ -32,6 +34,33 @@ def test_round_trip_is_byte_for_byte(asset: Asset, tmp_path: Path) -> None:
         assert (tmp_path / "copy" / name).read_bytes() == (asset.folder / name).read_bytes()
     for name in ("brick_coords", "brick_masks", "density", "features"):
         assert (getattr(again.arrays, name) == getattr(asset.arrays, name)).all()
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (70,), (0, 3), (1, 3), (70, 1), (70, 5)])
+def test_packed_codes_come_back(shape: tuple[int, ...]) -> None:
+    for dtype in (np.int8, np.uint8):
+        info = np.iinfo(dtype)
+        codes = np.random.default_rng(0).integers(info.min, info.max + 1, shape, dtype)
+        again = unpack_codes(pack_codes(codes), shape, np.dtype(dtype).str[1:], "codes")
+        assert again.dtype == dtype and np.array_equal(again, codes)
+
+
+def test_what_is_added_at_the_end_is_listed_and_a_failure_there_leaves_nothing(
+    asset: Asset, tmp_path: Path
+) -> None:
+    def finish(folder: Path) -> dict[str, bytes]:
+        assert folder != tmp_path / "a" and not (tmp_path / "a").exists()
+        assert Asset.open(folder, verify=True).manifest.files.keys() == set(FILES)
+        return {"report.json": b"{}"}
+
+    def fail(folder: Path) -> dict[str, bytes]:
+        raise OutputError("it plays black")
+
+    write_asset(tmp_path / "a", *parts(asset), finish=finish)
+    assert Asset.open(tmp_path / "a", verify=True).path("report.json").read_bytes() == b"{}"
+    with pytest.raises(OutputError, match="it plays black"):
+        write_asset(tmp_path / "b", *parts(asset), finish=fail)
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_an_asset_moves(broken_folder: Path, tmp_path: Path) -> None:
@@ -116,26 +145,32 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 def test_arrays_that_do_not_fit(broken_folder: Path, asset: Asset) -> None:
     a = asset.arrays
+    packed = pack_codes(a.density)
     bad: list[tuple[str, bytes, str]] = [
-        ("density.npy", npy(a.density.astype(np.int8)), "expected uint8 .*got int8"),
-        ("density.npy", npy(a.density[:-1]), "expected uint8"),
-        ("features.npy", npy(a.features[:, :3]), "expected int8"),
-        ("features.npy", npy(np.asfortranarray(a.features)), "C order"),
+        ("density.codes", pack_codes(a.density[:-1]), f"expected {len(a.density)} packed codes, got"),
+        ("density.codes", pack_codes(np.append(a.density, 0)), "packed codes, got more"),
+        ("density.codes", pack_codes(np.zeros(1 << 20, np.uint8)), "packed codes, got more"),
+        ("density.codes", packed + b"tail", "packed codes, got more"),
+        ("density.codes", packed[:-9], "packed codes, got"),
+        ("density.codes", b"PK\x03\x04 not a stream", "expected packed codes, got something else"),
+        ("density.codes", b"", f"expected {len(a.density)} packed codes, got 0"),
+        ("features.codes", pack_codes(a.features[:, :3]), "packed codes, got"),
         ("brick_coords.npy", npy(a.brick_coords[::-1].copy()), "expected bricks sorted"),
         ("brick_coords.npy", npy(a.brick_coords[:-1]), "expected uint64"),
         ("brick_coords.npy", npy(a.brick_coords + np.uint16(1)), "expected coordinates below 9"),
+        ("brick_coords.npy", npy(np.asfortranarray(a.brick_coords)), "C order"),
+        ("brick_coords.npy", npy(np.array([{}], object), allow_pickle=True), "expected a numpy array"),
+        ("brick_coords.npy", npy(a.brick_coords) + b"tail", "bytes as its header says"),
+        ("brick_coords.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
+        ("brick_coords.npy", b"", "expected a numpy array"),
         ("brick_masks.npy", npy(a.brick_masks.astype(np.float64)), "expected uint64"),
-        ("density.npy", npy(np.array([{}], object), allow_pickle=True), "expected a numpy array"),
-        ("density.npy", npy(a.density) + b"tail", "bytes as its header says"),
-        ("density.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
-        ("density.npy", b"", "expected a numpy array"),
     ]
     for name, data, message in bad:
         good = (broken_folder / name).read_bytes()
         replace_file(broken_folder, name, data)
         with pytest.raises(FormatError, match=message) as caught:
             Asset.open(broken_folder)
-        assert ".npy: " in str(caught.value) and "\n" not in str(caught.value)
+        assert re.search(r"\.(npy|codes): ", str(caught.value)) and "\n" not in str(caught.value)
         replace_file(broken_folder, name, good)
     Asset.open(broken_folder)
 
@@ -222,10 +257,10 @@ def test_missing_key(key: str, asset: Asset) -> None:
 
 def test_versions(asset: Asset) -> None:
     document = json.loads(manifest_bytes(asset.manifest))
-    newer = document | {"version": [1, 7], "surprise": 1}
-    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(1, 7))
-    for version, fix in (([2, 0], "install a newer vfr-bake"), ([0, 9], "bake the asset again")):
-        with pytest.raises(VersionError, match=rf"m\.json: version: expected 1\.x, got {version[0]}.*{fix}"):
+    newer = document | {"version": [2, 7], "surprise": 1}
+    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(2, 7))
+    for version, fix in (([3, 0], "install a newer vfr-bake"), ([1, 0], "bake the asset again")):
+        with pytest.raises(VersionError, match=rf"m\.json: version: expected 2\.x, got {version[0]}.*{fix}"):
             parse_manifest(json.dumps(document | {"version": version}).encode(), "m.json")
 
 
@@ -258,7 +293,7 @@ def test_golden_manifest() -> None:
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
         '"density_range":[0.0,1.0],"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
-        '"provenance":{},"resolution":6,"step":0.5,"version":[1,0],"view_size":[4,3],'
+        '"provenance":{},"resolution":6,"step":0.5,"version":[2,0],"view_size":[4,3],'
         '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'
     )
 

@@ -148,12 +148,12 @@ def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = bytearray((broken_folder / "mesh.ply").read_bytes())
     data[0] ^= 1
     (broken_folder / "mesh.ply").write_bytes(bytes(data))
-    (broken_folder / "density.npy").unlink()
+    (broken_folder / "density.codes").unlink()
     assert cli.main([str(broken_folder), "--check"]) == 1
     printed = capsys.readouterr()
     assert len(re.findall(r"^ok ", printed.out, re.M)) == 5
     assert re.search(r"^FAILED  mesh\.ply .*sha256", printed.out, re.M)
-    assert re.search(r"^FAILED  density\.npy .*got none", printed.out, re.M)
+    assert re.search(r"^FAILED  density\.codes .*got none", printed.out, re.M)
     assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 7 files failed\n"
     assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
     assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"

@@ -133,7 +133,16 @@ def test_a_view_without_error_is_null_in_json(
 def test_bake_needs_no_data_set_and_refuses_to_replace(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [str(model), str(tmp_path / "asset"), "--resolution", "48", "--refine-steps", "50"]
+    arguments = [
+        str(model),
+        str(tmp_path / "asset"),
+        "--resolution",
+        "48",
+        "--refine-steps",
+        "50",
+        "--head-width",
+        "0",
+    ]
     assert bake_main([*arguments, "--json", str(tmp_path / "bake.json")]) == 0
     figures = json.loads((tmp_path / "bake.json").read_text())
     assert figures["megabytes"] > 0 and figures["psnr_to_full_model"] > 25

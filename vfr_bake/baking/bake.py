@@ -1,53 +1,69 @@
-"""The bake, step by step: what is seen, what of it is stored, the head, the mesh, and a check from the
-written files."""
+"""The bake, step by step: what is seen, what of it is stored, the head, the mesh, and what each step loses.
+
+Everything is measured on views that nothing else looks at (`vfr_bake.baking.loss`), the end result by
+playing the written files.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from exporters.int8_head import activation_ranges
-from exporters.onnx_head import head_onnx
+from exporters.onnx_head import HeadWeights, head_onnx
 from exporters.ply import ply_bytes
-from player.asset import Asset, GridArrays, write_asset
-from player.bricks import pack_vertices
+from player.asset import Asset, write_asset
 from player.cameras import Camera
-from player.density import encode_density
-from player.errors import ConfigError
+from player.errors import ConfigError, TrainingError
 from player.files import check_target
+from player.head import Head
 from player.manifest import Manifest
-from player.render import render
-from player.sparse_grid import SparseGrid, build_grid
+from player.packing import pack_codes
+from player.render import Renderer
+from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
-from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
+from vfr_bake.baking.head_weights import fold_head, small_head
+from vfr_bake.baking.lessons import Taught, collect_lessons, teach
+from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.mesh import bake_mesh
-from vfr_bake.baking.projection import Projection, code_scales, encode_features, project
-from vfr_bake.baking.refinement import collect_lessons, refine
-from vfr_bake.baking.visibility import corner_vertices, pixel_footprints, visible_cells
+from vfr_bake.baking.projection import Projection, code_scales, head_sensitivity, project
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
+from vfr_bake.baking.report import BakeReport
+from vfr_bake.baking.views import views_between
+from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import psnr, to_8_bit
 from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
-CELLS_PER_PIXEL = 1.25
-"""Finer cells store what no picture has shown; on lego 400x400 this is 448 cells, and 512 plays no nearer to
-the photographs."""
-N_RENDERED = 200_000
-"""Rays whose rendered features decide the projection."""
+N_RAYS = 2_000_000
+"""Rays that head and stored values learn from; about a third of them meet something."""
 N_CALIBRATION = 20_000
 """Rays that decide the ranges of the head's activations."""
-VERTEX_CHUNK = 1 << 18
-"""Vertices evaluated at once: 32 MB of features."""
-FAINTEST, DENSEST = 1e-5, 20.0
-"""Optical depths of one march step at codes 0 and 255: from invisible to opaque, in steps of 5.9 %."""
+N_SENSITIVITY = 50_000
+"""Rays that decide which directions of the features the colours depend on."""
+NEW_HEAD_RATE = 3e-3
+"""Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
+DIRECTION_LOSS_DB = 0.02
+"""A small head leaves the direction out where that is expected to lose no more."""
+MOST_FLOATS = 600_000_000
+"""Features held at once, 2.4 GB: a cell stores about one vertex of its own."""
+LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
+"""Lookups per ray that are tried."""
+N_PICTURES = 2
+"""Views shown side by side in the report."""
+PLAYS_NOTHING = 6.0
+"""Expected loss in dB over which the asset does not show what the model shows."""
 
 
 @dataclass(frozen=True)
@@ -56,52 +72,23 @@ class BakeResult:
 
     n_vertices: int
     n_bytes: int
+    """Without the report."""
     seconds: float
     figures: dict[str, Any]
+    missed: list[str]
+    """What the preset aims at and was not reached, in words."""
 
 
 def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
-    """Bake `model` into the asset `folder`. Raises OutputError, TrainingError (nothing visible)."""
+    """Bake `model` into the asset `folder`.
+
+    Raises OutputError, ConfigError, or TrainingError: nothing is visible, the result does not show what the
+    model shows, or misses `max_loss_db` or `max_mb`; then nothing is written.
+    """
     check_target(folder, force)
     _check_bakeable(model)
-    begin = time.monotonic()
-    resolution = config.resolution or round(2 * CELLS_PER_PIXEL / float(np.median(pixel_footprints(model))))
-    resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
-    visible = visible_cells(model, resolution, config.weight_floor, _stage(report, "visibility"))
-    rendered = _rendered_features(model)
-    projection = project(model.field.head.first_weights(), rendered, config.n_channels)
-    arrays, scales, density_range = _grid_arrays(model, visible, projection, _stage(report, "grid"))
-    step = float(model.occupancy.step)
-    grid = build_grid(
-        (arrays.brick_coords, arrays.brick_masks, arrays.density, arrays.features),
-        resolution, np.array([[-1.0] * 3, [1.0] * 3]), step, density_range,
-    )  # fmt: skip
-    head = _head(model, projection, scales, grid, config, report)
-    mesh, n_floaters = bake_mesh(model, visible, config.mesh_resolution or resolution, _stage(report, "mesh"))
-    figures = {
-        "n_vertices": len(arrays.density),
-        "visible_cells": int(visible.sum()),
-        "first_layer_kept": projection.kept,
-        "mesh_faces": len(mesh.faces),
-        "mesh_floaters_removed": n_floaters,
-    }
-    camera = model.cameras[0]
-    manifest = Manifest(
-        generator=f"vfr-bake {__version__}",
-        resolution=resolution,
-        step=step,
-        density_range=density_range,
-        n_channels=arrays.features.shape[1],
-        view_size=(camera.width, camera.height),
-        world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
-        n_samples=config.n_samples,
-        background=tuple(model.background.tolist()),
-        provenance={"bake": asdict(config), "train": model.train, "trained": model.figures, "baked": figures},
-    )
-    write_asset(folder, manifest, arrays, head, ply_bytes(mesh), write_cameras(model.cameras), force)
-    figures = figures | check_asset(model, folder, config.check_views, _stage(report, "check"))
-    n_bytes = sum(path.stat().st_size for path in folder.iterdir())
-    return BakeResult(len(arrays.density), n_bytes, time.monotonic() - begin, figures)
+    work = _Bake(model, config, report)
+    return work.run(folder, force)
 
 
 def _check_bakeable(model: Model) -> None:
@@ -113,85 +100,278 @@ def _check_bakeable(model: Model) -> None:
             raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(config, name)}")
 
 
-def _head(
-    model: Model,
-    projection: Projection,
-    scales: np.ndarray,
-    grid: SparseGrid,
-    config: BakeConfig,
-    report: Report,
-) -> bytes:
-    """The folded head, adapted to what the player will give it, as ONNX."""
-    lessons = collect_lessons(model, grid, config.n_samples)
-    folded = fold_head(model.field.head, projection.first * scales)
-    folded = refine(folded, lessons, config.refine_steps, _stage(report, "refinement"))
-    if config.head_bits == 32:
-        return head_onnx(folded)
-    some = slice(N_CALIBRATION)
-    return head_onnx(folded, activation_ranges(folded, lessons.codes[some], lessons.dirs[some]))
+class _Bake:
+    """One bake: what its steps share."""
+
+    def __init__(self, model: Model, config: BakeConfig, report: Report) -> None:
+        self.model, self.config, self.choice = model, config, config.choice()
+        self.seconds: dict[str, float] = {}
+        self.left_out: dict[str, str] = {}
+        self.lookups: dict[str, float] = {}
+        self.n_samples = self.choice.n_samples
+        self._report = report
+        with self._part("teacher"):
+            self.held_out = HeldOut(model, config.check_views)
+
+    def run(self, folder: Path, force: bool) -> BakeResult:
+        visible, layout = self._cells()
+        with self._part("mesh"):
+            size = self.choice.mesh_resolution or layout.resolution
+            mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
+        mesh_bytes = ply_bytes(mesh)
+        stored, taught = self._store(layout, len(mesh_bytes))
+        stored = self._refine(stored, layout, taught)
+        head = self._head(stored, layout, taught)
+        figures = {
+            "n_vertices": len(layout.vertices),
+            "mesh_faces": len(mesh.faces),
+            "mesh_floaters_removed": n_floaters,
+            "stages": self.held_out.table(),
+        }
+        result: dict[str, Any] = {}
+
+        def finish(new: Path) -> dict[str, bytes]:
+            made = self._judge(new, folder.name)
+            result["last"], result["missed"] = self.held_out.stages[-1], made.missed
+            return {"report.json": made.json(), "report.html": made.html()}
+
+        with self._part("writing and checking"):
+            arrays = layout.arrays(stored.density, stored.features)
+            manifest = self._manifest(layout, arrays.features.shape[1], figures)
+            cameras = write_cameras(self.model.cameras)
+            write_asset(folder, manifest, arrays, head, mesh_bytes, cameras, force, finish)
+        last: Stage = result["last"]
+        figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
+        figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
+        n_bytes = sum(_file_sizes(folder).values())
+        seconds = sum(self.seconds.values())
+        return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
+
+    def _cells(self) -> tuple[np.ndarray, Layout]:
+        model, choice = self.model, self.choice
+        cell = float(np.median(pixel_footprints(model)))
+        resolution = self.config.resolution or round(2 * choice.cells_per_pixel / cell)
+        resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
+        with self._part("visibility"):
+            held = occupied_cells(model, resolution)
+            if self.config.no_cull:
+                visible = held
+            else:
+                visible = visible_cells(model, resolution, choice.weight_floor, self._progress("visibility"))
+                share = 1 - float(visible.sum()) / max(int(held.sum()), 1)
+                self.left_out["cells"] = (
+                    f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
+                    f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
+                )
+        n_cells, most = int(visible.sum()), MOST_FLOATS // model.field.config.n_channels
+        if n_cells > most:
+            raise TrainingError(
+                f"bake: cells: expected at most {most:,} that hold something, which fit into memory, got "
+                f"{n_cells:,} of {visible.size:,}: is the model a fog? Lower --resolution, or raise "
+                "--weight-floor"
+            )
+        return visible, make_layout(visible, float(model.occupancy.step))
+
+    def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
+        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
+
+        `mesh_size` is what the mesh takes of the budget, bytes.
+        """
+        model, choice, held_out = self.model, self.choice, self.held_out
+        cameras = model.model_cameras()
+        with self._part("teacher"):
+            views = cameras + views_between(model, len(cameras), seed=1)
+            taught = teach(model, views, N_RAYS, 0, self._progress("teacher"))
+        with self._part("grid"):
+            features, density = evaluate_vertices(model, layout, self._progress("grid"))
+            own = fold_head(model.field.head, model.field.head.first_weights().astype(np.float64))
+            held_out.measure("grid", layout.float_grid(density, features), runner(own), 0)
+            projection = self._projection(taught)
+            features = features @ projection.matrix.T.astype(np.float32)
+            scales = code_scales(features, choice.code_levels).astype(np.float32)
+            features /= scales
+            n_fit = self._channels_that_fit(layout, density, features, mesh_size)
+            features, scales = np.ascontiguousarray(features[:, :n_fit]), scales[:n_fit]
+            first = model.field.head.first_weights().astype(np.float64) @ projection.back[:, :n_fit]
+            head = fold_head(model.field.head, first * scales)
+            held_out.measure("rank", layout.float_grid(density, features), runner(head), 0)
+            grid = layout.grid(density, features)
+            held_out.measure("codes", grid, runner(head), 0)
+        n_all = model.field.config.n_channels
+        self.left_out["channels"] = (
+            f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
+            "than that after 'grid', before refinement"
+        )
+        return Stored(head, features, density), taught
+
+    def _projection(self, taught: Taught) -> Projection:
+        """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
+        head, most = self.model.field.head, self.choice.n_channels
+        some = slice(None, None, max(len(taught.opacity) // N_SENSITIVITY, 1))
+        sensitivity = head_sensitivity(
+            head, taught.features[some], taught.rays_d[some], taught.opacity[some]
+        )  # fmt: skip
+        if self.config.n_channels is not None:
+            return project(sensitivity, taught.features, most)
+        for n_stored in range(1, most):
+            projection = project(sensitivity, taught.features, n_stored)
+            if self.held_out.channel_loss(projection.back @ projection.matrix) <= self.choice.channel_loss_db:
+                return projection
+        return project(sensitivity, taught.features, most)
+
+    def _channels_that_fit(
+        self, layout: Layout, density: np.ndarray, features: np.ndarray, mesh_size: int
+    ) -> int:
+        """How many of the channels, the most important of which come first, fit into the budget."""
+        if self.config.max_mb is None:
+            return features.shape[1]
+        arrays = layout.arrays(density, features)
+        rest = mesh_size + arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
+        rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
+        if not self.choice.head_width:
+            rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
+        sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
+        return channels_that_fit(self.config.max_mb, rest, sizes)
+
+    def _refine(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
+        """Head and stored values adapted to each other: at every sample, then at the k that are played."""
+        choice, n_steps = self.choice, self.choice.refine_steps
+        if n_steps == 0:
+            self._choose_lookups(layout.grid(stored.density, stored.features), stored.head)
+            return stored
+        head_rate = HEAD_RATE
+        with self._part("refinement"):
+            grid = layout.grid(stored.density, stored.features)
+            lessons = collect_lessons(taught, grid, 0)
+            if choice.head_width:
+                typical = float(
+                    np.abs(lessons.composed(stored.features, np.arange(1000) % len(lessons))).mean()
+                )
+                new = self._new_head(stored.head, max(typical, 1e-3))
+                stored = replace(stored, head=new)
+                stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
+                self.held_out.measure("small head", grid, runner(stored.head), 0)
+                head_rate = NEW_HEAD_RATE / 2
+                width = self.model.field.config.head_width
+                self.left_out["head"] = f"a head {width} wide: this one is {choice.head_width} wide"
+            stored = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, grid=grid)
+            grid = layout.grid(stored.density, stored.features)
+            self.held_out.measure("refined", grid, runner(stored.head), 0)
+            self._choose_lookups(grid, stored.head)
+            if self.n_samples:
+                lessons = collect_lessons(taught, grid, self.n_samples)
+                rates = head_rate / 2, CODE_RATE / 2  # what is left to learn is little
+                stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
+                grid = layout.grid(stored.density, stored.features)
+                self.held_out.measure("refined at k", grid, runner(stored.head), self.n_samples)
+        return stored
+
+    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
+        """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
+        each number loses is kept in `lookups`."""
+        most = self.choice.n_samples
+        if self.config.n_samples is None:
+            every = self.held_out.look("all", grid, runner(head), 0).loss_db
+            for k in (*(k for k in LOOKUPS if k < most), most):
+                self.n_samples = k
+                self.lookups[str(k)] = self.held_out.look(str(k), grid, runner(head), k).loss_db - every
+                if self.lookups[str(k)] <= self.choice.sample_loss_db:
+                    break
+        if self.n_samples:
+            self.held_out.measure("k", grid, runner(head), self.n_samples)
+            self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
+
+    def _new_head(self, own: HeadWeights, code_scale: float) -> HeadWeights:
+        """A small head that has not learned yet; without directions where the colours do not need them."""
+        choice, n_bands = self.choice, min(self.choice.head_bands, own.sh_degree)
+        lost = self.held_out.direction_loss()
+        if lost < DIRECTION_LOSS_DB:
+            n_bands = 1
+            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
+        elif n_bands < own.sh_degree:
+            self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
+        return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
+
+    def _head(self, stored: Stored, layout: Layout, taught: Taught) -> bytes:
+        """The head as ONNX."""
+        if self.choice.head_bits == 32 or self.choice.head_width:
+            return head_onnx(stored.head)
+        grid = layout.grid(stored.density, stored.features)
+        some = Taught(
+            *(column[:: max(len(taught.opacity) // N_CALIBRATION, 1)] for column in vars(taught).values())
+        )
+        lessons = collect_lessons(some, grid, self.n_samples)
+        ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
+        self.left_out["head bits"] = "24 of 32 bits of the head's wide layers; part of the loss after 'files'"
+        return head_onnx(stored.head, ranges)
+
+    def _manifest(self, layout: Layout, n_channels: int, figures: dict[str, Any]) -> Manifest:
+        model = self.model
+        camera = model.cameras[0]
+        return Manifest(
+            generator=f"vfr-bake {__version__}",
+            resolution=layout.resolution,
+            step=layout.step,
+            density_range=layout.density_range,
+            n_channels=n_channels,
+            view_size=(camera.width, camera.height),
+            world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
+            n_samples=self.n_samples,
+            background=tuple(model.background.tolist()),
+            provenance={
+                "bake": asdict(self.config) | asdict(self.choice),
+                "train": model.train,
+                "trained": model.figures,
+                "baked": figures,
+            },
+        )
+
+    def _judge(self, folder: Path, name: str) -> BakeReport:
+        """Play the written files; raises TrainingError where they miss what was asked."""
+        asset = Asset.open(folder, verify=True)
+        head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+        last = self.held_out.measure("files", asset.grid, head, self.n_samples)
+        n_bytes = _file_sizes(folder)
+        if last.loss_db > PLAYS_NOTHING:
+            raise TrainingError(
+                f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
+                "to its pictures: it is empty or a fog, or too little is stored: train longer, or lower "
+                "--weight-floor"
+            )
+        megabytes = sum(n_bytes.values()) / 1e6
+        check_budget(self.config, last.loss_db, megabytes)
+        missed = []
+        if last.loss_db > self.choice.target_loss_db:
+            missed.append(
+                f"preset {self.config.preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
+                f"got {last.loss_db:.2f} dB"
+            )
+        asked = asdict(self.config) | asdict(self.choice)
+        return BakeReport(
+            f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(), n_bytes,
+            self.seconds, self.left_out, self.lookups, missed, list(self._pictures(asset)),
+        )  # fmt: skip
+
+    def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        with Renderer(asset) as renderer:
+            for camera in views_between(self.model, N_PICTURES, seed=3):
+                full = render_image(self.model.field, self.model.occupancy, camera, self.model.background)
+                world: Camera = camera.transformed(self.model.world_from_model)
+                yield camera.name, full, renderer.render(world).rgb
+
+    def _progress(self, name: str) -> Callable[[int, int], object]:
+        return lambda done, of: self._report(name, done, of)
+
+    @contextmanager
+    def _part(self, name: str) -> Iterator[None]:
+        begin = time.monotonic()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin
 
 
-def _stage(report: Report, name: str) -> Callable[[int, int], object]:
-    return lambda done, of: report(name, done, of)
-
-
-def _rendered_features(model: Model) -> np.ndarray:
-    """Rendered features of rays spread over all training views, those that hit something."""
-    cameras = model.model_cameras()
-    random = np.random.default_rng(0)
-    per_view = max(1, N_RENDERED // len(cameras))
-    found = []
-    for camera in cameras:
-        rays_o, rays_d = camera.rays()
-        rows = random.choice(len(rays_o), min(per_view, len(rays_o)), replace=False)
-        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[rows], rays_d[rows])
-        found.append(features[opacity > 0])
-    return np.concatenate(found)
-
-
-def _grid_arrays(
-    model: Model, visible: np.ndarray, projection: Projection, progress: Callable[[int, int], object]
-) -> tuple[GridArrays, np.ndarray, tuple[float, float]]:
-    """Codes at the corners of the visible cells, the scale of each channel's code, and the range of the
-    density's."""
-    resolution = len(visible)
-    vertices = corner_vertices(visible)
-    brick_coords, brick_masks, order = pack_vertices(vertices)
-    vertices = vertices[order]
-    features = np.empty((len(vertices), len(projection.matrix)), np.float32)
-    log_sigmas = np.empty(len(vertices), np.float32)
-    matrix = projection.matrix.T.astype(np.float32)
-    for start in range(0, len(vertices), VERTEX_CHUNK):
-        rows = slice(start, start + VERTEX_CHUNK)
-        points = (vertices[rows] / resolution).astype(np.float32)
-        features[rows] = model.field.features(points) @ matrix
-        log_sigmas[rows] = model.field.log_densities(points)
-        progress(min(start + VERTEX_CHUNK, len(vertices)), len(vertices))
-    scales = code_scales(features)
-    step = model.occupancy.step
-    density_range = (float(np.log(FAINTEST / step)), float(np.log(DENSEST / step)))
-    arrays = GridArrays(
-        brick_coords=brick_coords,
-        brick_masks=brick_masks,
-        density=encode_density(log_sigmas, density_range),
-        features=encode_features(features, scales),
-    )
-    return arrays, scales, density_range
-
-
-def check_asset(
-    model: Model, folder: Path, n_views: int, progress: Callable[[int, int], object]
-) -> dict[str, Any]:
-    """Training views played from the written files against the full model's pictures: PSNR between the two,
-    mean."""
-    asset = Asset.open(folder, verify=True)
-    chosen = np.unique(np.linspace(0, len(model.cameras) - 1, n_views).round().astype(int))
-    in_model = model.model_cameras()
-    agreement = []
-    for done, index in enumerate(chosen):
-        camera: Camera = model.cameras[index]
-        played = render(asset, camera, background=tuple(model.background.tolist()))
-        full = render_image(model.field, model.occupancy, in_model[index], model.background)
-        agreement.append(psnr(to_8_bit(played.rgb) / 255, to_8_bit(full) / 255))
-        progress(done + 1, len(chosen))
-    return {"psnr_to_full_model": float(np.mean(agreement))}
+def _file_sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each of the asset's files; the report is not among them."""
+    paths = sorted(path for path in folder.iterdir() if path.stem != "report")
+    return {path.name: path.stat().st_size for path in paths}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from exporters.onnx_head import HeadWeights
+from exporters.onnx_head import HeadWeights, Layer
 from vfr_bake.field.head import Head
 
 
@@ -38,4 +38,28 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
         output=layer(head.out),
         sh_degree=int(np.sqrt(head.harmonics.coefficients.shape[1])),
         n_sh_features=head.n_sh_features,
+    )
+
+
+def small_head(like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: float) -> HeadWeights:
+    """A head of `like`'s form with random weights, which has everything to learn.
+
+    It is `width` wide, has `n_layers` directional layers after the first and `n_bands` bands of spherical
+    harmonics; `code_scale` is the size of the features that it will be given, in codes.
+    """
+    random = np.random.default_rng(0)
+
+    def layer(n_in: int, n_out: int, gain: float = np.sqrt(2)) -> Layer:
+        return random.normal(0, gain / np.sqrt(n_in), (n_in, n_out)), np.zeros(n_out)
+
+    n_encoded = n_bands**2 * like.n_sh_features
+    first, bias = layer(like.n_channels, width)
+    return HeadWeights(
+        spatial=((first / code_scale, bias),),
+        to_sh=layer(width, n_encoded, 1.0),
+        directional_first=(layer(width, width)[0], layer(n_encoded, width, 1.0)[0], np.zeros(width)),
+        directional=tuple(layer(width, width) for _ in range(n_layers)),
+        output=layer(width, 3, 1.0),
+        sh_degree=n_bands,
+        n_sh_features=like.n_sh_features,
     )

@@ -1,9 +1,10 @@
-"""Fewer feature channels, at the least loss for the head.
+"""Fewer feature channels, at the least loss for the colours.
 
 Compositing is linear, so a linear map of the features can be applied per vertex before it and undone after
-it: W1 sum w_i F_i = (W1 U) sum w_i (P F_i). With the second moment G = E[x x^T] of the rendered features x =
-sum w_i F_i, the rank-r maps that change the first layer's output least in the mean square are P = A^T W1 and
-W1 U = A, where A holds the first r left singular vectors of W1 G^(1/2) (Eckart-Young).
+it: W1 sum w_i F_i ~ (W1 Q) sum w_i (P F_i). With the second moment G = E[x x^T] of the rendered features x =
+sum w_i F_i and the mean square M = E[J^T J] of the colours' derivatives J = A d rgb / dx, the colours' error
+E |J (x - Q P x)|^2 is least, J and x taken as independent, for P = U^T S and Q = S^-1 U, where S = M^(1/2)
+and U holds the first r eigenvectors of S G S (Eckart-Young).
 """
 
 from __future__ import annotations
@@ -11,53 +12,67 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+
+from vfr_bake.field.head import Head
+
+LEAST_SENSITIVITY = 1e-6
+"""Share of the mean that every direction of M keeps, so that S has an inverse."""
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Stored channels are P F; the head's first layer becomes `first`."""
+    """Stored channels are P F; the head is given Q P x."""
 
     matrix: np.ndarray
     """P [n_stored, n_channels]."""
-    first: np.ndarray
-    """[width, n_stored]; `first @ P` replaces the first layer's weights."""
-    kept: float
-    """Share of the first layer's mean square output that is kept, in [0, 1]."""
+    back: np.ndarray
+    """Q [n_channels, n_stored]."""
 
 
-def project(first_layer: np.ndarray, rendered: np.ndarray, n_stored: int) -> Projection:
-    """The best projection to `n_stored` channels.
+def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Projection:
+    """The best projection to `n_stored` channels, or to all where there are no more.
 
-    `first_layer` [width, n_channels] are the head's first weights, `rendered` [n, n_channels] rendered
-    features. With all channels kept nothing is lost.
+    `sensitivity` [n_channels, n_channels] is M, `rendered` [n, n_channels] rendered features.
 
     >>> p = project(np.eye(3), np.diag([3.0, 2.0, 1e-9]), 2)
-    >>> bool(np.allclose(p.first @ p.matrix, np.diag([1, 1, 0]), atol=1e-6)), round(p.kept, 6)
-    (True, 1.0)
+    >>> bool(np.allclose(p.back @ p.matrix, np.diag([1, 1, 0]), atol=1e-6))
+    True
     """
-    weights = first_layer.astype(np.float64)
-    n_stored = min(n_stored, *weights.shape)
+    n_channels = len(sensitivity)
+    least = LEAST_SENSITIVITY * max(float(np.trace(sensitivity)) / n_channels, 1e-30)
+    values, vectors = np.linalg.eigh(sensitivity.astype(np.float64))
+    root = np.sqrt(np.maximum(values, least))
+    s, inverse = (vectors * root) @ vectors.T, (vectors / root) @ vectors.T
     moment = rendered.astype(np.float64).T @ rendered.astype(np.float64) / max(len(rendered), 1)
-    values, vectors = np.linalg.eigh(moment)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    left, singular, _ = np.linalg.svd(weights @ root, full_matrices=False)
-    basis = left[:, :n_stored]
-    energy = singular**2
-    kept = float(energy[:n_stored].sum() / energy.sum()) if energy.sum() > 0 else 1.0
-    return Projection(basis.T @ weights, basis, kept)
+    _, basis = np.linalg.eigh(s @ moment @ s)
+    basis = basis[:, ::-1][:, :n_stored]
+    return Projection(basis.T @ s, inverse @ basis)
 
 
-def code_scales(vertex_features: np.ndarray) -> np.ndarray:
-    """Step [n_stored] of each channel's signed 8-bit code: its largest magnitude at 127; 1 for a channel of
+def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """M [n_channels, n_channels]: mean square of the derivatives of the shown colours, at `rendered` features
+    [n, n_channels] seen along `dirs` [n, 3] with `opacity` [n]."""
+    features = torch.from_numpy(rendered).requires_grad_(True)
+    colours = head(features, torch.from_numpy(dirs)) * torch.from_numpy(opacity)[:, None]
+    total = np.zeros((rendered.shape[1],) * 2)
+    for channel in range(3):
+        (slope,) = torch.autograd.grad(colours[:, channel].sum(), features, retain_graph=channel < 2)
+        total += slope.double().numpy().T @ slope.double().numpy()
+    return total / max(len(rendered), 1)
+
+
+def code_scales(vertex_features: np.ndarray, levels: int = 127) -> np.ndarray:
+    """Step [n_stored] of each channel's signed code: its largest magnitude at `levels`; 1 for a channel of
     zeros.
 
     >>> code_scales(np.array([[127.0, 0.0], [-254.0, 0.0]])).tolist()
     [2.0, 1.0]
     """
     largest = np.abs(vertex_features).max(axis=0)
-    return np.where(largest > 0, largest / 127, 1.0)
+    return np.where(largest > 0, largest / levels, 1.0)
 
 
-def encode_features(vertex_features: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Signed 8-bit codes [n_vertices, n_stored] of `vertex_features`, rounded to nearest."""
-    return np.clip(np.rint(vertex_features / scales), -127, 127).astype(np.int8)
+def encode_features(codes: np.ndarray) -> np.ndarray:
+    """Codes that need not be whole [n_vertices, n_stored] as signed bytes, rounded to nearest."""
+    return np.clip(np.rint(codes), -127, 127).astype(np.int8)

@@ -1,9 +1,9 @@
-"""The head learns to live with what the bake did to its inputs.
+"""Head and stored features learn to live with what the bake did.
 
 Grid, projection, 8-bit codes and the choice of k samples change the composited features a little. The model
-itself is the teacher: on rays of the training cameras the folded head is trained, from its exact weights on,
-to give the full model's colours from the features that the player composes out of the baked arrays, by the
-player's own march.
+itself is the teacher: the folded head is trained, from its exact weights on, to give the full model's colours
+from the features that the player composes out of the baked arrays, and the stored features with it. Codes are
+rounded where they are composed, and move as if they were not (straight through).
 """
 
 from __future__ import annotations
@@ -17,83 +17,94 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from exporters.onnx_head import HeadWeights, Layer
-from player.errors import TrainingError
-from player.march_compiled import march
+from player.march import MAX_TAU
 from player.sparse_grid import SparseGrid
+from vfr_bake.baking.lessons import Lessons
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
-from vfr_bake.rendering.render import head_colours
-from vfr_bake.training.model_file import Model
+from vfr_bake.kernels.stored_features import descend, descend_density, weigh
 
-N_RAYS = 1_000_000
-"""Rays over all training views; about a third of them meet something."""
 BATCH = 2048
 FULL_CODE = 127.0
 """The largest feature code; in this unit the first weights are of the size that the learning rate fits."""
-RATE = 5e-4
-"""Adam's learning rate at first; it falls to zero along a cosine."""
+HEAD_RATE = 5e-4
+"""Adam's learning rate for a head that the full model had; it falls to zero along a cosine."""
+CODE_RATE = 1.0
+"""Adagrad's learning rate of the codes, in codes; it falls to zero along the same cosine."""
+
+DENSITY_RATE = 1.0
+"""The same of the density's codes."""
+
+Progress = Callable[[int, int], object]
 
 
-@dataclass(frozen=True)
-class Lessons:
-    """What the player composes on n rays, and what the full model shows there."""
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What the asset will hold, codes as floats that need not be whole."""
 
-    codes: np.ndarray
-    """[n, n_stored] composited feature codes, as the player gives them to the head."""
-    dirs: np.ndarray
-    """[n, 3] unit view directions."""
-    opacity: np.ndarray
-    """[n] of the baked grid."""
-    colours: np.ndarray
-    """[n, 3] the full model's colours times its opacity."""
-    full_opacity: np.ndarray
-    """[n] of the full model."""
-
-
-def collect_lessons(model: Model, grid: SparseGrid, n_samples: int) -> Lessons:
-    """Lessons from random pixels of all training views, where the baked grid holds something; in random
-    order."""
-    random = np.random.default_rng(0)
-    cameras = model.model_cameras()
-    parts: list[tuple[np.ndarray, ...]] = []
-    for camera in cameras:
-        n_pixels = camera.width * camera.height
-        rays_o, rays_d = camera.rays()
-        rows = random.choice(n_pixels, min(n_pixels, max(1, N_RAYS // len(cameras))), replace=False)
-        rays_o, rays_d = rays_o[rows], rays_d[rows]
-        played = march(grid, rays_o, rays_d, n_samples)
-        hits = played.hits
-        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[hits], rays_d[hits])
-        colours = head_colours(model.field, features, rays_d[hits]) * opacity[:, None]
-        parts.append((played.features, rays_d[hits], played.opacity[hits], colours, opacity))
-    n_lessons = sum(len(part[0]) for part in parts)
-    if n_lessons == 0:
-        raise TrainingError("the baked grid shows nothing in any training view: train longer")
-    order = random.permutation(n_lessons)
-    return Lessons(*(np.concatenate(columns)[order] for columns in zip(*parts, strict=True)))
+    head: HeadWeights
+    features: np.ndarray
+    """[n_vertices, n_channels] float32 within -127..127."""
+    density: np.ndarray
+    """[n_vertices] float32 within 0..255."""
 
 
 def refine(
-    weights: HeadWeights, lessons: Lessons, n_steps: int, progress: Callable[[int, int], object]
-) -> HeadWeights:
-    """The head after `n_steps` of Adam on the squared error of the colours over random backgrounds."""
+    stored: Stored,
+    lessons: Lessons,
+    n_steps: int,
+    progress: Progress,
+    head_rate: float = HEAD_RATE,
+    code_rate: float = CODE_RATE,
+    grid: SparseGrid | None = None,
+) -> Stored:
+    """Head and codes after `n_steps` on the squared error of the colours over random backgrounds.
+
+    Codes are rounded wherever they are composed, and returned as they stand, not rounded; `stored` is left
+    alone. With `code_rate` 0 only the head learns. With a `grid`, whose lookups `lessons` must hold at every
+    sample, the densities learn too, and the weights of the lessons follow them.
+    """
+    random = np.random.default_rng(0)
     torch.manual_seed(0)
-    head = FoldedHead(weights)
-    data = [torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in vars(lessons).values()]
-    adam = torch.optim.Adam(head.parameters(), lr=RATE, fused=True)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, max(n_steps, 1))
+    head = FoldedHead(stored.head)
+    features, density = stored.features.copy(), stored.density.copy()
+    steep, steep_density = np.zeros((2, len(features)), np.float32)
+    where = (lessons.starts, lessons.rows, lessons.shares)
+    adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in range(n_steps):
-        rows = torch.randint(len(data[0]), (BATCH,))
-        codes, dirs, opacity, colours, full_opacity = (column[rows] for column in data)
-        background = torch.rand(BATCH, 3)
-        shown = head(codes, dirs) * opacity[:, None] + background * (1 - opacity)[:, None]
-        wanted = colours + background * (1 - full_opacity)[:, None]
+        falling = np.float32(0.5 * (1 + np.cos(np.pi * step / n_steps)))
+        adam.param_groups[0]["lr"] = float(head_rate * falling)
+        some = random.integers(0, len(lessons), BATCH)
+        if grid is not None:
+            decode = (grid.density_low, grid.density_slope, grid.step)
+            weigh(some, *where, density, *decode, MAX_TAU, lessons.weights, lessons.opacity)
+        composed = torch.from_numpy(lessons.composed(features, some)).requires_grad_(code_rate > 0)
+        opacity = torch.from_numpy(lessons.opacity[some]).requires_grad_(grid is not None)
         adam.zero_grad(set_to_none=True)
-        ((shown - wanted) ** 2).mean().backward()
+        _loss(head, composed, opacity, lessons, some).backward()
         adam.step()
-        schedule.step()
+        if grid is not None:
+            assert composed.grad is not None and opacity.grad is not None
+            descend_density(
+                some, *where, lessons.weights, lessons.opacity, features, composed.grad.numpy(),
+                opacity.grad.numpy(), *decode, np.float32(DENSITY_RATE) * falling, density, steep_density,
+            )  # fmt: skip
+        if composed.grad is not None:
+            rate = np.float32(code_rate) * falling
+            descend(some, *where, lessons.weights, composed.grad.numpy(), rate, features, steep)
         if step % 50 == 49 or step == n_steps - 1:
             progress(step + 1, n_steps)
-    return head.weights()
+    return Stored(head.weights(), features, density)
+
+
+def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray) -> Tensor:
+    """Mean squared error of the colours of the lessons `some` over random backgrounds."""
+    dirs, colours, full_opacity = (
+        torch.from_numpy(column[some]) for column in (lessons.dirs, lessons.colours, lessons.full_opacity)
+    )
+    background = torch.rand(len(some), 3)
+    shown = head(composed, dirs) * opacity[:, None] + background * (1 - opacity)[:, None]
+    wanted = colours + background * (1 - full_opacity)[:, None]
+    return ((shown - wanted) ** 2).mean()
 
 
 class FoldedHead(nn.Module):
@@ -148,3 +159,18 @@ class FoldedHead(nn.Module):
             sh_degree=self._like.sh_degree,
             n_sh_features=self._like.n_sh_features,
         )
+
+
+def runner(weights: HeadWeights) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """The head as a function of composited features [n, n_channels] and unit dirs [n, 3]."""
+    head = FoldedHead(weights)
+
+    @torch.no_grad()
+    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+        parts = [
+            head(torch.from_numpy(features[i : i + 8192]), torch.from_numpy(dirs[i : i + 8192])).numpy()
+            for i in range(0, len(features), 8192)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+    return colours

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from player.errors import TrainingError
+from vfr_bake.baking.views import views_between
 from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
@@ -22,15 +23,16 @@ Progress = Callable[[int, int], object]
 
 
 def visible_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
-    """[resolution]^3 bool: cells in which a sample of some training view's ray weighs at least
-    `weight_floor`, and the gaps of one cell between them.
+    """[resolution]^3 bool: cells in which a sample of some view's ray weighs at least `weight_floor`, and the
+    gaps of one cell between them. Views are the training cameras and as many between them.
 
-    Rays leave each training camera as densely as it takes for every surface cell to be met HITS times over
+    Rays leave each camera as densely as it takes for every surface cell to be met HITS times over
     all views, whatever the pictures' size. Raises TrainingError when nothing is seen.
     """
     visible = np.zeros((resolution,) * 3, np.uint8)
     cameras = model.model_cameras()
-    density = _ray_density(pixel_footprints(model), 2 / resolution)
+    cameras += views_between(model, len(cameras), seed=0)
+    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
     # No cell between two samples may be missed: other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
@@ -47,6 +49,13 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
             "train longer, or lower --weight-floor"
         )
     return close_gaps(visible.view(bool))
+
+
+def occupied_cells(model: Model, resolution: int) -> np.ndarray:
+    """[resolution]^3 bool: cells in which the training's occupancy grid allows matter."""
+    occupied = model.occupancy.occupied
+    index = np.arange(resolution) * len(occupied) // resolution
+    return occupied[np.ix_(index, index, index)]
 
 
 def pixel_footprints(model: Model) -> np.ndarray:

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
 import torch
 
-from exporters.onnx_head import HeadWeights, head_onnx
+from exporters.onnx_head import head_onnx
 from exporters.ply import read_ply
 from player.asset import Asset
-from player.errors import OutputError, TrainingError
+from player.errors import ConfigError, OutputError, TrainingError
+from player.march_compiled import march
 from player.render import render
 from vfr_bake.baking.bake import bake
+from vfr_bake.baking.budget import SMALL_FILES
 from vfr_bake.baking.head_weights import fold_head
-from vfr_bake.baking.projection import code_scales, encode_features, project
-from vfr_bake.baking.refinement import FoldedHead, Lessons, refine
+from vfr_bake.baking.lessons import Lessons, player_fetches
+from vfr_bake.baking.projection import code_scales, encode_features, head_sensitivity, project
+from vfr_bake.baking.refinement import FoldedHead, Stored, refine
+from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import close_gaps, corner_vertices, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig, FieldConfig, FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
+from vfr_bake.kernels.stored_features import descend_density, weigh
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
@@ -48,27 +57,41 @@ def model() -> Model:
 
 def test_projection_is_the_best_of_its_rank() -> None:
     random = np.random.default_rng(0)
-    first = random.normal(size=(20, 8))
+    slopes = random.normal(size=(20, 8))  # colours that are linear in the features: Eckart-Young is exact
     rendered = random.normal(size=(500, 8)) * np.array([9, 5, 3, 2, 1, 0.5, 0.1, 0.01])
-    exact = rendered @ first.T
-
-    def loss(projection_matrix: np.ndarray, unprojected: np.ndarray) -> float:
-        return float(np.mean((rendered @ projection_matrix.T @ unprojected.T - exact) ** 2))
-
-    ours = project(first, rendered, 3)
-    best = loss(ours.matrix, ours.first)
+    exact = rendered @ slopes.T
+    ours = project(slopes.T @ slopes, rendered, 3)
+    loss = float(np.mean((rendered @ (ours.back @ ours.matrix).T @ slopes.T - exact) ** 2))
     singular = np.linalg.svd(exact, compute_uv=False)
-    assert best == pytest.approx(float((singular[3:] ** 2).sum() / exact.size), rel=1e-9), "Eckart-Young"
-    assert ours.kept == pytest.approx(1 - best * exact.size / (exact**2).sum(), rel=1e-9)
-    whole = project(first, rendered, 8)
-    np.testing.assert_allclose(whole.first @ whole.matrix, first, atol=1e-10)
+    assert loss == pytest.approx(float((singular[3:] ** 2).sum() / exact.size), rel=1e-6), "Eckart-Young"
+    for n_stored in (8, 20):
+        whole = project(slopes.T @ slopes, rendered, n_stored)
+        np.testing.assert_allclose(whole.back @ whole.matrix, np.eye(8), atol=1e-9)
+
+
+def test_sensitivity_is_the_mean_square_of_finite_differences() -> None:
+    torch.manual_seed(0)
+    head = Head(FieldConfig(n_levels=2, head_width=16)).double()
+    random = np.random.default_rng(0)
+    features, opacity = random.normal(size=(30, 4)), random.random(30)
+    dirs = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=-1).numpy()
+    slopes = []
+    with torch.no_grad():
+        for step in np.eye(4) * 1e-5:
+            ahead, behind = (
+                head(torch.from_numpy(features + s), torch.from_numpy(dirs)) for s in (step, -step)
+            )
+            slopes.append(((ahead - behind) / 2e-5).numpy() * opacity[:, None])
+    j = np.stack(slopes, axis=-1)  # [30, 3, 4]
+    expected = np.einsum("nci,ncj->ij", j, j) / 30
+    np.testing.assert_allclose(head_sensitivity(head, features, dirs, opacity), expected, rtol=1e-6)
 
 
 def test_feature_codes_are_within_half_a_step() -> None:
     values = np.random.default_rng(0).normal(size=(1000, 3)) * np.array([1e-30, 1.0, 1e30])
     values[:, 1] = 0
     scales = code_scales(values)
-    codes = encode_features(values, scales)
+    codes = encode_features(values / scales)
     assert codes.dtype == np.int8 and np.abs(codes.astype(int)).max() == 127
     assert (np.abs(codes * scales - values) <= scales * 0.5000001).all()
 
@@ -136,30 +159,116 @@ def test_the_trainable_head_is_the_exported_one() -> None:
     np.testing.assert_allclose(again, rgb, rtol=0, atol=2e-6)
 
 
+def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lessons:
+    """One fetch a lesson, each of its own vertex."""
+    n = len(codes)
+    rows = np.repeat(np.arange(n, dtype=np.int32)[:, None], 8, axis=1)
+    shares = np.zeros((n, 8), np.float32)
+    shares[:, 3] = 1
+    ones = np.ones(n, np.float32)
+    return Lessons(np.arange(n + 1), rows, shares, ones, dirs, ones.copy(), wanted, ones)
+
+
 def test_refinement_brings_the_head_back_to_its_teacher() -> None:
     torch.manual_seed(0)
     head = Head(FieldConfig(n_levels=6, head_width=24))
     weights = fold_head(head, head.first_weights() * 0.02)
     codes = torch.rand(4000, 12) * 254 - 127
     dirs = torch.nn.functional.normalize(torch.randn(4000, 3), dim=-1)
-    ones = np.ones(4000, np.float32)
     with torch.no_grad():
         wanted = FoldedHead(weights)(codes, dirs).numpy()
     # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
-    lessons = Lessons((codes * 0.8 + 10).numpy(), dirs.numpy(), ones, wanted, ones)
+    baked = (codes * 0.8 + 10).numpy().round()
+    lessons = lessons_of(baked, dirs.numpy(), wanted)
+    stored = Stored(weights, baked, np.zeros(4000, np.float32))
 
-    def error(weights: HeadWeights) -> float:
+    def error(stored: Stored) -> float:
+        composed = torch.from_numpy(lessons.composed(stored.features))
         with torch.no_grad():
-            shown = FoldedHead(weights)(torch.from_numpy(lessons.codes), dirs).numpy()
+            shown = FoldedHead(stored.head)(composed, dirs).numpy()
         return float(np.mean((shown - wanted) ** 2))
 
-    before = error(weights)
-    assert error(refine(weights, lessons, 0, lambda done, of: None)) == pytest.approx(before, rel=1e-3)
-    assert error(refine(weights, lessons, 200, lambda done, of: None)) < before / 5
+    before = error(stored)
+    nothing = refine(stored, lessons, 0, lambda done, of: None)
+    assert error(nothing) == pytest.approx(before, rel=1e-3)
+    head_alone = refine(stored, lessons, 200, lambda done, of: None, code_rate=0)
+    assert error(head_alone) < before / 5
+    assert np.array_equal(head_alone.features, baked), "left alone"
+    both = refine(stored, lessons, 200, lambda done, of: None, code_rate=4)
+    assert error(both) < error(head_alone)
+    assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
+
+
+@pytest.mark.parametrize("n_samples", [0, 1, 3, 5])
+def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path, n_samples: int) -> None:
+    settings = BakeConfig(resolution=48, mesh_resolution=16, refine_steps=0, check_views=1)
+    bake(model, tmp_path / "asset", settings, quiet)
+    grid = Asset.open(tmp_path / "asset").grid
+    rays_o, rays_d = model.model_cameras()[3].rays()
+    played = march(grid, rays_o, rays_d, n_samples)
+    hits, opacity, (counts, rows, shares, weights) = player_fetches(grid, rays_o, rays_d, n_samples)
+    assert np.array_equal(hits, played.hits) and len(hits) > 100
+    np.testing.assert_array_equal(opacity, played.opacity[hits])
+    lessons = lessons_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    lessons = replace(lessons, starts=starts, rows=rows, shares=shares, weights=weights)
+    composed = lessons.composed(grid.features.astype(np.float32))
+    # float32 sums of up to 127 in another order
+    np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
+
+
+def test_density_gradient_is_that_of_the_composite() -> None:
+    # Against torch, on whole codes. Adagrad that has seen very steep slopes moves by rate * gradient / 1e15.
+    random = np.random.default_rng(0)
+    n, n_vertices, k = 40, 200, 6
+    rows = random.integers(0, n_vertices, (n * k, 8)).astype(np.int32)
+    shares = random.random((n * k, 8)).astype(np.float32)
+    shares /= shares.sum(axis=1, keepdims=True)
+    starts = np.arange(0, n * k + 1, k)
+    density = random.integers(100, 200, n_vertices).astype(np.float32)
+    values = random.integers(-90, 90, (n_vertices, 3)).astype(np.float32)
+    low, slope, step = np.float32(-7), np.float32(0.05), np.float32(0.05)
+    weights, opacity = np.zeros(n * k, np.float32), np.zeros(n, np.float32)
+    weigh(np.arange(n), starts, rows, shares, density, low, slope, step, np.float32(1e9), weights, opacity)
+    gx, ga = random.normal(size=(n, 3)).astype(np.float32), random.normal(size=n).astype(np.float32)
+
+    latent = torch.tensor(density, dtype=torch.float64, requires_grad=True)
+    code = (latent[rows.astype(int)] * torch.from_numpy(shares).double()).sum(dim=1)
+    delta = (torch.exp(float(low) + float(slope) * code) * float(step)).reshape(n, k)
+    before = torch.cumsum(delta, dim=1) - delta
+    w = torch.exp(-before) * -torch.expm1(-delta)
+    np.testing.assert_allclose(weights.reshape(n, k), w.detach().numpy(), atol=1e-6)
+    f = (torch.from_numpy(values)[rows.astype(int)] * torch.from_numpy(shares)[..., None]).sum(dim=1).double()
+    x = (w[..., None] * f.reshape(n, k, 3)).sum(dim=1)
+    total = 1 - torch.exp(-delta.sum(dim=1))
+    np.testing.assert_allclose(opacity, total.detach().numpy(), atol=1e-6)
+    ((x * torch.from_numpy(gx)).sum() + (total * torch.from_numpy(ga)).sum()).backward()
+    assert latent.grad is not None
+
+    # One lesson at a time: otherwise later lessons would start from where earlier ones moved the codes to.
+    moved = np.zeros(n_vertices)
+    for lesson in range(n):
+        fresh = density.copy()
+        steepness = np.full(n_vertices, 1e30, np.float32)
+        descend_density(
+            np.array([lesson]), starts, rows, shares, weights, opacity, values, gx[lesson : lesson + 1],
+            ga[lesson : lesson + 1], low, slope, step, np.float32(1e13), fresh, steepness,
+        )  # fmt: skip
+        moved += (density - fresh) * 100
+    wanted = latent.grad.numpy()
+    np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
-    settings = BakeConfig(resolution=96, mesh_resolution=64, n_channels=16, check_views=2)
+    settings = BakeConfig(
+        resolution=96,
+        mesh_resolution=64,
+        n_channels=16,
+        check_views=2,
+        n_samples=5,
+        head_width=0,
+        refine_steps=300,
+    )
     result = bake(model, tmp_path / "asset", settings, quiet)
     asset = Asset.open(tmp_path / "asset", verify=True)
     assert asset.manifest.n_channels == 16 and result.n_vertices == len(asset.arrays.density)
@@ -171,6 +280,78 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     assert every > 35 and five > 32, "the grid, the codes and the choice of samples lose little"
     assert one < five <= every + 0.5
     assert result.figures["psnr_to_full_model"] > 32
+    losses = {stage["name"]: stage["psnr"] for stage in result.figures["stages"]}
+    assert losses["refined at k"] > losses["codes"] + 1, "refinement gets back what the bake lost"
+    assert losses["files"] == pytest.approx(losses["refined at k"], abs=0.05), (
+        "the files hold what was refined"
+    )
+
+
+def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
+    settings = BakeConfig(preset="fast", resolution=64, mesh_resolution=32, refine_steps=20, check_views=2)
+    result = bake(model, tmp_path / "asset", settings, quiet)
+    said = json.loads((tmp_path / "asset" / "report.json").read_text())
+    names = [stage["name"] for stage in said["stages"]]
+    assert names == ["grid", "rank", "codes", "small head", "refined", "k", "refined at k", "files"]
+    for name, size in said["bytes"].items():
+        if name != "manifest.json":  # it lists the reports, which are written after it was counted
+            assert (tmp_path / "asset" / name).stat().st_size == size
+    assert sum(said["bytes"].values()) <= result.n_bytes
+    assert said["asked"]["n_channels"] == 8 and "channels" in said["left_out"]
+    page = (tmp_path / "asset" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 and "<svg" in page
+    assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
+    k = Asset.open(tmp_path / "asset", verify=True).manifest.n_samples
+    assert list(said["lookups"])[-1] == str(k) and k <= 4
+    assert all(loss > 0.15 for tried, loss in said["lookups"].items() if tried != str(k)), (
+        "fewer would lose more"
+    )
+
+
+def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tmp_path: Path) -> None:
+    small: dict[str, Any] = {"resolution": 32, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    with pytest.raises(TrainingError, match=r"size: expected at most 0\.01 MB, got .* nothing was written"):
+        bake(model, tmp_path / "asset", BakeConfig(max_mb=0.01, **small), quiet)
+    with pytest.raises(TrainingError, match=r"loss: expected at most 0\.001 dB, got"):
+        bake(model, tmp_path / "asset", BakeConfig(max_loss_db=0.001, **small), quiet)
+    assert list(tmp_path.iterdir()) == []
+    for name in ("max_mb", "max_loss_db"):
+        with pytest.raises(ConfigError, match=f"{name}: expected more than 0, got 0"):
+            BakeConfig(**{name: 0})
+
+
+def test_a_budget_takes_the_channels_that_fit(model: Model, tmp_path: Path) -> None:
+    small: dict[str, Any] = {"resolution": 96, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    small |= {"n_channels": 14}
+    bake(model, tmp_path / "all", BakeConfig(**small), quiet)
+    sizes = {name: entry.bytes for name, entry in Asset.open(tmp_path / "all").manifest.files.items()}
+    del sizes["report.json"], sizes["report.html"]
+    # Room for about half of the features, beside what is kept for the head.
+    limit = (sum(sizes.values()) - sizes["features.codes"] / 2 + SMALL_FILES) / 1e6
+    result = bake(model, tmp_path / "half", BakeConfig(max_mb=limit, **small), quiet)
+    assert 4 <= Asset.open(tmp_path / "half").manifest.n_channels <= 9
+    assert result.n_bytes / 1e6 <= limit
+
+
+def test_views_between_lie_between(model: Model) -> None:
+    cameras = model.model_cameras()
+    views = views_between(model, 10, seed=0)
+    places = np.stack([camera.c2w[:3, 3] for camera in cameras])
+    for view in views:
+        to_others = np.linalg.norm(places - view.c2w[:3, 3], axis=1)
+        assert 0 < to_others.min() < 0.3 * np.linalg.norm(view.c2w[:3, 3])
+        np.testing.assert_allclose(view.c2w[:3, :3] @ view.c2w[:3, :3].T, np.eye(3), atol=1e-9)
+    again, other = views_between(model, 10, seed=0), views_between(model, 10, seed=1)
+    assert all(np.array_equal(a.c2w, b.c2w) for a, b in zip(views, again, strict=True))
+    assert not any(np.array_equal(a.c2w, b.c2w) for a, b in zip(views, other, strict=True))
+
+
+def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
+    small: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    culled = bake(model, tmp_path / "a", BakeConfig(**small), quiet)
+    whole = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
+    assert whole.n_vertices > 1.2 * culled.n_vertices
+    assert "cells" in culled.figures["left_out"] and "cells" not in whole.figures["left_out"]
 
 
 def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:
@@ -187,13 +368,28 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path
     assert colours.std(axis=0).min() > 10, "a colourful scene has colourful vertices"
 
 
-def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("logit", "message"), [(-30, "got nothing: train longer"), (-2, "or a thin fog")])
+def test_an_empty_model_and_one_of_fog_are_refused_and_leave_nothing(
+    model: Model, tmp_path: Path, logit: float, message: str
+) -> None:
     empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
     with torch.no_grad():
-        empty.field.density.out.bias.fill_(-30)
+        empty.field.density.out.weight.fill_(0)
+        empty.field.density.out.bias.fill_(logit)
     hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
-    with pytest.raises(TrainingError, match="empty or a thin fog"):
-        bake(hollow, tmp_path / "asset", BakeConfig(), quiet)
+    with pytest.raises(TrainingError, match=message):
+        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_cells_than_memory_holds_are_refused(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vfr_bake.baking.bake.MOST_FLOATS", 16 * 1000)
+    with pytest.raises(
+        TrainingError, match=r"expected at most 1,000 .* got [\d,]+ of 110,592: is the model a fog"
+    ):
+        bake(model, tmp_path / "asset", BakeConfig(resolution=48), quiet)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -214,7 +410,7 @@ def test_the_grid_is_as_fine_as_the_pictures_and_never_finer_than_the_field(
     model: Model, tmp_path: Path
 ) -> None:
     cell_of_a_pixel = 2 * 1.25 / float(np.median(pixel_footprints(model)))
-    assert 40 < cell_of_a_pixel < 96
+    assert 40 < cell_of_a_pixel < 96, "balanced: 1.25 cells a pixel"
     bake(model, tmp_path / "a", BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1), quiet)
     assert Asset.open(tmp_path / "a").manifest.resolution == round(cell_of_a_pixel)
     finest = BakeConfig(resolution=500, mesh_resolution=16, refine_steps=0, check_views=1)

@@ -1,0 +1,58 @@
+"""How rows of 8-bit codes are written in few bytes: one encoder, one decoder, shared by the bake and the
+player.
+
+Rows follow each other along z in a brick, so that neighbours in space are mostly neighbours in the file and
+their codes lie close together. Each channel is written by itself, as the differences between successive rows
+modulo 256, and the whole is a zlib stream (RFC 1950).
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from player.errors import FormatError
+
+LEVEL = 6
+"""zlib's effort: 9 takes three times as long for 1 % less."""
+
+
+def pack_codes(codes: np.ndarray) -> bytes:
+    """Codes [n] or [n, n_channels], int8 or uint8, as bytes.
+
+    >>> codes = np.repeat(np.arange(200, dtype=np.uint8), 50)
+    >>> packed = pack_codes(codes)
+    >>> len(packed) < 300, np.array_equal(unpack_codes(packed, (10000,), "u1", "codes"), codes)
+    (True, True)
+    """
+    planes = np.ascontiguousarray((codes if codes.ndim == 2 else codes[:, None]).T).view(np.uint8)
+    steps = planes.copy()
+    steps[:, 1:] -= planes[:, :-1]
+    return zlib.compress(steps.tobytes(), LEVEL)
+
+
+def unpack_codes(data: bytes, shape: tuple[int, ...], dtype: str, where: str) -> np.ndarray:
+    """Undo `pack_codes`.
+
+    Args:
+        data: the file's bytes.
+        shape: [n] or [n, n_channels] that is expected.
+        dtype: "i1" or "u1".
+        where: the file's name in error messages.
+
+    Raises:
+        FormatError: not a zlib stream, or one of another length; never more than expected is unpacked.
+    """
+    n_codes = int(np.prod(shape, dtype=np.int64))
+    stream = zlib.decompressobj()
+    try:
+        steps = stream.decompress(data, n_codes + 1)
+    except zlib.error as error:
+        raise FormatError(f"{where}: expected packed codes, got something else: {error}") from error
+    if len(steps) != n_codes or not stream.eof or stream.unused_data:
+        got = f"{len(steps)}" if len(steps) < n_codes else "more"
+        raise FormatError(f"{where}: expected {n_codes} packed codes, got {got}")
+    n_channels = int(np.prod(shape[1:], dtype=np.int64))
+    planes = np.cumsum(np.frombuffer(steps, np.uint8).reshape(n_channels, shape[0]), axis=1, dtype=np.uint8)
+    return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)

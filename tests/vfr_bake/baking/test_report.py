@@ -1,0 +1,83 @@
+"""The report as a page and as JSON."""
+
+from __future__ import annotations
+
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from vfr_bake.baking.loss import expected_loss
+from vfr_bake.baking.report import BakeReport, bars
+
+STAGE = {"psnr": 40.0, "loss_db": 0.5, "samples_median": 5.0, "samples_p95": 9.0}
+
+
+def report(**changes: object) -> BakeReport:
+    parts = {
+        "title": "a <scene> & more",
+        "asked": {"preset": "fast"},
+        "stages": [{"name": "grid", **STAGE}, {"name": "files", **STAGE, "loss_db": 0.25}],
+        "n_bytes": {"features.codes": 2_000_000},
+        "seconds": {"grid": 1.5},
+        "left_out": {"head": "256 wide, this one is <64>"},
+        "lookups": {"1": 0.5, "2": 0.125},
+        "missed": [],
+        "pictures": [("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
+    }
+    return BakeReport(**(parts | changes))  # type: ignore[arg-type]
+
+
+class Tags(HTMLParser):
+    """Counts tags, and fails where one closes that is not open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in {"meta", "img", "br"} and not tag == "rect":
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def test_the_page_is_whole_and_escapes_what_it_is_given() -> None:
+    page = report(missed=["size: <1 MB"]).html().decode()
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    text = " ".join(tags.texts)
+    for said in ("a <scene> & more", "size: <1 MB", "this one is <64>", "0.250 dB", "2.00 MB", "0.125 dB"):
+        assert said in text, said
+    assert "Missed" not in report().html().decode()
+
+
+def test_the_json_says_the_same() -> None:
+    said = json.loads(report().json())
+    assert [stage["name"] for stage in said["stages"]] == ["grid", "files"]
+    assert said["bytes"] == {"features.codes": 2_000_000} and said["missed"] == []
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        report(seconds={"grid": float("nan")}).json()
+
+
+def test_bars_of_nothing_and_of_zeros() -> None:
+    assert "<rect" not in bars({}, "dB", 1)
+    assert 'width="0.0"' in bars({"grid": 0.0}, "dB", 1)
+
+
+def test_expected_loss_is_that_of_independent_errors() -> None:
+    random = np.random.default_rng(0)
+    of_model, of_bake = random.normal(0, 0.02, (2, 1_000_000)) * np.array([[1.0], [0.3]])
+    alone, both = (-10 * np.log10(np.mean(e**2)) for e in (of_model, of_model + of_bake))
+    assert expected_loss(float(np.mean(of_bake**2)), float(alone)) == pytest.approx(alone - both, abs=0.01)
+    assert expected_loss(0.0, 30.0) == 0

@@ -1,0 +1,166 @@
+"""What the player composes on rays, taken apart so that it can be learned, and what the full model shows
+there.
+
+Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
+densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
+x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. A lesson holds that map, by the player's own choice
+of samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.box import Entries, enter_box
+from player.cameras import Camera
+from player.errors import TrainingError
+from player.few_samples import MIN_TOTAL, Samples, equal_mass_bins, heaviest
+from player.march import MIN_OPACITY, collect_samples
+from player.sparse_grid import ABSENT, SparseGrid
+from vfr_bake.kernels.stored_features import compose, corner_rows
+from vfr_bake.rendering.render import head_colours
+from vfr_bake.training.model_file import Model
+
+RAYS_AT_ONCE = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons:
+    """n rays that meet something in the baked grid."""
+
+    starts: np.ndarray
+    """[n + 1] int64: lesson i has the fetches starts[i] to starts[i + 1]."""
+    rows: np.ndarray
+    """[n_fetches, 8] int32 rows of the stored arrays: the corners around each place."""
+    shares: np.ndarray
+    """[n_fetches, 8] float32 of the corners, 1 in all."""
+    weights: np.ndarray
+    """[n_fetches] float32 compositing weights."""
+    dirs: np.ndarray
+    """[n, 3] float32 unit view directions."""
+    opacity: np.ndarray
+    """[n] float32 of the baked grid."""
+    colours: np.ndarray
+    """[n, 3] float32: the full model's colours times its opacity."""
+    full_opacity: np.ndarray
+    """[n] float32 of the full model."""
+
+    def __len__(self) -> int:
+        return len(self.opacity)
+
+    def composed(self, codes: np.ndarray, some: np.ndarray | None = None, rounded: bool = True) -> np.ndarray:
+        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, of all lessons or
+        of those whose numbers are in `some`."""
+        some = np.arange(len(self)) if some is None else some
+        out = np.empty((len(some), codes.shape[1]), np.float32)
+        compose(some, self.starts, self.rows, self.shares, self.weights, codes, rounded, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """n rays and what the full model shows on them."""
+
+    rays_o: np.ndarray
+    """[n, 3] float32, model frame."""
+    rays_d: np.ndarray
+    """[n, 3] float32, of unit length."""
+    features: np.ndarray
+    """[n, n_channels] float32 composited features of the model."""
+    colours: np.ndarray
+    """[n, 3] float32 colours times opacity."""
+    opacity: np.ndarray
+    """[n] float32."""
+
+
+def teach(
+    model: Model, cameras: list[Camera], n_rays: int, seed: int, progress: Callable[[int, int], object]
+) -> Taught:
+    """The full model on about `n_rays` random pixels of `cameras` (model frame); those at which it has
+    nothing to show are left out."""
+    random = np.random.default_rng(seed)
+    parts = []
+    for done, camera in enumerate(cameras):
+        rays_o, rays_d = camera.rays()
+        some = random.choice(len(rays_o), min(len(rays_o), max(n_rays // len(cameras), 1)), replace=False)
+        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[some], rays_d[some])
+        met = np.flatnonzero(opacity > 0)
+        some, features, opacity = some[met], features[met], opacity[met]
+        colours = head_colours(model.field, features, rays_d[some]) * opacity[:, None]
+        parts.append((rays_o[some], rays_d[some], features, colours, opacity))
+        progress(done + 1, len(cameras))
+    return Taught(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def collect_lessons(taught: Taught, grid: SparseGrid, n_samples: int) -> Lessons:
+    """Lessons from those rays that meet something in the grid; n_samples as the player's k, 0 for every
+    sample.
+
+    Raises TrainingError where none does.
+    """
+    parts = []
+    for first in range(0, len(taught.opacity), RAYS_AT_ONCE):
+        rows = slice(first, first + RAYS_AT_ONCE)
+        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_samples)
+        of_hits = (column[rows][hits] for column in (taught.rays_d, taught.colours, taught.opacity))
+        dirs, colours, full_opacity = of_hits
+        parts.append((*fetches, dirs, opacity, colours, full_opacity))
+    if sum(len(part[0]) for part in parts) == 0:
+        raise TrainingError("the baked grid shows nothing in any training view: train longer")
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return Lessons(np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)]), *columns[1:])
+
+
+def player_fetches(
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """The linear map from stored codes to the composites of the rays that hit, as `player.march` composes
+    them.
+
+    Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8],
+    shares [n_fetches, 8], weights [n_fetches]).
+    """
+    entries = enter_box(grid, rays_o, rays_d)
+    samples, tau, _ = collect_samples(grid, entries, None)
+    opacity = -np.expm1(-tau)
+    hits = np.flatnonzero(opacity > MIN_OPACITY)
+    is_hit = np.zeros(len(opacity), bool)
+    is_hit[hits] = True
+    counts = np.bincount(samples.ray, minlength=len(opacity))
+    merged = is_hit[samples.ray] & (counts[samples.ray] > n_samples) & (n_samples > 0)
+    own = Samples(*(column[is_hit[samples.ray] & ~merged] for column in samples))
+    ray, s, weights = own
+    if merged.any():
+        many = Samples(*(column[merged] for column in samples))
+        bins = equal_mass_bins(many, n_samples)
+        places = bins.s.copy()
+        gaps = np.flatnonzero(_corners(grid, entries, bins.ray, places)[1].sum(axis=1) < MIN_TOTAL)
+        if len(gaps):
+            places[gaps] = many.s[heaviest(bins, gaps)]
+        ray = np.concatenate([ray, bins.ray])
+        s = np.concatenate([s, places])
+        weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_samples)])
+        order = np.argsort(ray, kind="stable")
+        ray, s, weights = ray[order], s[order], weights[order]
+    rows, shares = _corners(grid, entries, ray, s)
+    total = shares.sum(axis=1)
+    stored = total >= MIN_TOTAL
+    shares /= np.where(stored, total, 1)[:, None]
+    weights = np.where(stored, weights, np.float32(0)).astype(np.float32)
+    counts = np.bincount(ray, minlength=len(opacity))[hits]
+    return hits, opacity[hits], (counts, rows, shares, weights)
+
+
+def _corners(
+    grid: SparseGrid, entries: Entries, ray: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    points = entries.point[:, ray] + s * entries.direction[:, ray]
+    rows, shares = np.empty((len(ray), 8), np.int32), np.empty((len(ray), 8), np.float32)
+    corner_rows(
+        np.ascontiguousarray(points, np.float32), grid.resolution, grid.n_per_axis, grid.bricks, grid.base,
+        grid.ranks, ABSENT, rows, shares,
+    )  # fmt: skip
+    return rows, shares

@@ -1,0 +1,57 @@
+"""What the presets of `vfr-bake` decide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Preset = Literal["fidelity", "balanced", "fast"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeChoice:
+    """What a preset decides, with what was given instead in its place."""
+
+    cells_per_pixel: float
+    """Resolution of the grid where none is given: cells for each pixel that the training pictures see across
+    the middle of the box, at most the field's finest level."""
+    n_channels: int
+    """Most feature channels."""
+    channel_loss_db: float
+    """Fewer channels are taken where they lose no more than this, before refinement, dB."""
+    n_samples: int
+    """Most feature lookups per ray, k; 0 for every sample."""
+    sample_loss_db: float
+    """Fewer are taken where they lose no more than this, dB."""
+    weight_floor: float
+    code_levels: int
+    head_width: int
+    head_layers: int
+    """Directional layers of a smaller head after the first."""
+    head_bands: int
+    """Bands of spherical harmonics of a smaller head, at most the model's; 1 where nothing depends on the
+    direction."""
+    head_bits: int
+    refine_steps: int
+    mesh_resolution: int
+    target_loss_db: float
+    """Expected loss that the preset aims at, dB."""
+
+
+PRESETS: dict[Preset, BakeChoice] = {
+    "fidelity": BakeChoice(
+        cells_per_pixel=4.0, n_channels=18, channel_loss_db=0.05, n_samples=16, sample_loss_db=0.005,
+        weight_floor=0.01,        code_levels=63, head_width=0, head_layers=3, head_bands=4, head_bits=32,
+        refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
+    ),
+    "balanced": BakeChoice(
+        cells_per_pixel=1.25, n_channels=10, channel_loss_db=0.5, n_samples=8, sample_loss_db=0.05,
+        weight_floor=0.01,        code_levels=31, head_width=64, head_layers=3, head_bands=4, head_bits=32,
+        refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
+    ),
+    "fast": BakeChoice(
+        cells_per_pixel=0.9, n_channels=8, channel_loss_db=1.5, n_samples=4, sample_loss_db=0.15,
+        weight_floor=0.02,        code_levels=31, head_width=32, head_layers=1, head_bands=3, head_bits=32,
+        refine_steps=2000, mesh_resolution=96, target_loss_db=1.0,
+    ),
+}  # fmt: skip

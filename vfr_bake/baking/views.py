@@ -1,0 +1,45 @@
+"""Views between the training cameras: what the bake learns from and is measured on without a data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from player.cameras import Camera, focus_point
+from vfr_bake.training.model_file import Model
+
+LARGEST_TURN = np.deg2rad(15.0)
+"""Farther from a training camera than this nobody has taught the model anything."""
+
+
+def views_between(model: Model, n_views: int, seed: int) -> list[Camera]:
+    """`n_views` training cameras (model frame), spread evenly, each turned around what all cameras look at
+    by up to half the angle to its nearest neighbour. The same seed gives the same views, another one
+    others."""
+    cameras = model.model_cameras()
+    random = np.random.default_rng(seed)
+    focus = focus_point(cameras)
+    places = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
+    places /= np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
+    first = random.integers(0, len(cameras))
+    chosen = (first + np.linspace(0, len(cameras), n_views, endpoint=False).astype(int)) % len(cameras)
+    found = []
+    for index in chosen:
+        to_others = np.arccos(np.clip(places @ places[index], -1, 1))
+        nearest = float(np.partition(to_others, 1)[1]) if len(cameras) > 1 else 0.0
+        axis = random.normal(size=3)
+        turn = _turn(axis / np.linalg.norm(axis), min(nearest / 2, LARGEST_TURN) * random.uniform(0.5, 1))
+        move = np.eye(4)
+        move[:3, :3] = turn
+        move[:3, 3] = focus - turn @ focus
+        camera = cameras[index]
+        found.append(replace(camera, name=f"{camera.name} turned", c2w=move @ camera.c2w))
+    return found
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    """[3, 3] rotation by `angle` around the unit `axis` (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -1,0 +1,167 @@
+"""Stored codes as the player composes them, and their descent along a gradient.
+
+Letters: lesson i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
+weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
+x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
+of a ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) step, T_j = exp(-sum_{i<j}
+delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as the integer
+nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the latent as
+if there were no rounding (straight through).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 64
+"""Lessons that a thread takes at a time."""
+
+
+@njit(parallel=True, cache=True)
+def compose(lessons, starts, rows, shares, weights, latent, rounded, out):
+    """out [n, n_channels] of `lessons` [n], from the latent codes [n_vertices, n_channels], rounded or
+    not."""
+    n_channels = latent.shape[1]
+    for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
+        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
+            for c in range(n_channels):
+                out[i, c] = np.float32(0)
+            for j in range(starts[lessons[i]], starts[lessons[i] + 1]):
+                for corner in range(8):
+                    share = weights[j] * shares[j, corner]
+                    if share == 0:
+                        continue
+                    row = rows[j, corner]
+                    for c in range(n_channels):
+                        code = np.rint(latent[row, c]) if rounded else latent[row, c]
+                        out[i, c] += share * code
+
+
+@njit(cache=True)
+def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, steepness):
+    """One step of Adagrad on `latent`, in place, codes kept within -127..127.
+
+    `gradient` [n, n_channels] is that of the composites; `steepness` [n_vertices] collects the mean square of
+    what a vertex has seen, over its channels, so that vertices that few rays meet move as fast as the others.
+    """
+    n_channels = latent.shape[1]
+    low, high = np.float32(-127), np.float32(127)
+    for i in range(lessons.shape[0]):
+        square = np.float32(0)
+        for c in range(n_channels):
+            square += gradient[i, c] * gradient[i, c]
+        if square == 0:
+            continue
+        square /= np.float32(n_channels)
+        for j in range(starts[lessons[i]], starts[lessons[i] + 1]):
+            for corner in range(8):
+                share = weights[j] * shares[j, corner]
+                if share == 0:
+                    continue
+                row = rows[j, corner]
+                steepness[row] += share * share * square
+                step = rate * share / np.sqrt(steepness[row])
+                for c in range(n_channels):
+                    latent[row, c] = min(max(latent[row, c] - step * gradient[i, c], low), high)
+
+
+@njit(parallel=True, cache=True)
+def weigh(lessons, starts, rows, shares, latent, low, slope, step, opaque, weights, opacity):
+    """Weights of the fetches of `lessons`, and their opacity, from the latent density codes [n_vertices];
+    both in place. Behind the optical depth `opaque` nothing weighs."""
+    for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
+        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
+            lesson = lessons[i]
+            tau = np.float32(0)
+            for j in range(starts[lesson], starts[lesson + 1]):
+                if tau > opaque:
+                    weights[j] = np.float32(0)
+                    continue
+                code = np.float32(0)
+                for corner in range(8):
+                    code += shares[j, corner] * np.rint(latent[rows[j, corner]])
+                delta = np.exp(low + slope * code) * step
+                weights[j] = -np.exp(-tau) * np.expm1(-delta)
+                tau += delta
+            opacity[lesson] = -np.expm1(-tau)
+
+
+@njit(cache=True)
+def descend_density(
+    lessons, starts, rows, shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope, step,
+    rate, latent, steepness,
+):  # fmt: skip
+    """One step of Adagrad on the latent density codes [n_vertices], in place, kept within 0..255.
+
+    dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
+    n_channels] are the latent feature codes; `gradient` [n, n_channels] and `gradient_of_opacity` [n] are
+    those of x and A.
+    """
+    n_channels = values.shape[1]
+    along = np.zeros(4096, np.float32)
+    for i in range(lessons.shape[0]):
+        lesson = lessons[i]
+        first, end = starts[lesson], starts[lesson + 1]
+        n = min(end - first, along.shape[0])
+        behind = np.float32(0)
+        for j in range(n):
+            total = np.float32(0)
+            for corner in range(8):
+                row = rows[first + j, corner]
+                dot = np.float32(0)
+                for c in range(n_channels):
+                    dot += gradient[i, c] * np.rint(values[row, c])
+                total += shares[first + j, corner] * dot
+            along[j] = total
+            behind += weights[first + j] * total
+        trans = np.float32(1)
+        left = np.float32(1) - opacity[lesson]
+        for j in range(n):
+            weight = weights[first + j]
+            if weight == 0:
+                continue
+            code = np.float32(0)
+            for corner in range(8):
+                code += shares[first + j, corner] * np.rint(latent[rows[first + j, corner]])
+            delta = np.exp(low + slope * code) * step
+            behind -= weight * along[j]
+            trans -= weight
+            slant = (trans * along[j] - behind + left * gradient_of_opacity[i]) * delta * slope
+            for corner in range(8):
+                share = shares[first + j, corner]
+                slant_of_row = share * slant
+                if slant_of_row == 0:
+                    continue
+                row = rows[first + j, corner]
+                steepness[row] += slant_of_row * slant_of_row
+                moved = latent[row] - rate * slant_of_row / np.sqrt(steepness[row])
+                latent[row] = min(max(moved, np.float32(0)), np.float32(255))
+
+
+@njit(parallel=True, cache=True)
+def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, rows, shares):
+    """The stored corners around `points` [3, n] float32 of the grid (cells): `rows` [n, 8] of features.codes
+    and trilinear `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states."""
+    size = np.float32(resolution)
+    one = np.float32(1)
+    last = resolution - 1
+    for i in prange(points.shape[1]):
+        gx = min(max(points[0, i], np.float32(0)), size)
+        gy = min(max(points[1, i], np.float32(0)), size)
+        gz = min(max(points[2, i], np.float32(0)), size)
+        x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
+        fx, fy, fz = gx - np.float32(x), gy - np.float32(y), gz - np.float32(z)
+        for corner in range(8):
+            ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
+            vx, vy, vz = x + ix, y + iy, z + iz
+            rows[i, corner] = 0
+            shares[i, corner] = np.float32(0)
+            brick = np.int64(bricks[((vx >> 3) * n_per_axis + (vy >> 3)) * n_per_axis + (vz >> 3)])
+            if brick < 0:
+                continue
+            rank = np.int64(ranks[brick * 512 + ((vx & 7) * 64 + (vy & 7) * 8 + (vz & 7))])
+            if rank == absent:
+                continue
+            rows[i, corner] = base[brick] + rank
+            shares[i, corner] = (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
