@@ -95,8 +95,13 @@ def test_one_line_and_nothing_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("arguments", ["a.stl", "a.json", "a.vdb", "a.npz", "a.usdc", "a.onnx", "a.ply --points 9", "d --format colmap",
-                                       "d --format exr --size 5x4"])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *("a.stl", "a.json", "a.vdb", "a.npz", "a.usdc", "a.onnx", "a.ply --points 9"),
+        *("d --format colmap", "d --format exr --size 5x4"),
+    ],
+)
 def test_targets_that_cannot_be_written(
     arguments: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

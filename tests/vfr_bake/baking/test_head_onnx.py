@@ -97,7 +97,8 @@ def test_int8_is_torch_s_quantisation(
     decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
 ) -> None:
     """An activation in the middle between two levels may go either way, and moves a colour by a level of one
-    of 256 activations; two or three of them together, 5e-3. Against the float head, eight bits cost 0.01 in the root mean square."""
+    of 256 activations; two or three of them together, 5e-3. Against the float head, eight bits cost 0.01 in
+    the root mean square."""
     random = np.random.default_rng(1)
     seen = random.normal(0, 40, (4000, N_CHANNELS))
     dirs = random.normal(size=(4000, 3))
