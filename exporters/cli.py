@@ -34,6 +34,13 @@ meshes and points:
   vfr-export out/ part.stl --crop box.json           {"matrix": 4 x 4 world from box, "size": [W, D, H]}
   vfr-export out/ points.ply --points 200000         a point cloud with normals and colours
 
+  vfr-export out/ scene.usdc                         for Omniverse, Houdini, Unreal
+
+volumes:
+  vfr-export out/ scene.vdb --colour                 for Houdini and others: density and linear colour
+  vfr-export out/ scene.vdb --frame blender          for Blender's renderer
+  vfr-export out/ scene.npz                          the same as numpy arrays
+
 cameras:
   vfr-export out/ cameras.json --frame gltf          transforms.json, turned as the mesh is
   vfr-export out/ sparse/ --format colmap            for Gaussian splatting, MVS
@@ -50,7 +57,8 @@ frames of --frame:
   world    the photographs' (GLB files are turned to Y up in every frame, because glTF is)
   model    the field's own, its box is -1..1
   gltf     the world turned to Y up: (x, y, z) -> (x, z, -y)
-  blender  so that Blender's importers, left as they are, show the world: OBJ and GLB Y up, others Z up
+  blender  so that Blender's importers, left as they are, show the world: OBJ and GLB Y up, others Z up,
+           VDB half a voxel lower, which is where Blender's renderer then draws it
 
 In Blender: PLY and GLB bring a colour attribute; show it with Viewport Shading > Color > Attribute, render it
 with a Color Attribute node. docs/exports.md has the layers of the pictures, and more programs.
@@ -87,6 +95,7 @@ def _options(arguments: argparse.Namespace) -> ExportOptions:
         views=arguments.views,
         size=arguments.size,
         half=arguments.half,
+        colour=arguments.colour,
         decode=arguments.decode,
         force=arguments.force,
     )
@@ -114,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--views", type=_slice, metavar="A:B", help="a slice of the views, as in Python")
     add("--size", type=_size, metavar="WxH", help="size of the pictures (the cameras' own)")
     add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
+    add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
     add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
     add("--force", action="store_true", help="replace FILE if it exists")
     add("--json", action="store_true", help="print the summary as one line of JSON")
@@ -164,8 +174,8 @@ def _bar(done: int, total: int) -> None:
 
 
 def _sentence(summary: dict[str, Any]) -> str:
-    counts = [f"{summary[key]} {key}" for key in ("pictures", "cameras", "vertices", "faces", "points")
-              if key in summary]  # fmt: skip
+    names = ("pictures", "cameras", "vertices", "faces", "points", "voxels")
+    counts = [f"{summary[name]} {name}" for name in names if name in summary]
     if "channels" in summary:
         counts.append(f"{len(summary['channels'])} channels")
     if "inputs" in summary:
@@ -174,12 +184,17 @@ def _sentence(summary: dict[str, Any]) -> str:
     if "bounds" in summary:
         low, high = summary["bounds"]
         parts.append(f"bounds {_corner(low)} to {_corner(high)}")
+    if "level" in summary:
+        low, high = summary["densities"]
+        parts.append(f"densities {low:.3g} to {high:.3g}, half opaque over a voxel at {summary['level']:.4g}")
     if summary.get("frame", "world") != "world":
         parts.append(f"written in the frame {summary['frame']}")
     if summary.get("faces", 0) > summary.get("faces_asked", float("inf")):
         parts.append(f"{summary['faces_asked']} were asked for, but no other edge can go without a fold")
     if "removed" in summary:
-        parts.append(f"the crop removed {summary['removed']:.1%} of the faces")
+        parts.append(
+            f"the crop removed {summary['removed']:.1%} of the {'voxels' if 'voxels' in summary else 'faces'}"
+        )
     return f"{summary['file']}: {', '.join(parts)}"
 
 

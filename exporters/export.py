@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from exporters.crop import CropBox, parse_crop
 from exporters.formats import COLMAP_FILES, FOLDERS, POINTS, ExportOptions, check_options
 from exporters.mesh import TriangleMesh
 from player.asset import Asset
@@ -41,8 +42,8 @@ def export_asset(
     Returns:
         JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
         in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
-        `faces_asked`;
-        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
+        `faces_asked`; `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit
+        of the frame; `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop.
@@ -66,6 +67,8 @@ def export_asset(
         data, facts = _cameras(asset, target, options)
     elif name == "onnx":
         data, facts = _head(asset, target, options)
+    elif name in ("vdb", "npz"):
+        data, facts = _volume(asset, target, options, name)
     elif options.points is not None:
         data, facts = _points(asset, target, options)
     else:
@@ -88,9 +91,37 @@ def _mesh(asset: Asset, target: Path, options: ExportOptions, name: str) -> tupl
         mesh = simplify_mesh(mesh, options.faces)
         facts["faces_asked"] = options.faces
     moved = _in_frame(mesh, asset, options, name)
-    data = {"ply": ply_bytes, "obj": obj_bytes, "glb": glb_bytes, "stl": stl_bytes}[name](moved)
+    if name in ("usdc", "usda"):
+        from exporters.usd import usd_bytes
+
+        data = usd_bytes(moved, f".{name}", "Y" if options.frame == "gltf" else "Z")
+    else:
+        data = {"ply": ply_bytes, "obj": obj_bytes, "glb": glb_bytes, "stl": stl_bytes}[name](moved)
     check_mesh_bytes(f".{name}", data, moved, str(target))
     return data, {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "bounds": _bounds(mesh), **facts}
+
+
+def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
+    from exporters.npz import npz_bytes
+    from exporters.parity import check_volume_bytes
+    from exporters.vdb import vdb_bytes
+    from exporters.volume import asset_volume
+
+    frame = options.frame or "world"
+    frame_from_world = _matrix(asset, options, name)
+    volume, removed = asset_volume(asset, frame_from_world, _box(options), options.colour)
+    written = volume.for_blender() if (name, frame) == ("vdb", "blender") else volume
+    data = npz_bytes(volume, frame) if name == "npz" else vdb_bytes(written)
+    check_volume_bytes(f".{name}", data, written, str(target))
+    places = np.c_[volume.points(), np.ones(len(volume.index))] @ np.linalg.inv(frame_from_world).T
+    facts = {
+        "voxels": len(volume.index),
+        "level": volume.level,
+        "densities": [float(volume.density.min()), float(volume.density.max())],
+        "bounds": [places[:, :3].min(axis=0).tolist(), places[:, :3].max(axis=0).tolist()],
+        "frame": frame,
+    }
+    return data, facts | ({"removed": removed} if options.crop is not None else {})
 
 
 def _points(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
@@ -145,11 +176,7 @@ def _world_mesh(asset: Asset, options: ExportOptions) -> tuple[TriangleMesh, dic
     there."""
     from exporters.ply import read_ply
 
-    box = None
-    if options.crop is not None:
-        from exporters.crop import parse_crop
-
-        box = parse_crop(options.crop)
+    box = _box(options)
     mesh = read_ply(asset.path("mesh.ply"))
     facts: dict[str, Any] = {"frame": options.frame or "world"}
     if box is not None:
@@ -158,6 +185,10 @@ def _world_mesh(asset: Asset, options: ExportOptions) -> tuple[TriangleMesh, dic
         mesh, removed = crop_mesh(mesh, box)
         facts["removed"] = removed
     return mesh, facts
+
+
+def _box(options: ExportOptions) -> CropBox | None:
+    return None if options.crop is None else parse_crop(options.crop)
 
 
 def _cloud(asset: Asset, options: ExportOptions, n_points: int) -> tuple[TriangleMesh, dict[str, Any]]:

@@ -15,6 +15,10 @@ FORMATS = {
     ".obj": "Wavefront OBJ, `v x y z r g b` in sRGB",
     ".glb": "binary glTF 2.0; linear COLOR_0, unlit material; Y up as glTF wants it: (x, y, z) -> (x, z, -y)",
     ".stl": "binary STL: the shape alone, no colours",
+    ".usdc": "USD, binary (.usda: text); linear displayColor, metersPerUnit 1, upAxis",
+    ".usda": "USD, text",
+    ".vdb": "OpenVDB volume: `density`, and with --colour `color` (linear)",
+    ".npz": "the same volume as numpy arrays, and what they mean as JSON inside",
     ".json": "transforms.json of the training cameras",
     ".onnx": "the head as an ONNX graph; --decode puts the decode of the features in front",
 }
@@ -34,6 +38,7 @@ POINTS = 100_000
 _TAKES = {
     "mesh": {"frame", "crop", "faces"},
     "points": {"frame", "crop", "points"},
+    "volume": {"frame", "crop", "colour"},
     "json": {"frame"},
     "colmap": {"frame", "crop", "points"},
     "exr": {"cameras", "views", "size", "half"},
@@ -59,6 +64,8 @@ class ExportOptions:
     size: tuple[int, int] | None = None
     """Width and height of pictures."""
     half: bool = False
+    colour: bool = False
+    """Colours in a volume."""
     decode: bool = False
     force: bool = False
 
@@ -88,8 +95,10 @@ def check_options(target: Path, options: ExportOptions) -> str:
         known = [*(suffix[1:] for suffix in FORMATS), *FOLDERS]
         raise ConfigError(f"--format: expected one of {', '.join(known)}, got {name}")
     kind = name
-    if name in ("ply", "obj", "glb", "stl"):
+    if name in ("ply", "obj", "glb", "stl", "usdc", "usda"):
         kind = "points" if name == "ply" and options.points is not None else "mesh"
+    elif name in ("vdb", "npz"):
+        kind = "volume"
     default = ExportOptions()
     for key in sorted(set().union(*_TAKES.values()) - _TAKES[kind]):
         if getattr(options, key) != getattr(default, key):
@@ -104,4 +113,4 @@ def check_options(target: Path, options: ExportOptions) -> str:
 
 def kind_name(name: str, kind: str) -> str:
     """How a message calls what is written."""
-    return {"points": "a point cloud", "mesh": f"a {name} mesh"}.get(kind, name)
+    return {"points": "a point cloud", "mesh": f"a {name} mesh", "volume": f"a {name} volume"}.get(kind, name)

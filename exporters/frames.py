@@ -9,7 +9,7 @@ the GLB writer turns what it is given, and whoever opens the file turns it back.
 | `world` | the world's; in a GLB turned to Y up |
 | `model` | the field's own: its box is -1..1, no unit; in a GLB turned to Y up |
 | `gltf` | the world turned to Y up, (x, y, z) -> (x, z, -y), in every format |
-| `blender` | so that Blender's importers, left as they are, show the world: OBJ and GLB Y up, others Z up |
+| `blender` | what Blender, left as it is, shows as the world: OBJ and GLB Y up, VDB half a voxel lower |
 """
 
 from __future__ import annotations

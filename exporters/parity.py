@@ -11,9 +11,13 @@ import numpy as np
 from exporters.colour import linear_from_srgb
 from exporters.glb import parse_glb, y_up
 from exporters.mesh import TriangleMesh
+from exporters.npz import parse_npz
 from exporters.ply import parse_ply
 from exporters.points import parse_points
 from exporters.stl import parse_stl
+from exporters.usd import parse_usd
+from exporters.vdb import parse_vdb
+from exporters.volume import Volume
 from player.errors import ParityError
 
 
@@ -23,31 +27,34 @@ class _Arrays(NamedTuple):
     vertices: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
-    """[n, 3 or 4], 0..1: sRGB, in a GLB linear."""
+    """[n, 3 or 4], 0..1: sRGB, in GLB and USD linear."""
     faces: np.ndarray
 
 
-COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6}
-"""Half a step of what the format writes: bytes, four decimals, 16 bits."""
+COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6, ".usdc": 6e-8, ".usda": 6e-8}
+"""Half a step of what the format writes: bytes, four decimals, 16 bits, float32."""
 
 
 def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -> None:
-    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl) file, does not hold
-    `mesh`: counts, places, normals, colours, faces; of an STL, which has no vertices, the corners.
+    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl, .usdc, .usda) file,
+    does not hold `mesh`: counts, places, normals, colours, faces; of an STL, which has no vertices, the
+    corners.
 
-    Places may differ by what the format rounds: float32 for PLY, GLB and STL, nine digits for OBJ. The
+    Places may differ by what the format rounds: float32 for PLY, GLB, STL and USD, nine digits for OBJ. The
     message names the worst.
     """
     if suffix == ".stl":
         corners = parse_stl(data, where)["corners"].reshape(-1, 3)
         _check_rows(where, "corners", mesh.vertices[mesh.faces].reshape(-1, 3), corners, _rounding(mesh))
         return
-    got = {".ply": _ply, ".obj": _obj, ".glb": _glb}[suffix](data, where)
+    readers = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".usdc": _usdc, ".usda": _usda}
+    got = readers[suffix](data, where)
     n_colours = got.colours.shape[1]
     colours = mesh.colours[:, :n_colours] / 255
     vertices, normals = mesh.vertices, mesh.normals
     if suffix == ".glb":
         vertices, normals = y_up(vertices), y_up(normals)
+    if suffix in (".glb", ".usdc", ".usda"):
         colours[:, :3] = linear_from_srgb(colours[:, :3])
     if len(mesh.faces) != len(got.faces):
         raise ParityError(f"{where}: faces: expected {len(mesh.faces)}, got {len(got.faces)}")
@@ -63,6 +70,36 @@ def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
     _check_rows(where, "points", cloud.vertices, points["position"], _rounding(cloud))
     _check_rows(where, "normals", cloud.normals, points["normal"], 1e-6)
     _check_rows(where, "colours", cloud.colours, points["colour"], 0.0)
+
+
+def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> None:
+    """Raises ParityError if `data`, the content of a `suffix` (.vdb, .npz) file, holds another volume: every
+    vertex, density, colour and the matrix are compared, exactly but for linear colours in float32."""
+    colours = volume.colours
+    if suffix == ".npz":
+        got = parse_npz(data, where)
+        index, density, matrix, found = got.index, got.density[:, None], got.matrix, got.colours
+    else:
+        grids = parse_vdb(data, where)
+        index, density, matrix = grids["density"]
+        found = grids["color"].values if "color" in grids else None
+        colours = None if colours is None else linear_from_srgb(colours / 255)
+        if found is not None:
+            _check_rows(where, "color: vertices", index, grids["color"].index, 0.0)
+            _check_rows(where, "color: matrix", matrix, grids["color"].matrix, 0.0)
+    order, rows = _sorted(volume.index), _sorted(index)
+    _check_rows(where, "matrix", volume.matrix, matrix, 0.0)
+    _check_rows(where, "vertices", volume.index[order], index[rows], 0.0)
+    _check_rows(where, "density", volume.density[order, None], density[rows], 0.0)
+    if (colours is None) != (found is None):
+        raise ParityError(f"{where}: colours: expected {'some' if found is None else 'none'}, got the other")
+    if colours is not None and found is not None:
+        _check_rows(where, "colours", colours[order], found[rows], 6e-8)
+
+
+def _sorted(index: np.ndarray) -> np.ndarray:
+    x, y, z = index.T.astype(np.int64)
+    return np.argsort((x << 40) | (y << 20) | z, kind="stable")
 
 
 def _rounding(mesh: TriangleMesh) -> float:
@@ -124,3 +161,16 @@ def _glb(data: bytes, where: str) -> _Arrays:
         raise ParityError(f"{where}: POSITION: min and max: expected those of its numbers, got {position}")
     colours = read(names["COLOR_0"], "<u2", 4) / 65535
     return _Arrays(vertices, read(names["NORMAL"], "<f4", 3), colours, read(primitive["indices"], "<u4", 3))
+
+
+def _usdc(data: bytes, where: str) -> _Arrays:
+    return _usd(data, ".usdc", where)
+
+
+def _usda(data: bytes, where: str) -> _Arrays:
+    return _usd(data, ".usda", where)
+
+
+def _usd(data: bytes, suffix: str, where: str) -> _Arrays:
+    found = parse_usd(data, suffix, where)
+    return _Arrays(*(found[name] for name in _Arrays._fields))

@@ -93,7 +93,9 @@ def test_existing_target(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 def test_unknown_suffix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(tmp_path), str(tmp_path / "mesh.fbx")]) == 1
     error = capsys.readouterr().err
-    assert "suffix: expected one of .ply, .obj, .glb, .stl, .json, .onnx, or a folder with --format" in error
+    assert (
+        "suffix: expected one of .ply, .obj, .glb, .stl, .usdc, .usda, .vdb, .npz, .json, .onnx, or" in error
+    )
     assert error.endswith("exr or colmap, got .fbx\n")
     assert cli.main([str(tmp_path), str(tmp_path / "mesh")]) == 1
     assert "got none" in capsys.readouterr().err

@@ -64,11 +64,14 @@ def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("a.fbx", "suffix: expected one of .ply, .obj, .glb, .stl, .json, .onnx, or a folder with --format"),
+        (
+            "a.fbx",
+            "suffix: expected one of .ply, .obj, .glb, .stl, .usdc, .usda, .vdb, .npz, .json, .onnx, or a",
+        ),
         ("frames/", "got none"),
         (
             "a.ply --format usd",
-            "--format: expected one of ply, obj, glb, stl, json, onnx, exr, colmap, got usd",
+            "expected one of ply, obj, glb, stl, usdc, usda, vdb, npz, json, onnx, exr, colmap, got usd",
         ),
         ("a.ply --faces 0", "--faces: expected 1 or more, got 0"),
         ("a.ply --points 0", "--points: expected 1 or more, got 0"),
@@ -79,6 +82,8 @@ def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None
         ("a.ply --points 5 --faces 5", "--faces does nothing for a point cloud"),
         ("a.json --crop 0,0,0,9,9,9", "--crop does nothing for json; it takes --frame"),
         ("a.onnx --half", "--half does nothing for onnx; it takes --decode"),
+        ("a.vdb --faces 9", "--faces does nothing for a vdb volume; it takes --colour, --crop, --frame"),
+        ("a.glb --colour", "--colour does nothing for a glb mesh"),
         ("dir --format colmap --views 1", "--views does nothing for colmap"),
     ],
 )
@@ -90,8 +95,13 @@ def test_one_line_and_nothing_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("arguments", ["a.stl", "a.json", "a.onnx", "a.ply --points 9", "d --format colmap",
-                                       "d --format exr --size 5x4"])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *("a.stl", "a.json", "a.vdb", "a.npz", "a.usdc", "a.onnx", "a.ply --points 9"),
+        *("d --format colmap", "d --format exr --size 5x4"),
+    ],
+)
 def test_targets_that_cannot_be_written(
     arguments: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,9 +186,9 @@ def test_missing_extra_is_named(
 ) -> None:
     import sys
 
-    for module in ("open3d", "OpenEXR", "onnx"):
+    for module in ("open3d", "OpenEXR", "onnx", "pxr"):
         monkeypatch.setitem(sys.modules, module, None)
-    for arguments in (["a.ply", "--faces", "5"], ["d", "--format", "exr"], ["a.onnx"]):
+    for arguments in (["a.ply", "--faces", "5"], ["d", "--format", "exr"], ["a.onnx"], ["a.usdc"]):
         error = fails([str(shells_asset), str(tmp_path / arguments[0]), *arguments[1:]], capsys)
         assert "pip install 'vfr-bake[export]'" in error
     assert not list(tmp_path.iterdir())
@@ -187,7 +197,8 @@ def test_missing_extra_is_named(
 def test_same_bytes_again(shells_asset: Path, tmp_path: Path) -> None:
     for name, options in (
         ("a.ply", {}), ("a.obj", {}), ("a.glb", {}), ("a.stl", {}), ("a.json", {"frame": "model"}),
-        ("b.ply", {"points": 40}), ("a.onnx", {}),
+        ("b.ply", {"points": 40}), ("a.onnx", {}), ("a.usdc", {}), ("a.usda", {}),
+        ("a.vdb", {"colour": True}), ("a.npz", {"colour": True}),
     ):  # fmt: skip
         for folder in ("one", "two"):
             export.export_asset(shells_asset, tmp_path / folder / name, ExportOptions(**options))

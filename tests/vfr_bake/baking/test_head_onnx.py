@@ -1,0 +1,145 @@
+"""`vfr-export out/ head.onnx` against torch, on random and extreme inputs, in float32 and in 8 bits.
+
+The float head is held against the trained module itself in float64, the 8-bit head against torch's own fake
+quantisation of the same layers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from torch.nn.functional import gelu
+
+from exporters.asset_head import comparisons, head_bytes
+from exporters.int8_head import activation_ranges
+from exporters.onnx_head import HeadWeights, Range, head_onnx
+from player.asset import Asset
+from tests.exporters import block
+from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.head import Head
+from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+
+N_CHANNELS = 16
+SCALE = 0.02
+"""Of the codes, folded into the first layer as the bake folds it."""
+
+
+@pytest.fixture(scope="module")
+def head() -> Head:
+    torch.manual_seed(5)
+    return Head(FieldConfig(n_levels=N_CHANNELS // 2)).double()
+
+
+@pytest.fixture(scope="module")
+def weights(head: Head) -> HeadWeights:
+    return fold_head(head, head.first_weights() * SCALE)
+
+
+@pytest.fixture(scope="module")
+def asset(weights: HeadWeights, tmp_path_factory: pytest.TempPathFactory) -> Asset:
+    """A complete asset whose channels are as many as the head's; only the head is of interest."""
+    opened = Asset.open(block.write_block(tmp_path_factory.mktemp("head") / "asset"))
+    manifest = dataclasses.replace(opened.manifest, n_channels=N_CHANNELS)
+    return dataclasses.replace(opened, manifest=manifest)
+
+
+def exported(asset: Asset, folder: Path, data: bytes, decode: bool) -> onnxruntime.InferenceSession:
+    copy = dataclasses.replace(asset, folder=folder / "asset")
+    shutil.copytree(asset.folder, copy.folder)
+    (copy.folder / "head.onnx").write_bytes(data)
+    written = head_bytes(copy, decode)
+    onnx.checker.check_model(onnx.load_from_string(written), full_check=True)
+    return onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
+
+
+def answers(session: onnxruntime.InferenceSession) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Label, features, dirs and the rgb of the file, for every input that it takes."""
+    found = []
+    names = {port.name for port in session.get_inputs()}
+    for label, features, codes, k_weights, dirs in comparisons(N_CHANNELS):
+        if "codes" in names and codes is None:
+            continue
+        inputs = {"features": features, "codes": codes, "weights": k_weights, "dirs": dirs}
+        (rgb,) = session.run(["rgb"], {name: inputs[name] for name in names})
+        found.append((label, features, dirs, np.asarray(rgb)))
+    return found
+
+
+@pytest.mark.parametrize("decode", [False, True])
+def test_float32_is_the_trained_head(
+    decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
+) -> None:
+    """2e-6: float32 sums of 256 products, a quarter of which passes the sigmoid. Where features are so large
+    that logits of hundreds cancel, 2^-24 of the largest activation remains; beyond, the sigmoid is 0 or 1."""
+    labels = set()
+    for label, features, dirs, rgb in answers(exported(asset, tmp_path, head_onnx(weights), decode)):
+        with torch.no_grad():
+            x = torch.from_numpy(features.astype(np.float64) * SCALE)
+            expected = head(x, torch.from_numpy(dirs.astype(np.float64))).numpy()
+        assert rgb.shape == expected.shape == (len(features), 3), label
+        size = float(np.abs(features).max(initial=0)) * SCALE
+        np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6 * min(max(size, 1), 200), err_msg=label)
+        labels.add(label)
+    assert {"no pixel", "one pixel", "random", "lowest codes", "highest codes"} <= labels
+    assert decode or {"subnormal", "ten thousand", "1e30"} <= labels
+
+
+@pytest.mark.parametrize("decode", [False, True])
+def test_int8_is_torch_s_quantisation(
+    decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
+) -> None:
+    """An activation in the middle between two levels may go either way, and moves a colour by a level of one
+    of 256 activations; two or three of them together, 5e-3. Against the float head, eight bits cost 0.01 in
+    the root mean square."""
+    random = np.random.default_rng(1)
+    seen = random.normal(0, 40, (4000, N_CHANNELS))
+    dirs = random.normal(size=(4000, 3))
+    dirs /= np.linalg.norm(dirs, axis=-1, keepdims=True)
+    ranges = activation_ranges(weights, seen, dirs)
+    for label, features, dirs, rgb in answers(exported(asset, tmp_path, head_onnx(weights, ranges), decode)):
+        expected = quantised(weights, ranges, torch.from_numpy(features), torch.from_numpy(dirs)).numpy()
+        assert rgb.shape == expected.shape, label
+        np.testing.assert_allclose(rgb, expected, rtol=0, atol=5e-3, err_msg=label)
+        if label in ("random", "random floats"):
+            with torch.no_grad():
+                x = torch.from_numpy(features.astype(np.float64) * SCALE)
+                exact = head(x, torch.from_numpy(dirs.astype(np.float64))).numpy()
+            assert 0 < float(np.sqrt(np.mean((rgb - exact) ** 2))) < 0.01, label
+
+
+def quantised(
+    weights: HeadWeights, ranges: tuple[Range, ...], features: torch.Tensor, dirs: torch.Tensor
+) -> torch.Tensor:
+    """The head with the rounding of `exporters.onnx_head`, done by torch."""
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.tensor(array, dtype=torch.float32)
+
+    def rounded(x: torch.Tensor, limits: Range) -> torch.Tensor:
+        scale = (limits[1] - limits[0]) / 255
+        return torch.fake_quantize_per_tensor_affine(x, scale, round(-limits[0] / scale), 0, 255)
+
+    def layer(x: torch.Tensor, weight: np.ndarray, bias: np.ndarray) -> torch.Tensor:
+        w = tensor(weight)
+        scales = w.abs().amax(dim=0) / 127
+        zeros = torch.zeros(len(scales), dtype=torch.int32)
+        w = torch.fake_quantize_per_channel_affine(w, scales, zeros, 1, -127, 127)
+        return x @ w + tensor(bias)
+
+    ((weight, bias),) = weights.spatial
+    h = rounded(gelu(features @ tensor(weight) + tensor(bias)), ranges[0])
+    basis = SphericalHarmonics(weights.sh_degree)(dirs).repeat_interleave(weights.n_sh_features, dim=-1)
+    d_bottleneck, d_sh, bias = weights.directional_first
+    z = gelu(layer(h, d_bottleneck, bias) + (layer(h, *weights.to_sh) * basis) @ tensor(d_sh))
+    for limits, (weight, bias) in zip(ranges[1:], weights.directional, strict=True):
+        z = gelu(layer(rounded(z, limits), weight, bias))
+    weight, bias = weights.output
+    return torch.sigmoid(z @ tensor(weight) + tensor(bias))
