@@ -47,9 +47,7 @@ def psnr(scene: Scene, pilot_steps: int) -> float:
 
 def test_a_large_head_needs_the_pilot_to_converge() -> None:
     scene = demo_scene(size=48, n_train=20, n_test=3)
-    scene = replace(
-        scene, train=before_a_wall(scene.train), test=before_a_wall(scene.test), has_alpha=False
-    )
+    scene = replace(scene, train=before_a_wall(scene.train), test=before_a_wall(scene.test), has_alpha=False)
     blank = np.mean(
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
