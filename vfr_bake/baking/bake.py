@@ -261,9 +261,14 @@ class _Bake:
             if self.n_samples:
                 lessons = collect_lessons(taught, grid, self.n_samples)
                 rates = head_rate / 2, CODE_RATE / 2  # what is left to learn is little
-                stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
-                grid = layout.grid(stored.density, stored.features)
-                self.held_out.measure("refined at k", grid, runner(stored.head), self.n_samples)
+                before = self.held_out.stages[-1]
+                tuned = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
+                grid = layout.grid(tuned.density, tuned.features)
+                after = self.held_out.measure("refined at k", grid, runner(tuned.head), self.n_samples)
+                if after.loss_db < before.loss_db:
+                    stored = tuned
+                else:
+                    self.left_out["refinement at k"] = "all of it: it lost more on views that it has not seen"
         return stored
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
