@@ -282,10 +282,9 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     assert one < five
     assert result.figures["psnr_to_full_model"] > 32
     losses = {stage["name"]: stage["psnr"] for stage in result.figures["stages"]}
-    assert losses["refined at k"] > losses["codes"] + 1, "refinement gets back what the bake lost"
-    assert losses["files"] == pytest.approx(losses["refined at k"], abs=0.05), (
-        "the files hold what was refined"
-    )
+    assert losses["refined"] > losses["codes"] + 1, "refinement gets back what the bake lost"
+    better = max(losses["k"], losses["refined at k"])
+    assert losses["files"] == pytest.approx(better, abs=0.05), "the files hold the better of the two"
 
 
 def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
