@@ -239,7 +239,7 @@ class _Bake:
         if n_steps == 0:
             self._choose_lookups(layout.grid(stored.density, stored.features), stored.head)
             return stored
-        head_rate = HEAD_RATE
+        head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         with self._part("refinement"):
             grid = layout.grid(stored.density, stored.features)
             lessons = collect_lessons(taught, grid, 0)
@@ -254,16 +254,23 @@ class _Bake:
                 head_rate = NEW_HEAD_RATE / 2
                 width = self.model.field.config.head_width
                 self.left_out["head"] = f"a head {width} wide: this one is {choice.head_width} wide"
-            stored = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, grid=grid)
+            stored = refine(
+                stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid
+            )
             grid = layout.grid(stored.density, stored.features)
             self.held_out.measure("refined", grid, runner(stored.head), 0)
             self._choose_lookups(grid, stored.head)
             if self.n_samples:
                 lessons = collect_lessons(taught, grid, self.n_samples)
-                rates = head_rate / 2, CODE_RATE / 2  # what is left to learn is little
-                stored = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
-                grid = layout.grid(stored.density, stored.features)
-                self.held_out.measure("refined at k", grid, runner(stored.head), self.n_samples)
+                rates = head_rate / 2, code_rate / 2  # what is left to learn is little
+                before = self.held_out.stages[-1]
+                tuned = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
+                grid = layout.grid(tuned.density, tuned.features)
+                after = self.held_out.measure("refined at k", grid, runner(tuned.head), self.n_samples)
+                if after.loss_db < before.loss_db:
+                    stored = tuned
+                else:
+                    self.left_out["refinement at k"] = "all of it: it lost more on views that it has not seen"
         return stored
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:

@@ -29,7 +29,7 @@ FULL_CODE = 127.0
 HEAD_RATE = 5e-4
 """Adam's learning rate for a head that the full model had; it falls to zero along a cosine."""
 CODE_RATE = 1.0
-"""Adagrad's learning rate of the codes, in codes; it falls to zero along the same cosine."""
+"""Adagrad's learning rate of codes up to 127; it falls to zero along the same cosine."""
 
 DENSITY_RATE = 1.0
 """The same of the density's codes."""
