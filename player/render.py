@@ -83,7 +83,7 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else n_threads
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
-        self.march, self._module = _choose_march(march)
+        self.march, self._module = choose_march(march)
         self.asset = asset
         self._grid = asset.grid
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
@@ -221,7 +221,7 @@ def check_size(width: int, height: int) -> None:
         raise ConfigError(f"size: expected at most {MAX_PIXELS} pixels (8192x8192), got {width}x{height}")
 
 
-def _choose_march(name: March) -> tuple[str, ModuleType]:
+def choose_march(name: March) -> tuple[str, ModuleType]:
     if name != "numpy":
         from player import march_compiled
 
