@@ -106,8 +106,8 @@ def seen_vertices(
 
 
 def _farthest_around(distance: np.ndarray) -> np.ndarray:
-    """[height + 1, width + 1] the largest of the up to four pixels around each corner of the picture, of those
-    that hit something: what is inside a solid must not be seen past its outline."""
+    """[height + 1, width + 1] the largest of the up to four pixels around each corner of a picture, of those
+    that hit something: nothing inside a solid is seen past its outline."""
     padded = np.pad(np.where(np.isfinite(distance), distance, np.float32(-1)), 1, constant_values=-1)
     farthest = np.maximum(
         np.maximum(padded[:-1, :-1], padded[1:, :-1]), np.maximum(padded[:-1, 1:], padded[1:, 1:])

@@ -1,4 +1,4 @@
-"""A second way to a surface: depth pictures of the training cameras, fused by Open3D (Curless and Levoy 1996).
+"""A second way to a surface: training cameras' depth pictures, fused by Open3D (Curless and Levoy 1996).
 
 Where marching cubes asks what the density is at a place, this asks how far the cameras see: fog in front of a
 surface counts for less, thin parts that few pixels hit for nothing. Pixels of less than half opacity are left

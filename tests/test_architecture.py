@@ -24,7 +24,7 @@ FORBIDDEN = {
 # At the top level, where importing the package alone would need them.
 LAZY = {
     "player": {"numba", "PIL", "onnxruntime"},
-    "exporters": {"onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL", "OpenEXR", "open3d"},
+    "exporters": {"onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL", "OpenEXR", "open3d", "xatlas"},
     "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton", "pycolmap"},
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
@@ -77,7 +77,7 @@ def test_there_are_modules() -> None:
     "missing",
     [
         ["torch"],
-        ["torch", "numba", "scipy", "skimage", "onnx", "cv2", "tqdm", "tyro", "OpenEXR", "open3d"],
+        ["torch", "numba", "scipy", "skimage", "onnx", "cv2", "tqdm", "tyro", "OpenEXR", "open3d", "xatlas"],
     ],
 )
 def test_player_and_exporters_start_without(missing: list[str]) -> None:
@@ -85,7 +85,7 @@ def test_player_and_exporters_start_without(missing: list[str]) -> None:
         f"import sys; sys.modules.update(dict.fromkeys({missing!r})); import player.cli; "
         "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface; "
         "import exporters.parity, exporters.onnx_head, exporters.export, exporters.exr, exporters.pictures; "
-        "import exporters.simplify, exporters.colmap, exporters.asset_head; "
+        "import exporters.simplify, exporters.colmap, exporters.asset_head, exporters.mesh_export, exporters.tsdf; "
         "print('torch' in sys.modules and sys.modules['torch'])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=REPOSITORY)
