@@ -1,10 +1,10 @@
 """The surface of a baked asset: marching cubes on its own sparse density, block by block.
 
 Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
-(`player.density`); v, the size of a voxel; dt, the step of the march. The default level is the density that is
-half opaque over a voxel or a step, whichever is longer, sigma = ln 2 / max(v, dt): what the player draws as
-solid. Only live cells are cut, those whose eight corners are stored: what no training view has seen is neither
-empty nor full, and no surface is made up there. The mesh is open where they end.
+(`player.density`); v, the size of a voxel; dt, the step of the march. The default level is the density that
+is half opaque over a voxel or a step, whichever is longer, sigma = ln 2 / max(v, dt): what the player draws
+as solid. Only live cells are cut, those whose eight corners are stored: what no training view has seen is
+neither empty nor full, and no surface is made up there. The mesh is open where they end.
 
 Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
 not by the box. A corner of the mesh lies on an edge of the grid, and the edge's number is what joins it

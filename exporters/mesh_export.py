@@ -79,8 +79,8 @@ def export_mesh(
 
 
 def world_mesh(scene: Scene, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh in the world's frame, cropped, and what to say about it: baked, unless `method` or `level` asks
-    for it to be made again: then without colours if a texture brings them."""
+    """The mesh in the world's frame, cropped, and what to say about it: as baked, unless `method` or `level`
+    asks for it to be made again: then without colours if a texture brings them."""
     from exporters.ply import read_ply
 
     box = None

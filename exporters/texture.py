@@ -1,9 +1,9 @@
 """A picture on a mesh: which texel lies where on the surface, its colour, and the padding around the charts.
 
-Letters: (u, v) in 0..1 with the origin at the upper left corner of the picture, as in glTF; the texel in row r
-and column c has its centre at u = (c + 1/2) / size, v = (r + 1/2) / size. A texel belongs to the face whose
-triangle holds its centre; all others take the colour of the nearest one that has a face, so that neither linear
-filtering nor smaller copies of the picture show what is between the charts.
+Letters: (u, v) in 0..1 with the origin at the upper left corner of the picture, as in glTF; the texel in
+row r and column c has its centre at u = (c + 1/2) / size, v = (r + 1/2) / size. A texel belongs to the face
+whose triangle holds its centre; all others take the colour of the nearest one that has a face, so that
+neither linear filtering nor smaller copies of the picture show what is between the charts.
 """
 
 from __future__ import annotations

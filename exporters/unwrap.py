@@ -1,8 +1,9 @@
 """A mesh laid out flat: charts and their places in a square, by xatlas.
 
-xatlas has no way to be stopped and says nothing while it works, so it runs in a process of its own: that one is
-ended when the time is over, or with Ctrl-C. Its time grows faster than the number of faces that it is given at
-once (1,500 faces: a tenth of a millisecond each; 6,000: over three), so the mesh is cut into small parts.
+xatlas has no way to be stopped and says nothing while it works, so it runs in a process of its own: that
+one is ended when the time is over, or with Ctrl-C. Its time grows faster than the number of faces that it
+is given at once (1,500 faces: a tenth of a millisecond each; 6,000: over three), so the mesh is cut into
+small parts.
 """
 
 from __future__ import annotations

@@ -85,7 +85,8 @@ def test_player_and_exporters_start_without(missing: list[str]) -> None:
         f"import sys; sys.modules.update(dict.fromkeys({missing!r})); import player.cli; "
         "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface; "
         "import exporters.parity, exporters.onnx_head, exporters.export, exporters.exr, exporters.pictures; "
-        "import exporters.simplify, exporters.colmap, exporters.asset_head, exporters.mesh_export, exporters.tsdf; "
+        "import exporters.simplify, exporters.colmap, exporters.asset_head; "
+        "import exporters.mesh_export, exporters.tsdf, exporters.unwrap; "
         "print('torch' in sys.modules and sys.modules['torch'])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=REPOSITORY)
