@@ -137,8 +137,8 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
         from scipy.ndimage import distance_transform_edt
     except ImportError as error:
         raise MissingExtraError("--texture: needs scipy: pip install 'vfr-bake[export]'") from error
-    nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    return np.ascontiguousarray(image[tuple(nearest)])
+    nearest = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
+    return np.ascontiguousarray(image[nearest[0], nearest[1]])
 
 
 def _inside(

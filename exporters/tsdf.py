@@ -8,6 +8,7 @@ out, and so are those beside a jump in depth, whose mean lies between two surfac
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -48,8 +49,10 @@ def fuse_depth(
             "libusb-1.0-0, libgl1)"
         ) from error
     core = open3d.core
+    one: Any = (1, 1)  # Open3D's stubs know less than its code
+    tensor: Any = core.Tensor
     grid = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
+        ("tsdf", "weight"), (core.float32, core.float32), one, voxel, 8, _BLOCKS, core.Device("CPU:0")
     )
     for done, view in enumerate(views):
         camera = view.camera
@@ -60,8 +63,8 @@ def fuse_depth(
                 [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]], np.float64
             )
             pose = np.linalg.inv(camera.c2w @ np.diag([1.0, -1.0, -1.0, 1.0]))
-            picture = open3d.t.geometry.Image(core.Tensor(depth))
-            where = (core.Tensor(lens), core.Tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
+            picture = open3d.t.geometry.Image(tensor(depth))
+            where = (tensor(lens), tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
             grid.integrate(grid.compute_unique_block_coordinates(picture, *where), picture, *where)
         if progress is not None:
             progress(done + 1, len(views))

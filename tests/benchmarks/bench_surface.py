@@ -5,8 +5,8 @@
 
 `demo`: mean and 95th percentile of the distance to the true surface, both ways (the true one is sampled where
 rays of training cameras end), in voxels, and the mean angle between normals.
-`views`: silhouette IoU with the volume, PSNR of the mesh's picture and of the volume's against the photographs.
-`colours`: which direction, or mean of directions, gives places on the surface the nearest colour.
+`views`: silhouette IoU with the volume, PSNR of the mesh's picture and of the volume's, both against the
+photographs. `colours`: which direction, or mean of directions, gives a place the nearest colour.
 """
 
 from __future__ import annotations
@@ -92,15 +92,15 @@ def bench_demo(asset: Asset, methods: list[str]) -> None:
             near = np.abs(signed_distance(places)) < 2 * voxel
             step = 1e-4
             slopes = np.stack(
-                [signed_distance(places + step * e) - signed_distance(places - step * e) for e in np.eye(3)],
-                axis=-1,,
+                [signed_distance(places + e) - signed_distance(places - e) for e in step * np.eye(3)],
+                axis=-1,
             )
             slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
             cosines = (slopes * normals).sum(-1)[near]
             angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
         from_truth, angle = np.concatenate(back), np.concatenate(angles)
         print(
-            f"{name:8} {len(mesh.faces):9,} faces, {seconds:5.1f} s: mesh to truth {to_truth.mean():.2f} voxels "
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:5.1f} s: mesh to truth {to_truth.mean():.2f} voxel "
             f"(95 %: {np.percentile(to_truth, 95):.2f}), truth to mesh {from_truth.mean():.2f} "
             f"(95 %: {np.percentile(from_truth, 95):.2f}), normals {angle.mean():.1f} degrees "
             f"(median {np.median(angle):.1f})",
