@@ -21,8 +21,8 @@ from player.render import choose_march, default_threads
 
 STAND_OFF = 3.0
 """Voxels above the surface at which a ray starts."""
-MAX_DIRECTIONS = 8
-"""Cameras that count for a point, at most."""
+MAX_DIRECTIONS = 4
+"""Cameras that count for a point, at most: eight are no nearer to the player's pictures (docs/exports.md)."""
 _RAYS = 1 << 14
 _LEAST = 0.1  # opacity below which a ray has met too little to have a colour
 

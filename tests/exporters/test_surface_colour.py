@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import onnx
+import pytest
 from onnx import numpy_helper
 
 from exporters import surface_colour
@@ -41,7 +42,8 @@ def test_along_the_normal_without_views(ball_asset: Asset) -> None:
     assert np.abs(rgb - expected).max() < 0.06 and np.abs(rgb - expected).mean() < 0.02
 
 
-def test_mean_of_the_cameras_that_see_it(ball_asset: Asset) -> None:
+def test_mean_of_the_cameras_that_see_it(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_colour, "MAX_DIRECTIONS", 12)
     points, normals = on_the_ball(ball_asset)
     views = depth_views(ball_asset)
     rgb, known = surface_colours(ball_asset, points, normals, views)
@@ -73,7 +75,7 @@ def test_beside_the_surface_and_far_from_it(ball_asset: Asset) -> None:
     assert none.shape == (0, 3) and known.shape == (0,)
 
 
-def test_no_more_cameras_than_wanted(ball_asset: Asset, monkeypatch) -> None:
+def test_no_more_cameras_than_wanted(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     """With one camera each, colours are that camera's, not a mean."""
     points, normals = on_the_ball(ball_asset)
     views = depth_views(ball_asset)
