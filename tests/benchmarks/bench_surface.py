@@ -100,7 +100,7 @@ def bench_demo(asset: Asset, methods: list[str]) -> None:
             angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
         from_truth, angle = np.concatenate(back), np.concatenate(angles)
         print(
-            f"{name:8} {len(mesh.faces):9,} faces, {seconds:.1f} s: mesh to truth {to_truth.mean():.2f} voxel "
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:.1f} s: to truth {to_truth.mean():.2f} voxel "
             f"(95 %: {np.percentile(to_truth, 95):.2f}), truth to mesh {from_truth.mean():.2f} "
             f"(95 %: {np.percentile(from_truth, 95):.2f}), normals {angle.mean():.1f} degrees "
             f"(median {np.median(angle):.1f})",
