@@ -108,7 +108,7 @@ def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tup
     seen = seen_vertices(views, mesh.vertices, mesh.normals, tolerance)
     grown = np.zeros(len(mesh.vertices), bool)
     grown[mesh.faces[seen[mesh.faces].any(axis=1)]] = True
-    keep = grown[mesh.faces].all(axis=1)
+    keep = np.all(grown[mesh.faces], axis=-1)
     if not keep.any():
         raise DataError(f"surface: expected some of {len(keep)} faces in a training camera's view, got none")
     part = mesh if keep.all() else take_faces(mesh, keep)
