@@ -29,6 +29,10 @@ meshes and points:
   vfr-export out/ scene.glb                          for Blender, Unreal, Unity, three.js
   vfr-export out/ scene.obj --frame blender          Y up, as Blender's OBJ importer expects
   vfr-export out/ scene.ply --faces 100000           fewer faces, colours kept
+  vfr-export out/ scene.glb --lods 3                 scene.glb, scene.lod1.glb, scene.lod2.glb: half the faces
+  vfr-export out/ scene.glb --texture 2048           colours in a picture, 200,000 faces unless --faces
+  vfr-export out/ fine.ply --method density          the surface again, from the density as it is stored
+  vfr-export out/ fused.ply --method tsdf            the surface again, from what the training cameras see
   vfr-export out/ part.stl --crop 0,0,0.5,1,1,1      a box of 1 x 1 x 1 around (0, 0, 0.5)
   vfr-export out/ part.stl --crop 0,0,0.5,2,1,1,30   the same, 2 long, turned by 30 degrees about Z
   vfr-export out/ part.stl --crop box.json           {"matrix": 4 x 4 world from box, "size": [W, D, H]}
@@ -89,7 +93,12 @@ def _options(arguments: argparse.Namespace) -> ExportOptions:
         format=arguments.format,
         frame=arguments.frame,
         crop=arguments.crop,
+        method=arguments.method,
+        level=arguments.level,
         faces=arguments.faces,
+        lods=arguments.lods,
+        texture=arguments.texture,
+        time_limit=arguments.time_limit,
         points=arguments.points,
         cameras=arguments.cameras,
         views=arguments.views,
@@ -118,6 +127,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
     add("--crop", metavar="X,Y,Z,W,D,H[,YAW]", help="only what is in this box of the world; or a .json file")
     add("--faces", type=int, metavar="N", help="simplify the mesh to N faces, or as few as can be reached")
+    add("--lods", type=int, metavar="N", help="levels of detail: N files, each of half the faces of the last")
+    add(
+        "--method", choices=("density", "tsdf"), help="make the surface again: marching cubes, or fused depth"
+    )
+    add("--level", type=float, metavar="X", help="density of the surface, 1/model unit (half opaque)")
+    add("--texture", type=int, metavar="N", help="obj, glb: colours in a picture of N x N (needs xatlas)")
+    add("--time-limit", type=float, metavar="S", help="seconds that laying out a texture may take (300)")
     add("--points", type=int, metavar="N", help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})")
     add("--cameras", type=Path, metavar="FILE", help="views of a transforms.json (the training cameras)")
     add("--views", type=_slice, metavar="A:B", help="a slice of the views, as in Python")
@@ -165,10 +181,10 @@ def _slice(text: str) -> slice:
     return slice(*parts)
 
 
-def _bar(done: int, total: int) -> None:
+def _bar(stage: str, done: int, total: int) -> None:
     """A progress bar on stderr, if that is a terminal."""
     if sys.stderr.isatty():
-        sys.stderr.write(f"\r[{'#' * (24 * done // total):24}] picture {done}/{total}")
+        sys.stderr.write(f"\r\x1b[K[{'#' * (24 * done // total):24}] {stage} {done}/{total}")
         sys.stderr.write("\n" if done == total else "")
         sys.stderr.flush()
 
@@ -191,6 +207,15 @@ def _sentence(summary: dict[str, Any]) -> str:
         parts.append(f"written in the frame {summary['frame']}")
     if summary.get("faces", 0) > summary.get("faces_asked", float("inf")):
         parts.append(f"{summary['faces_asked']} were asked for, but no other edge can go without a fold")
+    if "texture" in summary:
+        parts.append(f"texture {summary['texture']} x {summary['texture']}")
+    for level in summary.get("lods", [])[1:]:
+        parts.append(f"{level['file']} of {level['faces']} faces")
+    if "method" in summary:
+        parts.append(
+            f"{summary['unseen_faces_removed']} faces that no training camera sees and "
+            f"{summary['floaters_removed']} floating parts ({summary['floater_faces_removed']} faces) removed"
+        )
     if "removed" in summary:
         parts.append(
             f"the crop removed {summary['removed']:.1%} of the {'voxels' if 'voxels' in summary else 'faces'}"

@@ -1,6 +1,6 @@
 """From an asset to the file or folder that was asked for: reads, changes, writes, compares.
 
-Order for meshes: crop (world units), then fewer faces, then the frame. Everything is made and read back in
+Meshes are the matter of `exporters.mesh_export`. Everything is made and read back in
 memory, or in a folder beside the target, before the target's name appears.
 """
 
@@ -12,24 +12,26 @@ from typing import Any
 
 import numpy as np
 
-from exporters.crop import CropBox, parse_crop
-from exporters.formats import COLMAP_FILES, FOLDERS, POINTS, ExportOptions, check_options
+from exporters.asset_mesh import Scene
+from exporters.crop import parse_crop
+from exporters.formats import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
 from exporters.mesh import TriangleMesh
+from exporters.mesh_export import export_mesh, mesh_paths, world_mesh
 from player.asset import Asset
 from player.cameras import Camera
 from player.errors import OutputError
 from player.files import check_target, new_folder, write_bytes
 from player.transforms import frame_names, read_cameras
 
-Progress = Callable[[int, int], object]
-"""Called with the number done and the total."""
+Report = Callable[[str, int, int], object]
+"""Called with (stage, done, of)."""
 
 
 def export_asset(
     asset_path: Path,
     target: Path,
     options: ExportOptions | None = None,
-    progress: Progress | None = None,
+    report: Report | None = None,
 ) -> dict[str, Any]:
     """Write one file or folder out of the asset in `asset_path` and describe it.
 
@@ -37,13 +39,15 @@ def export_asset(
         asset_path: the folder of an asset; every checksum is compared.
         target: what to write.
         options: what to write there, and how; by default the mesh, in the world's frame, as the suffix says.
-        progress: called after each picture.
+        report: called with (stage, done, of) while something takes its time.
 
     Returns:
         JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
         in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
-        `faces_asked`; `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit
-        of the frame; `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
+        `faces_asked`, `texture` (its size), `lods` (`file`, `faces`, `bytes` of each), and of a surface that
+        was made again `method`, `unseen_faces_removed`, `floaters_removed`, `floater_faces_removed`;
+        `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit of the frame;
+        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop.
@@ -53,52 +57,35 @@ def export_asset(
         MissingExtraError: the format needs a package that is not installed.
     """
     options = options or ExportOptions()
+    report = report or (lambda stage, done, of: None)
     name = check_options(target, options)
+    is_mesh = name in MESHES and options.points is None
+    for path in [path for level in mesh_paths(target, options, name) for path in level] if is_mesh else []:
+        _check_target(asset_path, path, name, options.force)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True)
+    if is_mesh:
+        facts = export_mesh(asset, target, options, name, _matrix(asset, options, name), report)
+        return {"file": str(target), "format": name, **facts}
     if name == "exr":
         from exporters.pictures import export_pictures
 
         cameras, names = _views(asset, options)
-        return export_pictures(asset, target, cameras, names, options.half, force, progress)
+        return export_pictures(
+            asset, target, cameras, names, options.half, force, lambda done, of: report("picture", done, of)
+        )
     if name == "colmap":
-        return _export_colmap(asset, target, options, force)
+        return _export_colmap(asset, target, options, force, report)
     if name == "json":
         data, facts = _cameras(asset, target, options)
     elif name == "onnx":
         data, facts = _head(asset, target, options)
     elif name in ("vdb", "npz"):
         data, facts = _volume(asset, target, options, name)
-    elif options.points is not None:
-        data, facts = _points(asset, target, options)
     else:
-        data, facts = _mesh(asset, target, options, name)
+        data, facts = _points(asset, target, options, report)
     write_bytes(target, data)
     return {"file": str(target), "format": name, **facts, "bytes": len(data)}
-
-
-def _mesh(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
-    from exporters.glb import glb_bytes
-    from exporters.obj import obj_bytes
-    from exporters.parity import check_mesh_bytes
-    from exporters.ply import ply_bytes
-    from exporters.stl import stl_bytes
-
-    mesh, facts = _world_mesh(asset, options)
-    if options.faces is not None:
-        from exporters.simplify import simplify_mesh
-
-        mesh = simplify_mesh(mesh, options.faces)
-        facts["faces_asked"] = options.faces
-    moved = _in_frame(mesh, asset, options, name)
-    if name in ("usdc", "usda"):
-        from exporters.usd import usd_bytes
-
-        data = usd_bytes(moved, f".{name}", "Y" if options.frame == "gltf" else "Z")
-    else:
-        data = {"ply": ply_bytes, "obj": obj_bytes, "glb": glb_bytes, "stl": stl_bytes}[name](moved)
-    check_mesh_bytes(f".{name}", data, moved, str(target))
-    return data, {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "bounds": _bounds(mesh), **facts}
 
 
 def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
@@ -108,8 +95,9 @@ def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tu
     from exporters.volume import asset_volume
 
     frame = options.frame or "world"
+    box = None if options.crop is None else parse_crop(options.crop)
     frame_from_world = _matrix(asset, options, name)
-    volume, removed = asset_volume(asset, frame_from_world, _box(options), options.colour)
+    volume, removed = asset_volume(asset, frame_from_world, box, options.colour)
     written = volume.for_blender() if (name, frame) == ("vdb", "blender") else volume
     data = npz_bytes(volume, frame) if name == "npz" else vdb_bytes(written)
     check_volume_bytes(f".{name}", data, written, str(target))
@@ -124,11 +112,13 @@ def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tu
     return data, facts | ({"removed": removed} if options.crop is not None else {})
 
 
-def _points(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
+def _points(
+    asset: Asset, target: Path, options: ExportOptions, report: Report
+) -> tuple[bytes, dict[str, Any]]:
     from exporters.parity import check_points_bytes
     from exporters.points import points_bytes
 
-    cloud, facts = _cloud(asset, options, options.points or POINTS)
+    cloud, facts = _cloud(asset, options, options.points or POINTS, report)
     moved = _in_frame(cloud, asset, options, "ply")
     data = points_bytes(moved)
     check_points_bytes(data, moved, str(target))
@@ -150,11 +140,13 @@ def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, di
     return head_bytes(asset, options.decode, str(target)), {"inputs": inputs, "outputs": ["rgb"]}
 
 
-def _export_colmap(asset: Asset, target: Path, options: ExportOptions, force: bool) -> dict[str, Any]:
+def _export_colmap(
+    asset: Asset, target: Path, options: ExportOptions, force: bool, report: Report
+) -> dict[str, Any]:
     from exporters.cameras import moved_cameras
     from exporters.colmap import colmap_files
 
-    cloud, facts = _cloud(asset, options, options.points or POINTS)
+    cloud, facts = _cloud(asset, options, options.points or POINTS, report)
     cameras = moved_cameras(_trained(asset), _matrix(asset, options, "colmap"))
     files = colmap_files(cameras, _in_frame(cloud, asset, options, "colmap"))
     with new_folder(target, force) as folder:
@@ -171,30 +163,12 @@ def _export_colmap(asset: Asset, target: Path, options: ExportOptions, force: bo
     }
 
 
-def _world_mesh(asset: Asset, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The asset's mesh, cropped: it is in the world's frame already, whoever opens mesh.ply itself sees it
-    there."""
-    from exporters.ply import read_ply
-
-    box = _box(options)
-    mesh = read_ply(asset.path("mesh.ply"))
-    facts: dict[str, Any] = {"frame": options.frame or "world"}
-    if box is not None:
-        from exporters.crop import crop_mesh
-
-        mesh, removed = crop_mesh(mesh, box)
-        facts["removed"] = removed
-    return mesh, facts
-
-
-def _box(options: ExportOptions) -> CropBox | None:
-    return None if options.crop is None else parse_crop(options.crop)
-
-
-def _cloud(asset: Asset, options: ExportOptions, n_points: int) -> tuple[TriangleMesh, dict[str, Any]]:
+def _cloud(
+    asset: Asset, options: ExportOptions, n_points: int, report: Report
+) -> tuple[TriangleMesh, dict[str, Any]]:
     from exporters.points import sample_points
 
-    mesh, facts = _world_mesh(asset, options)
+    mesh, facts = world_mesh(Scene(asset, report), options)
     return sample_points(mesh, n_points), facts
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 from player.errors import ConfigError
 
 Frame = Literal["world", "model", "gltf", "blender"]
+Method = Literal["density", "tsdf"]
 
 FORMATS = {
     ".ply": "binary PLY; colours are sRGB bytes. With --points N a point cloud instead of a mesh",
@@ -30,17 +31,26 @@ FOLDERS = {
 }
 """Folders, by --format."""
 
+MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
+"""The files that hold a mesh."""
+
 COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 POINTS = 100_000
 """Points of a COLMAP model, unless asked for another number."""
 
+TEXTURE_FACES = 200_000
+"""Faces of a mesh with a texture, unless asked for another number: laying out more takes minutes."""
+
+_SURFACE = {"frame", "crop", "method", "level"}
+_MESH = _SURFACE | {"faces", "lods"}
 _TAKES = {
-    "mesh": {"frame", "crop", "faces"},
-    "points": {"frame", "crop", "points"},
+    "mesh": _MESH,
+    "textured": _MESH | {"texture", "time_limit"},
+    "points": _SURFACE | {"points"},
     "volume": {"frame", "crop", "colour"},
     "json": {"frame"},
-    "colmap": {"frame", "crop", "points"},
+    "colmap": _SURFACE | {"points"},
     "exr": {"cameras", "views", "size", "half"},
     "onnx": {"decode"},
 }
@@ -56,7 +66,17 @@ class ExportOptions:
     """None is the world; `exporters.frames` describes them."""
     crop: str | None = None
     """`exporters.crop` reads it."""
+    method: Method | None = None
+    """Makes the surface again, by marching cubes on the density or from fused depth; None is as baked."""
+    level: float | None = None
+    """Density of the surface, 1/model unit; given, the surface is made again."""
     faces: int | None = None
+    lods: int | None = None
+    """Files of half the faces each, the first included."""
+    texture: int | None = None
+    """Texels along each side of a picture, in place of vertex colours."""
+    time_limit: float | None = None
+    """Seconds that laying out a texture may take."""
     points: int | None = None
     cameras: Path | None = None
     """A transforms.json; None is the training cameras."""
@@ -94,23 +114,45 @@ def check_options(target: Path, options: ExportOptions) -> str:
     elif name not in FOLDERS and f".{name}" not in FORMATS:
         known = [*(suffix[1:] for suffix in FORMATS), *FOLDERS]
         raise ConfigError(f"--format: expected one of {', '.join(known)}, got {name}")
-    kind = name
-    if name in ("ply", "obj", "glb", "stl", "usdc", "usda"):
-        kind = "points" if name == "ply" and options.points is not None else "mesh"
-    elif name in ("vdb", "npz"):
-        kind = "volume"
+    kind = _kind(name, options)
     default = ExportOptions()
     for key in sorted(set().union(*_TAKES.values()) - _TAKES[kind]):
         if getattr(options, key) != getattr(default, key):
-            takes = ", ".join(f"--{option}" for option in sorted(_TAKES[kind]))
-            raise ConfigError(f"{target}: --{key} does nothing for {kind_name(name, kind)}; it takes {takes}")
-    for key in ("faces", "points"):
-        value = getattr(options, key)
-        if value is not None and value < 1:
-            raise ConfigError(f"--{key}: expected 1 or more, got {value}")
+            takes = ", ".join(_flag(option) for option in sorted(_TAKES[kind]))
+            raise ConfigError(
+                f"{target}: {_flag(key)} does nothing for {kind_name(name, kind)}; it takes {takes}"
+            )
+    _check_ranges(options)
     return name
+
+
+def _kind(name: str, options: ExportOptions) -> str:
+    if name == "ply" and options.points is not None:
+        return "points"
+    if name in MESHES:
+        return "textured" if name in ("obj", "glb") else "mesh"
+    return "volume" if name in ("vdb", "npz") else name
+
+
+def _flag(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
+
+
+def _check_ranges(options: ExportOptions) -> None:
+    for key, low, high in (("faces", 1, None), ("points", 1, None), ("lods", 2, 10), ("texture", 16, 16384)):
+        value = getattr(options, key)
+        if value is not None and (value < low or (high is not None and value > high)):
+            wanted = f"{low} or more" if high is None else f"{low} to {high}"
+            raise ConfigError(f"--{key}: expected {wanted}, got {value}")
+    if options.time_limit is not None and not options.time_limit > 0:
+        raise ConfigError(f"--time-limit: expected seconds > 0, got {options.time_limit:g}")
+    if options.time_limit is not None and options.texture is None:
+        raise ConfigError("--time-limit: expected it with --texture, got it alone")
+    if options.level is not None and options.method == "tsdf":
+        raise ConfigError("--level: expected --method density, got tsdf, which has no level")
 
 
 def kind_name(name: str, kind: str) -> str:
     """How a message calls what is written."""
-    return {"points": "a point cloud", "mesh": f"a {name} mesh", "volume": f"a {name} volume"}.get(kind, name)
+    mesh, volume = f"a {name} mesh", f"a {name} volume"
+    return {"points": "a point cloud", "mesh": mesh, "textured": mesh, "volume": volume}.get(kind, name)

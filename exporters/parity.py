@@ -4,6 +4,7 @@ any rename.
 
 from __future__ import annotations
 
+import io
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from exporters.npz import parse_npz
 from exporters.ply import parse_ply
 from exporters.points import parse_points
 from exporters.stl import parse_stl
+from exporters.texture import Texture
 from exporters.usd import parse_usd
 from exporters.vdb import parse_vdb
 from exporters.volume import Volume
@@ -62,6 +64,43 @@ def check_mesh_bytes(suffix: str, data: bytes, mesh: TriangleMesh, where: str) -
     _check_rows(where, "normals", normals, got.normals, 1e-6)
     _check_rows(where, "colours", colours, got.colours, COLOUR_TOLERANCE[suffix])
     _check_rows(where, "faces", mesh.faces, got.faces, 0.0)
+
+
+def check_textured_glb(data: bytes, mesh: TriangleMesh, texture: Texture, where: str) -> None:
+    """Raises ParityError if `data` does not hold `mesh` and `texture`: places, normals, faces, places in the
+    picture, every texel."""
+    document, buffer = parse_glb(data, where)
+    names = document["meshes"][0]["primitives"][0]["attributes"]
+    if "COLOR_0" in names:
+        raise ParityError(f"{where}: COLOR_0: expected none beside a texture, got one")
+    uvs = _accessor(document, buffer, names["TEXCOORD_0"], "<f4", 2)
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    picture = buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    _check_textured(
+        where,
+        (y_up(mesh.vertices), y_up(mesh.normals), mesh.faces, texture),
+        (*_glb_places(document, buffer, where), uvs, picture),
+        _rounding(mesh),
+        0.0,
+    )
+
+
+def check_textured_obj(files: dict[str, bytes], mesh: TriangleMesh, texture: Texture, where: str) -> None:
+    """Raises ParityError if the `.obj`, `.mtl` and `.png` in `files` do not hold `mesh` and `texture`."""
+    data = files[".obj"]
+    vertices, normals, faces, uvs = _textured_obj(data, where)
+    named = [line[7:] for line in files[".mtl"].decode().splitlines() if line.startswith("map_Kd ")]
+    stem = data[data.index(b"mtllib ") + 7 : data.index(b".mtl")].decode()
+    if named != [f"{stem}.png"]:
+        raise ParityError(f"{where}: map_Kd: expected {stem}.png, got {named}")
+    uvs[:, 1] = 1 - uvs[:, 1]
+    _check_textured(
+        where,
+        (mesh.vertices, mesh.normals, mesh.faces, texture),
+        (vertices, normals, faces, uvs, files[".png"]),
+        _rounding(mesh),
+        1e-7,
+    )
 
 
 def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
@@ -146,21 +185,73 @@ def _obj(data: bytes, where: str) -> _Arrays:
 
 def _glb(data: bytes, where: str) -> _Arrays:
     document, buffer = parse_glb(data, where)
+    vertices, normals, faces = _glb_places(document, buffer, where)
+    names = document["meshes"][0]["primitives"][0]["attributes"]
+    return _Arrays(vertices, normals, _accessor(document, buffer, names["COLOR_0"], "<u2", 4) / 65535, faces)
+
+
+def _glb_places(document: dict, buffer: bytes, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     primitive = document["meshes"][0]["primitives"][0]
-
-    def read(index: int, kind: str, width: int) -> np.ndarray:
-        accessor = document["accessors"][index]
-        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
-        count = accessor["count"] * (1 if accessor["type"] == "SCALAR" else width)
-        return np.frombuffer(buffer, kind, count, start).reshape(-1, width)
-
     names = primitive["attributes"]
-    vertices = read(names["POSITION"], "<f4", 3)
+    vertices = _accessor(document, buffer, names["POSITION"], "<f4", 3)
     position = document["accessors"][names["POSITION"]]
     if [vertices.min(0).tolist(), vertices.max(0).tolist()] != [position["min"], position["max"]]:
         raise ParityError(f"{where}: POSITION: min and max: expected those of its numbers, got {position}")
-    colours = read(names["COLOR_0"], "<u2", 4) / 65535
-    return _Arrays(vertices, read(names["NORMAL"], "<f4", 3), colours, read(primitive["indices"], "<u4", 3))
+    faces = _accessor(document, buffer, primitive["indices"], "<u4", 3)
+    return vertices, _accessor(document, buffer, names["NORMAL"], "<f4", 3), faces
+
+
+def _accessor(document: dict, buffer: bytes, index: int, kind: str, width: int) -> np.ndarray:
+    accessor = document["accessors"][index]
+    start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    count = accessor["count"] * (1 if accessor["type"] == "SCALAR" else width)
+    return np.frombuffer(buffer, kind, count, start).reshape(-1, width)
+
+
+def _textured_obj(data: bytes, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, normals, faces and places in the picture of what `textured_obj_files` writes."""
+    starts = [data.find(word) for word in (b"\nv ", b"\nvt ", b"\nvn ", b"\nf ")]
+    if min(starts) < 0 or starts != sorted(starts):
+        raise ParityError(f"{where}: expected v, vt, vn and f in this order, got {starts}")
+
+    def numbers(part: bytes, letter: bytes, width: int) -> np.ndarray:
+        return np.fromstring(part.replace(letter, b" ").replace(b"/", b" ").decode(), sep=" ").reshape(
+            -1, width
+        )
+
+    first, places, turned, faces = starts
+    corners = numbers(data[faces:], b"f", 9)
+    if not (
+        np.array_equal(corners[:, ::3], corners[:, 1::3])
+        and np.array_equal(corners[:, ::3], corners[:, 2::3])
+    ):
+        raise ParityError(f"{where}: faces: expected the normals and places of their vertices, got others")
+    return (
+        numbers(data[first:places], b"v", 3),
+        numbers(data[turned:faces], b"vn", 3),
+        corners[:, ::3].astype(np.int64) - 1,
+        numbers(data[places:turned], b"vt", 2),
+    )
+
+
+def _check_textured(
+    where: str,
+    expected: tuple[np.ndarray, np.ndarray, np.ndarray, Texture],
+    got: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bytes],
+    rounding: float,
+    uv_tolerance: float,
+) -> None:
+    vertices, normals, faces, texture = expected
+    _check_rows(where, "vertices", vertices, got[0], rounding)
+    _check_rows(where, "normals", normals, got[1], 1e-6)
+    _check_rows(where, "faces", faces, got[2], 0.0)
+    _check_rows(where, "places in the picture", texture.uvs.astype(np.float64), got[3], uv_tolerance)
+    from PIL import Image
+
+    image = np.asarray(Image.open(io.BytesIO(got[4])))
+    if image.shape != texture.image.shape:
+        raise ParityError(f"{where}: picture: expected {texture.image.shape}, got {image.shape}")
+    _check_rows(where, "texels", texture.image.reshape(-1, 3), image.reshape(-1, 3), 0.0)
 
 
 def _usdc(data: bytes, where: str) -> _Arrays:

@@ -39,21 +39,33 @@ def write_bytes(path: Path, data: bytes) -> None:
 
     Raises OutputError: full disk, read-only folder, ...
     """
-    temporary = None
+    write_together({path: data})
+
+
+def write_together(files: dict[Path, bytes]) -> None:
+    """Write every file beside its place; when all are complete, rename them into place, in their order.
+
+    Raises OutputError: full disk, read-only folder, ...
+    """
+    complete: dict[Path, Path] = {}
+    path = Path()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o666 & ~_umask())
-        Path(temporary).replace(path)
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+            complete[path] = Path(temporary)
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            complete[path].chmod(0o666 & ~_umask())
+        for path, temporary_path in complete.items():
+            temporary_path.replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
+        for temporary_path in complete.values():
+            temporary_path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -105,7 +105,7 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else n_threads
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
-        self.march, self._module = _choose_march(march)
+        self.march, self._module = choose_march(march)
         self.asset = asset
         self._grid = asset.grid
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
@@ -288,7 +288,7 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def _choose_march(name: March) -> tuple[str, ModuleType]:
+def choose_march(name: March) -> tuple[str, ModuleType]:
     if name != "numpy":
         from player import march_compiled
 

@@ -13,6 +13,7 @@ from player.asset import Asset, GridArrays, write_asset
 from player.bricks import pack_vertices
 from player.manifest import Manifest
 from tests.exporters.meshes import box
+from tests.exporters.solids import ball, cube, write_solid
 from tests.player import conftest as shells
 
 # One runs inside Blender; the other asks programs that `make` installs from Debian's or Ubuntu's packages.
@@ -22,6 +23,10 @@ if not (sys.platform == "linux" and platform.machine() == "x86_64"):
 
 BOX = ((1.25, 2.25, 3.0), (1.75, 2.5, 4.0))
 """Corners of the asset's mesh, world frame: three edges of different length."""
+
+BALL_CENTRE, BALL_RADIUS = (0.05, -0.03, 0.02), 0.6
+CUBE_LOW, CUBE_HIGH = (-0.5, -0.4, -0.6), (0.5, 0.3, 0.2)
+"""Model frame."""
 
 
 @pytest.fixture(scope="session")
@@ -47,3 +52,15 @@ def shells_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def opened(shells_asset: Path) -> Asset:
     return Asset.open(shells_asset)
+
+
+@pytest.fixture(scope="session")
+def ball_asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
+    """A ball in two blocks along each axis. Do not change it."""
+    return write_solid(tmp_path_factory.mktemp("ball") / "asset", ball(BALL_CENTRE, BALL_RADIUS), 72)
+
+
+@pytest.fixture(scope="session")
+def cube_asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
+    """A box of three different edges. Do not change it."""
+    return write_solid(tmp_path_factory.mktemp("cube") / "asset", cube(CUBE_LOW, CUBE_HIGH), 48)

@@ -239,5 +239,7 @@ def test_examples_run(
     for line in lines:
         # the boxes of the examples are those of a scene around the origin
         line = re.sub(r"--crop [-\d.,]+", "--crop 1.5,2.375,3.5,9,9,9,30", line)
+        # the asset's own mesh is a box that is nowhere near its shells: nothing there has a colour
+        line = line.replace("--texture 2048", "--texture 64 --method density --faces 2000")
         small = ["--size", "6x5", "--views", "0:2"] if "--format exr" in line else []
         assert cli.main([*shlex.split(line), *small, "--force"]) == 0, line

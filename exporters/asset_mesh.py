@@ -1,0 +1,135 @@
+"""The surface of an asset in the world, made again from its density or its depth; what floats and what no
+training camera sees is taken away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from exporters.asset_surface import extract_asset_surface, voxel_size
+from exporters.formats import Method
+from exporters.mesh import TriangleMesh, take_faces
+from exporters.surface import remove_small_components
+from exporters.surface_colour import surface_colours
+from exporters.training_views import FULL_PIXELS, TOLERANCE, DepthView, depth_views, seen_vertices
+from player.asset import Asset
+from player.errors import DataError
+
+FLOATER_FRACTION = 1e-4
+"""Connected parts with a smaller share of the faces are floaters and go."""
+
+Report = Callable[[str, int, int], object]
+"""Called with (stage, done, of)."""
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What cleaning took away."""
+
+    unseen: int
+    """Faces that no training camera sees."""
+    floaters: int
+    """Parts that were too small."""
+    floater_faces: int
+
+
+class Scene:
+    """An asset whose training cameras are played once, when somebody first asks what they see."""
+
+    def __init__(self, asset: Asset, report: Report) -> None:
+        self.asset = asset
+        self.report = report
+
+    @cached_property
+    def views(self) -> list[DepthView]:
+        """What the training cameras see, small: enough to tell what is hidden."""
+        return depth_views(self.asset, progress=lambda done, of: self.report("views", done, of))
+
+    def coloured(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`exporters.surface_colour.surface_colours` of this asset."""
+        return surface_colours(
+            self.asset, points, normals, self.views, lambda done, of: self.report("colours", done, of)
+        )
+
+    def surface(
+        self, method: Method, level: float | None, coloured: bool = True
+    ) -> tuple[TriangleMesh, Removed]:
+        """The surface made again, and what was removed of it.
+
+        Args:
+            method: "density", marching cubes on the asset's density; "tsdf", depth pictures fused.
+            level: density of the surface in 1/model unit, for "density".
+            coloured: else it is white.
+
+        Raises:
+            ConfigError: a level outside the data.
+            DataError: there is no surface, or nothing of it is seen.
+            MissingExtraError: a package is not installed.
+        """
+        matrix = self.asset.world_from_model
+        voxel = voxel_size(self.asset.grid) * self.asset.scale
+        if method == "tsdf":
+            from exporters.tsdf import fuse_depth
+
+            full = depth_views(self.asset, FULL_PIXELS, lambda done, of: self.report("views", done, of))
+            vertices, faces, normals = fuse_depth(
+                full, voxel, lambda done, of: self.report("fusion", done, of)
+            )
+        else:
+            vertices, faces, normals = extract_asset_surface(
+                self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100)
+            )
+            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            normals = normals @ matrix[:3, :3].T / self.asset.scale
+        mesh = TriangleMesh(vertices, faces, normals, np.full((len(vertices), 4), 255, np.uint8))
+        mesh, removed = cleaned(mesh, self.views, TOLERANCE * voxel)
+        if not coloured:
+            return mesh, removed
+        rgb, known = self.coloured(mesh.vertices, mesh.normals)
+        colours = mesh.colours.copy()
+        colours[:, :3] = np.rint(np.clip(rgb, 0, 1) * 255)
+        if not known.all():  # beside the volume: what the corners around it are
+            colours = _from_around(colours, known, mesh.faces)
+        return replace(mesh, colours=colours), removed
+
+
+def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tuple[TriangleMesh, Removed]:
+    """A mesh (world frame) without the faces that no view sees and without floaters, and what went.
+
+    A face is seen if a corner of it, or of a face that shares a corner, is: holes of one face would be made
+    by noise alone. `tolerance`: see `exporters.training_views.seen_vertices`.
+
+    Raises DataError: no face is seen.
+    """
+    seen = seen_vertices(views, mesh.vertices, mesh.normals, tolerance)
+    grown = np.zeros(len(mesh.vertices), bool)
+    grown[mesh.faces[seen[mesh.faces].any(axis=1)]] = True
+    keep = np.all(grown[mesh.faces], axis=-1)
+    if not keep.any():
+        raise DataError(f"surface: expected some of {len(keep)} faces in a training camera's view, got none")
+    part = mesh if keep.all() else take_faces(mesh, keep)
+    whole, n_floaters = remove_small_components(part, FLOATER_FRACTION)
+    return whole, Removed(int((~keep).sum()), n_floaters, len(part.faces) - len(whole.faces))
+
+
+def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Colours [n, 4], those not known taken from the known corners of their faces, then of theirs."""
+    colours, known = colours.copy(), known.copy()
+    while not known.all():
+        open_ = faces[(~known)[faces].any(axis=1) & known[faces].any(axis=1)]
+        if not len(open_):
+            break
+        weight = known[open_].sum(axis=1)
+        mean = (colours[open_, :3] * known[open_][..., None]).sum(axis=1) / weight[:, None]
+        total, count = np.zeros((len(colours), 3)), np.zeros(len(colours))
+        for k in range(3):
+            np.add.at(total, open_[:, k], mean)
+            np.add.at(count, open_[:, k], 1)
+        fresh = ~known & (count > 0)
+        colours[fresh, :3] = np.rint(total[fresh] / count[fresh, None])
+        known |= fresh
+    return colours

@@ -1,0 +1,122 @@
+"""What the training cameras see of an asset: their pictures of depth, played, and which points are in view.
+
+Letters: t, the distance from a camera along a ray, world units; c, the cosine between a point's normal and
+    the
+direction to the camera. A point is seen where c > 0 and t is at most what the picture of depth has there,
+plus a tolerance; where the picture is less than half opaque nothing is in the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.asset import Asset
+from player.cameras import Camera
+from player.render import Renderer
+from player.transforms import read_cameras
+
+MAX_VIEWS = 100
+"""Views that are played, spread over all of the training cameras."""
+SMALL_PIXELS = 40_000
+"""Pixels of a played view at most, where it only has to tell what is hidden."""
+FULL_PIXELS = 1 << 18
+"""Pixels of a played view at most, where its depth becomes a surface."""
+SOLID = 0.5
+"""Opacity from which on there is something at the depth of a pixel."""
+TOLERANCE = 2.0
+"""Voxels behind the depth of a pixel at which a point still counts as seen: that depth is a mean."""
+
+Progress = Callable[[int, int], object]
+"""Called with (done, of)."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A training camera and how far it sees."""
+
+    camera: Camera
+    """World frame, at the size of the picture."""
+    distance: np.ndarray
+    """[height, width] float32, along the ray, world units; infinite where the opacity is below SOLID."""
+
+
+def depth_views(
+    asset: Asset, max_pixels: int = SMALL_PIXELS, progress: Progress | None = None
+) -> list[DepthView]:
+    """The training cameras' pictures of depth, at most MAX_VIEWS of `max_pixels` each.
+
+    Raises FormatError if the asset's cameras are damaged.
+    """
+    width, height = asset.manifest.view_size
+    cameras = read_cameras(asset.path("cameras.json"), (width, height))
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).round().astype(int))
+    views = []
+    with Renderer(asset) as renderer:
+        for done, index in enumerate(chosen):
+            camera = _small(cameras[index], max_pixels)
+            frame = renderer.render(camera)
+            distance = np.where(frame.opacity >= SOLID, frame.depth, np.float32(np.inf))
+            views.append(DepthView(camera, distance.astype(np.float32)))
+            if progress is not None:
+                progress(done + 1, len(chosen))
+    return views
+
+
+def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, tolerance: float) -> np.ndarray:
+    """How squarely a camera sees points: [n] float32 cosines, 0 for those that it does not see.
+
+    Args:
+        view: the camera and its picture of depth.
+        points: [n, 3] world frame.
+        normals: [n, 3] unit, world frame.
+        tolerance: how far behind the depth of the pixels around it a point may be, world units.
+    """
+    camera = view.camera
+    towards = camera.c2w[:3, 3] - points
+    distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+    cosines = np.einsum("ij,ij->i", towards, normals) / np.maximum(distance, 1e-30)
+    result = np.zeros(len(points), np.float32)
+    front = np.flatnonzero(cosines > 0)
+    local = -towards[front] @ camera.c2w[:3, :3]
+    depth = -local[:, 2]
+    ahead = np.maximum(depth, 1e-30)
+    column = camera.fx * local[:, 0] / ahead + camera.cx
+    row = camera.cy - camera.fy * local[:, 1] / ahead
+    inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    front, column, row = front[inside], column[inside], row[inside]
+    left, top = np.floor(column - 0.5).astype(int), np.floor(row - 0.5).astype(int)
+    reach = _farthest_around(view.distance)[top + 1, left + 1]
+    seen = distance[front] <= reach + tolerance
+    result[front[seen]] = cosines[front[seen]]
+    return result
+
+
+def seen_vertices(
+    views: list[DepthView], points: np.ndarray, normals: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """[n] bool: whether any view sees each point; arguments as `cosines_in_view`."""
+    seen = np.zeros(len(points), bool)
+    for view in views:
+        rest = np.flatnonzero(~seen)
+        seen[rest] = cosines_in_view(view, points[rest], normals[rest], tolerance) > 0
+    return seen
+
+
+def _farthest_around(distance: np.ndarray) -> np.ndarray:
+    """[height + 1, width + 1] the largest of the up to four pixels around each corner of a picture, of those
+    that hit something: nothing inside a solid is seen past its outline."""
+    padded = np.pad(np.where(np.isfinite(distance), distance, np.float32(-1)), 1, constant_values=-1)
+    farthest = np.maximum(
+        np.maximum(padded[:-1, :-1], padded[1:, :-1]), np.maximum(padded[:-1, 1:], padded[1:, 1:])
+    )
+    return np.where(farthest < 0, np.float32(np.inf), farthest)
+
+
+def _small(camera: Camera, max_pixels: int) -> Camera:
+    share = (max_pixels / (camera.width * camera.height)) ** 0.5
+    if share >= 1:
+        return camera
+    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))

@@ -1,0 +1,196 @@
+"""How good exported surfaces are: against known geometry, against the volume and against photographs.
+
+    python tests/benchmarks/bench_surface.py demo ASSET                    # an asset of the built-in scene
+    python tests/benchmarks/bench_surface.py views ASSET transforms_test.json [--pictures DIR] [--views 10]
+
+`demo`: mean and 95th percentile of the distance to the true surface, both ways (the true one is sampled where
+rays of training cameras end), in voxels, and the mean angle between normals.
+`views`: silhouette IoU with the volume, PSNR of the mesh's picture and of the volume's, both against the
+photographs. `colours`: which direction, or mean of directions, gives a place the nearest colour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import open3d
+from PIL import Image
+
+from exporters import surface_colour
+from exporters.asset_mesh import Scene
+from exporters.asset_surface import voxel_size
+from exporters.mesh import TriangleMesh
+from exporters.ply import read_ply
+from player.asset import Asset
+from player.cameras import Camera
+from player.render import Renderer
+from player.transforms import read_cameras
+
+
+def meshes(asset: Asset, methods: list[str]):
+    """Name, mesh, seconds."""
+    scene = Scene(asset, lambda stage, done, of: None)
+    for method in methods:
+        start = time.perf_counter()
+        if method == "baked":
+            mesh = read_ply(asset.path("mesh.ply"))
+        else:
+            mesh, removed = scene.surface(method, None)  # type: ignore[arg-type]
+            print(f"{method}: {removed}")
+        yield method, mesh, time.perf_counter() - start
+
+
+def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which pixels hit [n] bool, and of those place, normal and sRGB colour (0..1) on the mesh."""
+    rays_o, rays_d = camera.rays()
+    rays = np.concatenate([rays_o, rays_d], axis=1).astype(np.float32)
+    answer = caster(mesh).cast_rays(open3d.core.Tensor(rays))
+    t = answer["t_hit"].numpy()
+    hit = np.isfinite(t)
+    u, v = answer["primitive_uvs"].numpy()[hit].T
+    shares = np.stack([1 - u - v, u, v], axis=-1)
+    corners = mesh.faces[answer["primitive_ids"].numpy()[hit]]
+    normals = np.einsum("ij,ijk->ik", shares, mesh.normals[corners])
+    colours = np.einsum("ij,ijk->ik", shares, mesh.colours[corners, :3] / 255)
+    places = rays_o[hit].astype(np.float64) + rays_d[hit] * t[hit][:, None].astype(np.float64)
+    return hit, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True), colours
+
+
+_CASTERS: dict[int, open3d.t.geometry.RaycastingScene] = {}
+
+
+def caster(mesh: TriangleMesh) -> open3d.t.geometry.RaycastingScene:
+    if id(mesh) not in _CASTERS:
+        _CASTERS.clear()
+        scene = open3d.t.geometry.RaycastingScene()
+        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+        _CASTERS[id(mesh)] = scene
+    return _CASTERS[id(mesh)]
+
+
+def bench_demo(asset: Asset, methods: list[str]) -> None:
+    from vfr_bake.data.demo import signed_distance, trace
+
+    voxel = voxel_size(asset.grid) * asset.scale
+    cameras = read_cameras(asset.path("cameras.json"), asset.manifest.view_size)[::8]  # type: ignore[arg-type]
+    for name, mesh, seconds in meshes(asset, methods):
+        sample = mesh.vertices[:: max(1, len(mesh.vertices) // 100_000)].astype(np.float64)
+        to_truth = np.abs(signed_distance(sample)) / voxel
+        back, angles = [], []
+        for camera in cameras:
+            _, distance = trace(camera)
+            rays_o, rays_d = camera.rays()
+            seen = np.isfinite(distance.reshape(-1))
+            truth = rays_o[seen] + rays_d[seen] * distance.reshape(-1)[seen][:, None]
+            points = open3d.core.Tensor(truth.astype(np.float32))
+            back.append(caster(mesh).compute_distance(points).numpy() / voxel)
+            _, places, normals, _ = cast(mesh, camera)
+            near = np.abs(signed_distance(places)) < 2 * voxel
+            step = 1e-4
+            slopes = np.stack(
+                [signed_distance(places + e) - signed_distance(places - e) for e in step * np.eye(3)],
+                axis=-1,
+            )
+            slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
+            cosines = (slopes * normals).sum(-1)[near]
+            angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+        from_truth, angle = np.concatenate(back), np.concatenate(angles)
+        print(
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:.1f} s: to truth {to_truth.mean():.2f} voxel "
+            f"(95 %: {np.percentile(to_truth, 95):.2f}), truth to mesh {from_truth.mean():.2f} "
+            f"(95 %: {np.percentile(from_truth, 95):.2f}), normals {angle.mean():.1f} degrees "
+            f"(median {np.median(angle):.1f})",
+            flush=True,
+        )
+
+
+def bench_views(asset: Asset, methods: list[str], cameras: list[Camera], photographs: Path | None) -> None:
+    with Renderer(asset) as renderer:
+        frames = [renderer.render(camera) for camera in cameras]
+    photos = [photograph(photographs, camera) if photographs else None for camera in cameras]
+    for name, mesh, seconds in meshes(asset, methods):
+        both = either = 0
+        scores: dict[str, list[float]] = {"mesh": [], "volume": [], "mesh against volume": []}
+        for camera, frame, photo in zip(cameras, frames, photos, strict=True):
+            hit, _, _, colours = cast(mesh, camera)
+            solid = frame.opacity.reshape(-1) > 0.5
+            both, either = both + (hit & solid).sum(), either + (hit | solid).sum()
+            picture = np.tile(np.array(asset.manifest.background), (len(hit), 1))
+            picture[hit] = colours
+            played = frame.rgb.reshape(-1, 3)
+            scores["mesh against volume"].append(psnr(picture, played))
+            if photo is not None:
+                scores["mesh"].append(psnr(picture, photo))
+                scores["volume"].append(psnr(played, photo))
+        figures = ", ".join(f"{key} {np.mean(value):.2f} dB" for key, value in scores.items() if value)
+        print(
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:5.1f} s: IoU {both / either:.4f}, {figures}",
+            flush=True,
+        )
+
+
+def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
+    """Colours at what test cameras see, by how many directions are averaged, against the volume's picture."""
+    scene = Scene(asset, lambda stage, done, of: None)
+    mesh, _ = scene.surface(method, None)  # type: ignore[arg-type]
+    places, normals, truth = [], [], []
+    with Renderer(asset) as renderer:
+        for camera in cameras:
+            hit, at, normal, _ = cast(mesh, camera)
+            frame = renderer.render(camera)
+            solid = frame.opacity.reshape(-1)[hit] > 0.99
+            near = np.abs(np.linalg.norm(at - camera.c2w[:3, 3], axis=-1) - frame.depth.reshape(-1)[hit])
+            kept = np.flatnonzero(solid & (near < 4 * voxel_size(asset.grid) * asset.scale))[::5]
+            places.append(at[kept]), normals.append(normal[kept])
+            truth.append(frame.rgb.reshape(-1, 3)[hit][kept])
+    at, normal, expected = map(np.concatenate, (places, normals, truth))
+    for count in (0, 1, 2, 4, 8, 16):
+        surface_colour.MAX_DIRECTIONS = count
+        rgb, _ = surface_colour.surface_colours(asset, at, normal, scene.views if count else [])
+        name = f"mean of {count} directions" if count else "along the normal"
+        print(f"{name}: {psnr(rgb, expected):.2f} dB at {len(at):,} places", flush=True)
+
+
+def photograph(folder: Path, camera: Camera) -> np.ndarray:
+    path = folder / f"{camera.name.removeprefix('./')}"
+    rgba = np.asarray(Image.open(path if path.suffix else path.with_suffix(".png")).convert("RGBA")) / 255
+    return (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]).reshape(-1, 3)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("demo", "views", "colours"))
+    parser.add_argument("asset", type=Path)
+    parser.add_argument(
+        "cameras", type=Path, nargs="?", help="views, colours: transforms.json of test cameras"
+    )
+    parser.add_argument(
+        "--pictures", type=Path, help="views: the folder that the photographs' names start from"
+    )
+    parser.add_argument("--views", type=int, default=10, help="test cameras, spread over all")
+    parser.add_argument("--methods", default="baked,density,tsdf")
+    arguments = parser.parse_args()
+    asset = Asset.open(arguments.asset)
+    methods = arguments.methods.split(",")
+    if arguments.what == "demo":
+        bench_demo(asset, methods)
+        return 0
+    every = read_cameras(arguments.cameras or asset.path("cameras.json"), asset.manifest.view_size)  # type: ignore[arg-type]
+    chosen = [every[i] for i in np.linspace(0, len(every) - 1, arguments.views).round().astype(int)]
+    if arguments.what == "colours":
+        bench_colours(asset, methods[0], chosen)
+    else:
+        bench_views(asset, methods, chosen, arguments.pictures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
