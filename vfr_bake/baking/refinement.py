@@ -75,8 +75,10 @@ def refine(
         adam.param_groups[0]["lr"] = float(head_rate * falling)
         some = random.integers(0, len(lessons), BATCH)
         if grid is not None:
-            decode = (grid.density_low, grid.density_slope, grid.step)
-            weigh(some, *where, density, *decode, MAX_TAU, lessons.weights, lessons.opacity)
+            weigh(
+                some, *where, density, grid.density_low, grid.density_slope, grid.step, MAX_TAU,
+                lessons.weights, lessons.opacity,
+            )  # fmt: skip
         composed = torch.from_numpy(lessons.composed(features, some)).requires_grad_(code_rate > 0)
         opacity = torch.from_numpy(lessons.opacity[some]).requires_grad_(grid is not None)
         adam.zero_grad(set_to_none=True)
@@ -86,7 +88,8 @@ def refine(
             assert composed.grad is not None and opacity.grad is not None
             descend_density(
                 some, *where, lessons.weights, lessons.opacity, features, composed.grad.numpy(),
-                opacity.grad.numpy(), *decode, np.float32(DENSITY_RATE) * falling, density, steep_density,
+                opacity.grad.numpy(), grid.density_low, grid.density_slope, grid.step,
+                np.float32(DENSITY_RATE) * falling, density, steep_density,
             )  # fmt: skip
         if composed.grad is not None:
             rate = np.float32(code_rate) * falling
