@@ -52,8 +52,8 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     >>> mesh = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, white)
     >>> files = textured_obj_files(mesh, Texture(np.float32([[0, 0], [1, 0], [0, 1]]),
     ...     np.zeros((2, 2, 3), np.uint8)), "one")
-    >>> print(files[".obj"].decode().splitlines()[-1], [line for line in files[".mtl"].decode().split() if "."
-    in line]) f 1/1/1 2/2/2 3/3/3 ['one.png']
+    >>> files[".obj"].decode().splitlines()[-1], "map_Kd one.png" in files[".mtl"].decode()
+    ('f 1/1/1 2/2/2 3/3/3', True)
     """
     if not stem or any(character.isspace() for character in stem):
         raise ConfigError(

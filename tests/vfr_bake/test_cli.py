@@ -136,12 +136,12 @@ def test_bake_needs_no_data_set_and_refuses_to_replace(
     arguments = [
         str(model),
         str(tmp_path / "asset"),
+        "--preset",
+        "fidelity",
         "--resolution",
         "48",
         "--refine-steps",
         "50",
-        "--head-width",
-        "0",
     ]
     assert bake_main([*arguments, "--json", str(tmp_path / "bake.json")]) == 0
     figures = json.loads((tmp_path / "bake.json").read_text())

@@ -178,7 +178,9 @@ def same_samples(ours: Samples, expected: Samples) -> None:
     # Borders are drawn from sums of 64 weights in another order; far out a rounding of s is magnified in t.
     torch.testing.assert_close(ours.t_mid.cpu(), expected.t_mid, rtol=2e-3, atol=1e-5)
     torch.testing.assert_close(ours.deltas.cpu(), expected.deltas, rtol=5e-2, atol=1e-5)
-    torch.testing.assert_close(ours.points.cpu(), expected.points, rtol=0, atol=1e-5)
+    # A border lies where sums of weights reach a share; in an interval with hardly more than the padding of
+    # 1e-3 a rounding of 6e-8 moves it by 6e-5 of the interval, and intervals are up to half the cube long.
+    torch.testing.assert_close(ours.points.cpu(), expected.points, rtol=0, atol=3e-5)
 
 
 def test_no_ray_at_all(device: torch.device) -> None:
