@@ -7,9 +7,13 @@ alpha: the wall is white whatever the opacity is, so that nothing but the head's
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
+import numba
 import numpy as np
+import pytest
+import torch
 
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.capture import PosedImages
@@ -31,10 +35,21 @@ def before_a_wall(views: PosedImages) -> PosedImages:
     return PosedImages(views.cameras, images)
 
 
-def psnr(scene: Scene, pilot_steps: int) -> float:
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Sums in one order: which seeds fail hangs on the last bit."""
+    n_torch, n_numba = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_torch)
+    numba.set_num_threads(n_numba)
+
+
+def psnr(scene: Scene, pilot_steps: int, seed: int) -> float:
     """On held-out views, after 300 steps with 10 layers of 256 and the paper's rate for all."""
     config = TrainConfig(
-        device="cpu", steps=300, minutes=60.0, pilot_steps=pilot_steps, batch_samples=4096, seed=2,
+        device="cpu", steps=300, minutes=60.0, pilot_steps=pilot_steps, batch_samples=4096, seed=seed,
         network_rate=1e-2, occupancy_resolution=32,
         field=FieldOptions(**SMALL_GRID, head_width=256, n_directional_layers=8),
     )  # fmt: skip
@@ -45,13 +60,13 @@ def psnr(scene: Scene, pilot_steps: int) -> float:
     return float(np.mean([score.psnr for score in scores]))
 
 
-def test_a_large_head_needs_the_pilot_to_converge() -> None:
+def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:
     scene = demo_scene(size=48, n_train=20, n_test=3)
     scene = replace(scene, train=before_a_wall(scene.train), test=before_a_wall(scene.test), has_alpha=False)
     blank = np.mean(
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
-    without, with_it = psnr(scene, 0), psnr(scene, 100)
-    # Without, the field becomes empty and the picture white. With it, the scene appears.
-    assert without < blank + 1
-    assert with_it > blank + 6
+    # About every second seed fails; the field becomes empty then, and the picture white.
+    failed = next((seed for seed in (2, 0, 3, 1) if psnr(scene, 0, seed) < blank + 1), None)
+    assert failed is not None
+    assert psnr(scene, 100, failed) > blank + 6
