@@ -145,7 +145,7 @@ def test_bake_needs_no_data_set_and_refuses_to_replace(
     ]
     assert bake_main([*arguments, "--json", str(tmp_path / "bake.json")]) == 0
     figures = json.loads((tmp_path / "bake.json").read_text())
-    # After 150 steps the model is still half fog, of which the bake leaves out what weighs less than a percent.
+    # After 150 steps the model is half fog, of which the bake leaves out what weighs less than a percent.
     assert figures["megabytes"] > 0 and figures["psnr_to_full_model"] > 24
     assert "vertices" in capsys.readouterr().out
     before = (tmp_path / "asset" / "manifest.json").read_bytes()
