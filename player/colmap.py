@@ -17,6 +17,7 @@ import numpy as np
 
 from player.cameras import Camera
 from player.errors import DataError, FormatError
+from player.rotations import rotation_matrix
 
 MODELS = {
     0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
@@ -150,14 +151,7 @@ def _c2w(pose: np.ndarray, where: str) -> np.ndarray:
     length = np.linalg.norm(pose[:4])
     if not np.isfinite(pose).all() or length < 1e-9:
         raise FormatError(f"{where}: pose: expected a rotation and a translation, got {pose.tolist()}")
-    w, x, y, z = pose[:4] / length
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = rotation_matrix(pose[:4] / length)
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T
     c2w[:3, 3] = -rotation.T @ pose[4:]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from player.cameras import Camera
+from player.rotations import quaternion, rotation_matrix
 
 
 def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
@@ -22,7 +23,7 @@ def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
     [5.0, 10.0, 20.0]
     """
     places = np.stack([view.c2w[:3, 3] for view in views])
-    turns = _continuous([_quaternion(view.c2w[:3, :3]) for view in views])
+    turns = _continuous([quaternion(view.c2w[:3, :3]) for view in views])
     focal = [view.fy / view.height * views[0].height for view in views]
     path = []
     for index in range(len(views) - 1):
@@ -30,7 +31,7 @@ def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
         for step in range(n_between):
             share = step / n_between
             c2w = np.eye(4)
-            c2w[:3, :3] = _rotation(_slerp(turns[index], turns[index + 1], share))
+            c2w[:3, :3] = rotation_matrix(_slerp(turns[index], turns[index + 1], share))
             c2w[:3, 3] = _spline(around, share)
             path.append(_zoomed(views[0], c2w, focal[index] ** (1 - share) * focal[index + 1] ** share))
     return [*path, _zoomed(views[0], views[-1].c2w, focal[-1])]
@@ -45,30 +46,6 @@ def _spline(points: np.ndarray, share: float) -> np.ndarray:
     a, b, c, d = points
     linear, square, cube = c - a, 2 * a - 5 * b + 4 * c - d, 3 * b - 3 * c + d - a
     return b + share / 2 * (linear + share * (square + share * cube))
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4] (w, x, y, z): the eigenvector of the largest eigenvalue (Bar-Itzhack 2000), which
-    is the nearest one for a rotation with rounding in it."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    k = np.array([
-        [a + e + i, 0, 0, 0],
-        [h - f, a - e - i, 0, 0],
-        [c - g, b + d, e - a - i, 0],
-        [d - b, c + g, f + h, i - a - e],
-    ])  # fmt: skip
-    return np.linalg.eigh(k)[1][:, -1]  # eigh reads the lower triangle
-
-
-def _rotation(q: np.ndarray) -> np.ndarray:
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _continuous(turns: list[np.ndarray]) -> list[np.ndarray]:

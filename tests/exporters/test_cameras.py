@@ -11,12 +11,13 @@ import pytest
 
 from exporters import cli, colmap
 from exporters.cameras import check_cameras, moved_cameras, transforms_bytes
-from exporters.colmap import colmap_files, quaternion, rotation_matrix
+from exporters.colmap import colmap_files
 from exporters.frames import FRAMES, frame_matrix
 from exporters.points import sample_points
 from player.asset import Asset
 from player.cameras import Camera
 from player.errors import ParityError
+from player.rotations import quaternion, rotation_matrix
 from player.transforms import read_cameras
 from tests.exporters.conftest import BOX
 from tests.exporters.meshes import box
