@@ -60,8 +60,7 @@ class DeviceProposalGuide(ProposalPace):
     """Trains the two proposal grids of an unbounded scene beside the field, by autograd."""
 
     def __init__(self, config: TrainConfig, pace: Pace, near: float, device: torch.device) -> None:
-        super().__init__(config, pace, near)
-        self._sampler = ProposalSampler(near).to(device)
+        super().__init__(config, pace, ProposalSampler(near).to(device))
         self._adams = [DeviceGridAdam(grid.table) for grid in self._sampler.grids]  # type: ignore[arg-type]
 
     @property
@@ -73,9 +72,6 @@ class DeviceProposalGuide(ProposalPace):
         copy.load_state_dict(self._sampler.state_dict())
         copy.exponent = self._sampler.exponent
         return copy
-
-    def _set_exponent(self, exponent: float) -> None:
-        self._sampler.exponent = exponent
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float

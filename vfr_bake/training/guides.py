@@ -142,11 +142,11 @@ class ProposalPace:
     """When the proposals of a scene learn and how far they are believed: what its guides have in common on
     all devices."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, near: float) -> None:
-        self._config, self._pace = config, pace
+    def __init__(self, config: TrainConfig, pace: Pace, sampler: ProposalSampler) -> None:
+        self._config, self._pace, self._sampler = config, pace, sampler
         self._adams: Sequence[TableAdam] = ()
         self._learns = True
-        self._borders = (float(spacing(near)), float(spacing(FAR)))
+        self._borders = (float(spacing(sampler.near)), float(spacing(FAR)))
         self._span = self._borders[1] - self._borders[0]
 
     def n_rays(self, pilot: bool) -> int:
@@ -154,11 +154,8 @@ class ProposalPace:
 
     def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
-        self._set_exponent(ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x))
+        self._sampler.exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0
-
-    def _set_exponent(self, exponent: float) -> None:
-        raise NotImplementedError
 
     def observe(self, n_rays: int, n_samples: int) -> None:
         pass
@@ -171,12 +168,9 @@ class ProposalGuide(ProposalPace):
     """Trains the two proposal grids of an unbounded scene beside the field."""
 
     def __init__(self, config: TrainConfig, pace: Pace, near: float) -> None:
-        super().__init__(config, pace, near)
         self.sampler = ProposalSampler(near)
+        super().__init__(config, pace, self.sampler)
         self._adams = [GridAdam(grid.table) for grid in self.sampler.grids]  # type: ignore[arg-type]
-
-    def _set_exponent(self, exponent: float) -> None:
-        self.sampler.exponent = exponent
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
