@@ -69,7 +69,7 @@ class DeviceOccupancyGrid:
     def on_cpu(self) -> OccupancyGrid:
         """The grid that pictures are rendered with and that the model file keeps."""
         grid = OccupancyGrid(self.resolution, self.step, seed=0)
-        grid.restore(self.occupied.cpu().numpy())
+        grid.set_occupied(self.occupied.cpu().numpy())
         return grid
 
     def state(self) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class DeviceOccupancyGrid:
             "generator": self._generator.get_state(),
         }
 
-    def restore_state(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave."""
         self.densities.copy_(state["densities"])
         self.occupied = state["occupied"].to(self.densities.device)

@@ -65,7 +65,7 @@ class OccupancyGrid:
         # A fog everywhere must not count as full: the mean bounds the threshold while the field is still
         # thin.
         threshold = min(-np.log1p(-OPACITY_THRESHOLD) / self.step, float(flat.mean()))
-        self._set_occupied(self.densities > threshold)
+        self.set_occupied(self.densities > threshold)
 
     def observe(self, points: np.ndarray, sigmas: np.ndarray) -> None:
         """Take the densities [n_points] that rays met at `points` [n_points, 3] of the unit cube: what they
@@ -80,7 +80,8 @@ class OccupancyGrid:
         points = (corner + self._random.random((len(cells), 3))) / n
         return np.exp(field.log_densities(points.astype(np.float32)))
 
-    def _set_occupied(self, occupied: np.ndarray) -> None:
+    def set_occupied(self, occupied: np.ndarray) -> None:
+        """March through the cells of `occupied` [n, n, n] bool, through all if there is none."""
         if not occupied.any():
             occupied = np.ones_like(occupied)  # nothing found yet: look everywhere rather than nowhere
         chebyshev_distance(occupied, self.distance)
@@ -114,13 +115,9 @@ class OccupancyGrid:
             "random": self._random.bit_generator.state,
         }
 
-    def restore_state(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave."""
         self.densities[:] = state["densities"].numpy()
         self.n_updates = state["n_updates"]
         self._random.bit_generator.state = state["random"]
-        self._set_occupied(state["occupied"].numpy())
-
-    def restore(self, occupied: np.ndarray) -> None:
-        """Take `occupied` [n, n, n] bool from a model file."""
-        self._set_occupied(occupied)
+        self.set_occupied(state["occupied"].numpy())

@@ -7,13 +7,10 @@ Tensors and plain values only; loads with `weights_only=True`.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
-import torch
-
 from player.errors import ConfigError, FormatError
-from player.files import write_bytes
+from vfr_bake.training.tensor_files import read_tensors, write_tensors
 from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-checkpoint"
@@ -33,15 +30,13 @@ def checkpoint_path(model: Path) -> Path:
 
 def save_checkpoint(path: Path, trainer: Trainer) -> None:
     """Write beside `path` and rename into place, so that there is always a whole one."""
-    buffer = io.BytesIO()
     content = {
         "format": FORMAT,
         "version": VERSION,
         "settings": trainer.settings,
         "state": trainer.state(),
     }
-    torch.save(content, buffer)
-    write_bytes(path, buffer.getvalue())
+    write_tensors(path, content)
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
@@ -49,10 +44,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
 
     Raises FormatError (not a checkpoint, cut short) or ConfigError (of a run with other settings).
     """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load has no documented set of errors for bad bytes
-        raise FormatError(f"{path}: not a checkpoint written by vfr-train, or cut short") from error
+    content = read_tensors(path, "a checkpoint written by vfr-train")
     if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
         raise FormatError(
             f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"

@@ -53,7 +53,7 @@ class DeviceOccupancyGuide(OccupancyPace):
 
     def restore(self, state: dict[str, Any]) -> None:
         self._samples_per_ray = state["samples_per_ray"]
-        self._grid.restore_state(state["occupancy"])
+        self._grid.restore(state["occupancy"])
 
 
 class DeviceProposalGuide(ProposalPace):

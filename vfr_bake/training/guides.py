@@ -135,7 +135,7 @@ class OccupancyGuide(OccupancyPace):
 
     def restore(self, state: dict[str, Any]) -> None:
         self._samples_per_ray = state["samples_per_ray"]
-        self.sampler.restore_state(state["occupancy"])
+        self.sampler.restore(state["occupancy"])
 
 
 class ProposalPace:

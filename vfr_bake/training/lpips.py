@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from player.errors import ConfigError, DataError, MissingExtraError, ShapeError
+from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
+from vfr_bake.training.tensor_files import read_tensors
 
 MEAN = (-0.030, -0.088, -0.188)
 DEVIATION = (0.458, 0.448, 0.450)
@@ -33,7 +34,7 @@ class Lpips:
     def __init__(self, network: str = "alex") -> None:
         """`network`: "alex" (AlexNet, what papers report most) or "vgg" (VGG-16).
 
-        Raises MissingExtraError: no package `lpips`; DataError: a file of weights is missing or broken.
+        Raises MissingExtraError: no package `lpips`; FormatError: a file of weights is missing or broken.
         """
         if network not in _NETWORKS:
             raise ConfigError(f"lpips: network: expected one of {', '.join(_NETWORKS)}, got {network}")
@@ -125,7 +126,7 @@ def _load_layers(layers: nn.Sequential, checkpoint: str) -> None:
     try:
         layers.load_state_dict(features)
     except RuntimeError as error:
-        raise DataError(f"{path}: the tensors do not fit the network: download {address} again") from error
+        raise FormatError(f"{path}: the tensors do not fit the network: download {address} again") from error
     layers.eval().requires_grad_(False)
 
 
@@ -142,17 +143,12 @@ def _layer_weights(network: str, n_channels: list[int]) -> list[torch.Tensor]:
     weights = [state.get(f"lin{layer}.model.1.weight") for layer in range(len(n_channels))]
     shapes = [None if w is None else tuple(w.shape) for w in weights]
     if shapes != [(1, n, 1, 1) for n in n_channels]:
-        raise DataError(f"{path}: the tensors do not fit the network: install lpips again")
+        raise FormatError(f"{path}: the tensors do not fit the network: install lpips again")
     return [w for w in weights if w is not None]
 
 
 def _read(path: Path, hint: str) -> dict[str, torch.Tensor]:
-    if not path.is_file():
-        raise DataError(f"{path}: no such file: expected weights of a network: {hint}")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load has no documented set of errors for bad bytes
-        raise DataError(f"{path}: not a file of weights, or cut short: {hint}") from error
+    state = read_tensors(path, f"weights of a network: {hint}")
     if not isinstance(state, dict):
-        raise DataError(f"{path}: expected the weights of a network, got {type(state).__name__}: {hint}")
+        raise FormatError(f"{path}: expected the weights of a network, got {type(state).__name__}: {hint}")
     return state

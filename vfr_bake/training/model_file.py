@@ -10,7 +10,6 @@ resolution; that of an unbounded scene its proposals: near (model units), state 
 
 from __future__ import annotations
 
-import io
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,12 @@ from torch import nn
 
 from player.cameras import Camera
 from player.errors import ConfigError, FormatError, VersionError
-from player.files import write_bytes
 from player.transforms import parse_transforms, transforms_cameras, write_cameras
 from vfr_bake.config import field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
+from vfr_bake.training.tensor_files import read_tensors, write_tensors
 
 FORMAT = "vfr-model"
 VERSION = (2, 0)
@@ -73,8 +72,8 @@ class Model:
 
 def save_model(path: Path, model: Model) -> None:
     """Write beside `path` and rename into place."""
-    buffer = io.BytesIO()
-    torch.save(
+    write_tensors(
+        path,
         {
             "format": FORMAT,
             "version": list(VERSION),
@@ -87,9 +86,7 @@ def save_model(path: Path, model: Model) -> None:
             "state": model.field.state_dict(),
             "figures": model.figures,
         },
-        buffer,
     )
-    write_bytes(path, buffer.getvalue())
 
 
 def load_model(path: Path) -> Model:
@@ -122,12 +119,7 @@ def load_model(path: Path) -> Model:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise FormatError(f"{path}: no such file: expected a model written by vfr-train")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load has no documented set of errors for bad bytes
-        raise FormatError(f"{path}: not a model file written by vfr-train, or cut short") from error
+    content = read_tensors(path, "a model file written by vfr-train")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise FormatError(f"{path}: not a model file written by vfr-train: expected format {FORMAT!r}")
     version = content.get("version")
@@ -164,7 +156,7 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
     if len(bits) != resolution**3:
         raise FormatError(f"{where}: occupied: expected {resolution**3} bits, got {len(bits)}")
     occupancy = OccupancyGrid(resolution, step, seed=0)
-    occupancy.restore(bits.astype(bool).reshape((resolution,) * 3))
+    occupancy.set_occupied(bits.astype(bool).reshape((resolution,) * 3))
     return occupancy
 
 

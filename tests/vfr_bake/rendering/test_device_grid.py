@@ -70,7 +70,7 @@ def test_a_field_without_matter_is_looked_at_everywhere(device: torch.device) ->
 def test_it_goes_on_from_its_state(device: torch.device) -> None:
     grids = [grid_on(device), grid_on(device)]
     grids[0].update(Ball(0.4))  # type: ignore[arg-type]
-    grids[1].restore_state({k: v.clone() if hasattr(v, "clone") else v for k, v in grids[0].state().items()})
+    grids[1].restore({k: v.clone() if hasattr(v, "clone") else v for k, v in grids[0].state().items()})
     for grid in grids:
         grid.update(Ball(0.6))  # type: ignore[arg-type]
     assert torch.equal(grids[0].densities, grids[1].densities)

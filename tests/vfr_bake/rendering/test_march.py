@@ -28,7 +28,7 @@ def field_of_density(logit: float) -> VfrField:
 
 def half_full(seed: int = 0) -> OccupancyGrid:
     occupancy = OccupancyGrid(16, STEP, seed=0)
-    occupancy.restore(np.random.default_rng(seed).random((16, 16, 16)) < 0.15)
+    occupancy.set_occupied(np.random.default_rng(seed).random((16, 16, 16)) < 0.15)
     return occupancy
 
 

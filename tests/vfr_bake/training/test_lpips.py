@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from player.errors import ConfigError, DataError, MissingExtraError, ShapeError
+from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
 from vfr_bake.training.lpips import Lpips
 
 CONVOLUTIONS = {
@@ -106,7 +106,7 @@ def test_pictures_too_small_or_of_two_sizes(home: Path, network: str) -> None:
 
 @pytest.mark.usefixtures("package")
 def test_missing_weights_say_which_file_goes_where(home: Path, network: str) -> None:
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(FormatError) as caught:
         Lpips(network)
     message = str(caught.value)
     assert message.startswith(str(home / "hub" / "checkpoints" / CHECKPOINT[network]))
@@ -135,7 +135,7 @@ def test_broken_weights_are_named(home: Path, package: Path, content: str) -> No
         else:
             state = torch.load(path, weights_only=True)
             torch.save({key: torch.zeros(*value.shape, 2) for key, value in state.items()}, path)
-        with pytest.raises(DataError) as caught:
+        with pytest.raises(FormatError) as caught:
             Lpips("alex")
         assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
         path.write_bytes(good)

@@ -23,7 +23,7 @@ CONFIG = FieldConfig(n_levels=2, base_resolution=4, max_resolution=8, log2_table
 def model() -> Model:
     torch.manual_seed(0)
     occupancy = OccupancyGrid(16, step=0.01, seed=0)
-    occupancy.restore(np.random.default_rng(0).random((16, 16, 16)) < 0.5)
+    occupancy.set_occupied(np.random.default_rng(0).random((16, 16, 16)) < 0.5)
     world = np.diag([2.0, 2, 2, 1])
     world[:3, 3] = 1, 2, 3
     camera = Camera("./train/r_0", np.eye(4), 8, 6, 9.0, 9.0, 4.0, 3.0)
@@ -75,7 +75,7 @@ def test_loading_runs_no_code(tmp_path: Path) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="no such file: expected a model written by vfr-train"):
+    with pytest.raises(FormatError, match="no such file: expected a model file written by vfr-train"):
         load_model(tmp_path / "none.pt")
 
 

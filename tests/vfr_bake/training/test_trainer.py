@@ -24,7 +24,7 @@ def config(**changes: object) -> TrainConfig:
     settings = {
         "device": "cpu",
         "steps": 220,
-        "minutes": 5.0,
+        "minutes": 60.0,
         "batch_samples": 8192,
         "occupancy_resolution": 32,
         "pilot_steps": 60,
