@@ -221,6 +221,10 @@ class TrainConfig:
     """Objects: cells per axis of the occupancy grid."""
     distortion: float = 0.01
     """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
+    near_gradients: float = 1.0
+    """Scenes: what is nearer to a camera than this learns more slowly, by the square of its distance, so that
+    no fog settles before the cameras; model units, in which the farthest camera is at 1; 0: all learn
+    alike."""
     seed: int = 0
     """Seed of every random number."""
     eval_views: int | None = None
@@ -244,6 +248,7 @@ class TrainConfig:
             self.occupancy_resolution,
         )
         _check(0 <= self.distortion < 1e3, "distortion", "0 to 1000", self.distortion)
+        _check(0 <= self.near_gradients < 1e3, "near_gradients", "0 to 1000", self.near_gradients)
         _check(self.eval_views is None or self.eval_views >= 0, "eval_views", "at least 0", self.eval_views)
         _check(self.checkpoint_minutes > 0, "checkpoint_minutes", "more than 0", self.checkpoint_minutes)
         self.pace("cpu", False)  # so that what is out of range is refused before pictures are read

@@ -25,6 +25,7 @@ from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
+from vfr_bake.training.near_gradients import scale_near_gradients
 from vfr_bake.training.optimiser import (
     BETAS,
     EPSILON,
@@ -260,6 +261,8 @@ class Trainer:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(Colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of the rays that hit."""
         features = self._field.grid(samples.points, samples.features)
+        if self._field.config.unbounded and self.config.near_gradients > 0:
+            features = scale_near_gradients(features, samples.t_mid, self.config.near_gradients)
         sigmas = self._field.density(features)
         if pilot or self._field.config.compositing == "colour":
             network = self.pilot if pilot else self._field.head

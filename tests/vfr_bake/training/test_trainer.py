@@ -15,6 +15,7 @@ from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.near_gradients import scale_near_gradients
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
@@ -85,6 +86,24 @@ def test_pictures_without_alpha_train_over_their_own_background(scene: Scene) ->
 
 def unbounded(scene_size: int = 32) -> Scene:
     return build_scene(demo_capture(size=scene_size, n_train=12, n_test=2), "unbounded")
+
+
+@pytest.mark.parametrize(("kind", "distance"), [("object", 1.0), ("unbounded", 0.7), ("unbounded", 0.0)])
+def test_only_in_scenes_what_is_near_learns_slowly(
+    kind: str, distance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[float] = []
+
+    def spy(features: torch.Tensor, t_mid: torch.Tensor, distance: float) -> torch.Tensor:
+        assert len(features) == len(t_mid)
+        seen.append(distance)
+        return scale_near_gradients(features, t_mid, distance)
+
+    monkeypatch.setattr("vfr_bake.training.trainer.scale_near_gradients", spy)
+    scene = demo_scene(size=32, n_train=12, n_test=2) if kind == "object" else unbounded()
+    settings = {"steps": 2, "pilot_steps": 1, "batch_rays": 64, "batch_samples": 2048}
+    list(Trainer(scene, config(**settings, near_gradients=distance)).run())
+    assert seen == ([0.7, 0.7] if distance == 0.7 else [])
 
 
 @pytest.mark.parametrize("kind", ["object", "unbounded"])
