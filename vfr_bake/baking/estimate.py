@@ -51,7 +51,7 @@ class Plan:
 def make_plan(model: Model, config: BakeConfig) -> Plan:
     """What to bake within `config.max_memory` gigabytes.
 
-    Raises ConfigError where even the fewest rays and the cells of the finest stage do not fit.
+    Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """
     choice, field = config.choice(), model.field.config
     cell = float(np.median(pixel_footprints(model)))
@@ -68,7 +68,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     if room <= 0 or PROGRAM_BYTES + cells > allowed:
         least = (PROGRAM_BYTES + max(cells, FEWEST_RAYS * RAY_BYTES)) / 1e9
         raise ConfigError(
-            f"max_memory: expected at least {least:.1f} GB for {resolution} cells per axis, got "
+            f"max_memory: expected at least {least:.2f} GB for {resolution} cells per axis, got "
             f"{config.max_memory:g} GB: allow more, or lower --resolution"
         )
     peak = PROGRAM_BYTES + max(cells, n_vertices * vertex_bytes + n_rays * RAY_BYTES)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -65,6 +64,5 @@ def test_directions_stay_only_where_colours_depend_on_them(chosen: dict[str, dic
 def test_fog_takes_more_lookups_than_a_surface_and_fewer_channels_than_gloss(chosen: dict[str, dict]) -> None:
     lookups = {kind: report["manifest"].n_samples for kind, report in chosen.items()}
     channels = {kind: report["manifest"].n_channels for kind, report in chosen.items()}
-    print(lookups, channels)
     assert lookups["fog"] > lookups["matte"]
     assert len(set(zip(lookups.values(), channels.values(), strict=True))) == 3
