@@ -13,6 +13,7 @@ import numpy as np
 
 from player.errors import ConfigError
 from vfr_bake.baking.culling import FLOORS
+from vfr_bake.baking.refinement import BATCH
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -31,7 +32,6 @@ N_TIMED = 8192
 """Rays that tell how fast the model answers."""
 STEP_COST, VERTEX_COST = 2.5, 0.12
 """Of a lesson in a step of refinement, and of a vertex, in rays of the model."""
-BATCH = 2048
 
 
 @dataclass(frozen=True)
