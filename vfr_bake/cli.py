@@ -214,10 +214,19 @@ def _save(path: Path, trainer: Trainer, scene: Scene, figures: dict[str, Any]) -
 
 def _bake(options: Any) -> int:
     check_target(options.asset, options.force)
-    from vfr_bake.baking.bake import bake
+    from vfr_bake.baking.bake import bake, check_bakeable
+    from vfr_bake.baking.estimate import expected_seconds, make_plan
     from vfr_bake.training.model_file import load_model
 
     model = load_model(options.model)
+    check_bakeable(model)
+    plan = make_plan(model, options.config)
+    minutes = expected_seconds(model, options.config, plan) / 60
+    print(
+        f"vfr-bake: about {max(minutes, 0.1):.1f} minutes and {plan.n_bytes / 1e9:.1f} GB of memory at most, "
+        f"{plan.resolution} cells per axis, {plan.n_rays:,} rays to learn from",
+        file=sys.stderr,
+    )
     bars: dict[str, _Bar] = {}
 
     def report(stage: str, done: int, of: int) -> None:

@@ -280,7 +280,8 @@ class BakeConfig:
     """Feature lookups per ray, k, exactly; 0 looks up every sample. Not given: as few as the preset's loss
     allows. The player can be asked for another number."""
     weight_floor: float | None = None
-    """A cell is stored if some view gives one of its samples at least this weight."""
+    """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
+    a few that loses next to nothing on views kept apart, or none."""
     no_cull: bool = False
     """Store what no view sees as well: every cell that the model holds matter in."""
     code_levels: int | None = None
@@ -300,6 +301,12 @@ class BakeConfig:
     max_mb: float | None = None
     """Take so many channels as fit into this many megabytes, the report not counted; fail, and write nothing,
     if the asset takes more all the same."""
+    target_ms: float | None = None
+    """Take no wider a head and no more lookups than a frame of 800x800 in so many milliseconds allows,
+    measured by the player on this machine; fail, and write nothing, if it takes longer all the same."""
+    max_memory: float = 4.0
+    """Gigabytes of memory that the bake may take: rays that are learned from and cells that are stored follow
+    from it."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is measured."""
 
@@ -315,6 +322,8 @@ class BakeConfig:
             self.max_loss_db is None or self.max_loss_db > 0, "max_loss_db", "more than 0", self.max_loss_db
         )
         _check(self.max_mb is None or self.max_mb > 0, "max_mb", "more than 0", self.max_mb)
+        _check(self.target_ms is None or self.target_ms > 0, "target_ms", "more than 0", self.target_ms)
+        _check(self.max_memory > 0, "max_memory", "more than 0", self.max_memory)
         _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
         choice = self.choice()
         _check(1 <= choice.n_channels <= 64, "n_channels", "1 to 64", choice.n_channels)
@@ -328,7 +337,12 @@ class BakeConfig:
         )
         _check(0 <= choice.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", choice.refine_steps)
         _check(choice.head_bits in (8, 32), "head_bits", "8 or 32", choice.head_bits)
-        _check(0 < choice.weight_floor < 1, "weight_floor", "between 0 and 1", choice.weight_floor)
+        _check(
+            self.weight_floor is None or 0 < self.weight_floor < 1,
+            "weight_floor",
+            "between 0 and 1",
+            self.weight_floor,
+        )
         _check(
             choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024,
             "mesh_resolution",

@@ -30,24 +30,25 @@ from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.culling import CULLED_SHARE, cull, whole
+from vfr_bake.baking.estimate import make_plan
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.mesh import bake_mesh
-from vfr_bake.baking.projection import Projection, code_scales, head_sensitivity, project
+from vfr_bake.baking.pace import LOOKUPS, frame_ms, keep_to_time, measured_in_memory
+from vfr_bake.baking.presets import BakeChoice
+from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
 from vfr_bake.baking.report import BakeReport
 from vfr_bake.baking.views import views_between
-from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
-N_RAYS = 2_000_000
-"""Rays that head and stored values learn from; about a third of them meet something."""
 N_CALIBRATION = 20_000
 """Rays that decide the ranges of the head's activations."""
 N_SENSITIVITY = 50_000
@@ -56,10 +57,6 @@ NEW_HEAD_RATE = 3e-3
 """Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
 DIRECTION_LOSS_DB = 0.02
 """A small head leaves the direction out where that is expected to lose no more."""
-MOST_FLOATS = 600_000_000
-"""Features held at once, 2.4 GB: a cell stores about one vertex of its own."""
-LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
-"""Lookups per ray that are tried."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PLAYS_NOTHING = 6.0
@@ -83,15 +80,15 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     """Bake `model` into the asset `folder`.
 
     Raises OutputError, ConfigError, or TrainingError: nothing is visible, the result does not show what the
-    model shows, or misses `max_loss_db` or `max_mb`; then nothing is written.
+    model shows, or misses `max_loss_db`, `max_mb` or `target_ms`; then nothing is written.
     """
     check_target(folder, force)
-    _check_bakeable(model)
+    check_bakeable(model)
     work = _Bake(model, config, report)
     return work.run(folder, force)
 
 
-def _check_bakeable(model: Model) -> None:
+def check_bakeable(model: Model) -> None:
     """Raises ConfigError for a field that an asset cannot hold."""
     _ = model.occupancy  # says so if the scene is unbounded
     config = model.field.config
@@ -109,6 +106,7 @@ class _Bake:
         self.left_out: dict[str, str] = {}
         self.lookups: dict[str, float] = {}
         self.n_samples = self.choice.n_samples
+        self.plan = make_plan(model, config)
         self._report = report
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)
@@ -120,6 +118,9 @@ class _Bake:
             mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
         mesh_bytes = ply_bytes(mesh)
         stored, taught = self._store(layout, len(mesh_bytes))
+        if self.config.target_ms is not None:
+            with self._part("pace"):
+                self.choice = self._in_time(stored, layout, self.config.target_ms)
         stored = self._refine(stored, layout, taught)
         head = self._head(stored, layout, taught)
         figures = {
@@ -148,29 +149,24 @@ class _Bake:
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> tuple[np.ndarray, Layout]:
-        model, choice = self.model, self.choice
-        cell = float(np.median(pixel_footprints(model)))
-        resolution = self.config.resolution or round(2 * choice.cells_per_pixel / cell)
-        resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
+        model, choice, resolution = self.model, self.choice, self.plan.resolution
         with self._part("visibility"):
-            held = occupied_cells(model, resolution)
             if self.config.no_cull:
-                visible = held
+                cells = whole(model, resolution)
             else:
-                visible = visible_cells(model, resolution, choice.weight_floor, self._progress("visibility"))
-                share = 1 - float(visible.sum()) / max(int(held.sum()), 1)
-                self.left_out["cells"] = (
-                    f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
-                    f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
-                )
-        n_cells, most = int(visible.sum()), MOST_FLOATS // model.field.config.n_channels
-        if n_cells > most:
+                progress, most_db = self._progress("visibility"), CULLED_SHARE * choice.target_loss_db
+                cells = cull(model, resolution, self.held_out, self.config.weight_floor, most_db, progress)
+                self.left_out["cells"] = cells.report()
+        visible = cells.visible
+        layout = make_layout(visible, float(model.occupancy.step))
+        n_vertices, most = len(layout.vertices), self.plan.most_vertices
+        if n_vertices > most:
             raise TrainingError(
-                f"bake: cells: expected at most {most:,} that hold something, which fit into memory, got "
-                f"{n_cells:,} of {visible.size:,}: is the model a fog? Lower --resolution, or raise "
-                "--weight-floor"
+                f"bake: vertices: expected at most {most:,}, which fit into {self.config.max_memory:g} GB of "
+                f"memory, got {n_vertices:,} of {(resolution + 1) ** 3:,}: is the model a fog? Lower "
+                "--resolution, raise --weight-floor, or allow more by --max-memory"
             )
-        return visible, make_layout(visible, float(model.occupancy.step))
+        return visible, layout
 
     def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
@@ -181,19 +177,19 @@ class _Bake:
         cameras = model.model_cameras()
         with self._part("teacher"):
             views = cameras + views_between(model, len(cameras), seed=1)
-            taught = teach(model, views, N_RAYS, 0, self._progress("teacher"))
+            taught = teach(model, views, self.plan.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             features, density = evaluate_vertices(model, layout, self._progress("grid"))
             own = fold_head(model.field.head, model.field.head.first_weights().astype(np.float64))
             held_out.measure("grid", layout.float_grid(density, features), runner(own), 0)
             projection = self._projection(taught)
             features = features @ projection.matrix.T.astype(np.float32)
-            scales = code_scales(features, choice.code_levels).astype(np.float32)
-            features /= scales
+            step = code_step(features, choice.code_levels)
+            features /= np.float32(step)
             n_fit = self._channels_that_fit(layout, density, features, mesh_size)
-            features, scales = np.ascontiguousarray(features[:, :n_fit]), scales[:n_fit]
+            features = np.ascontiguousarray(features[:, :n_fit])
             first = model.field.head.first_weights().astype(np.float64) @ projection.back[:, :n_fit]
-            head = fold_head(model.field.head, first * scales)
+            head = fold_head(model.field.head, first * step)
             held_out.measure("rank", layout.float_grid(density, features), runner(head), 0)
             grid = layout.grid(density, features)
             held_out.measure("codes", grid, runner(head), 0)
@@ -244,10 +240,7 @@ class _Bake:
             grid = layout.grid(stored.density, stored.features)
             lessons = collect_lessons(taught, grid, 0)
             if choice.head_width:
-                typical = float(
-                    np.abs(lessons.composed(stored.features, np.arange(1000) % len(lessons))).mean()
-                )
-                new = self._new_head(stored.head, max(typical, 1e-3))
+                new = self._new_head(stored.head, lessons.typical(stored.features))
                 stored = replace(stored, head=new)
                 stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
                 self.held_out.measure("small head", grid, runner(stored.head), 0)
@@ -273,6 +266,22 @@ class _Bake:
                     self.left_out["refinement at k"] = "all of it: it lost more on views that it has not seen"
         return stored
 
+    def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
+        """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
+        arrays = layout.arrays(stored.density, stored.features)
+        scale = np.ones(arrays.features.shape[1])
+
+        def head(width: int) -> bytes:
+            if not width:
+                return head_onnx(stored.head)
+            shape = width, self.choice.head_layers, min(self.choice.head_bands, stored.head.sh_degree)
+            return head_onnx(small_head(stored.head, *shape, scale))
+
+        manifest = self._manifest(layout, arrays.features.shape[1], {})
+        measure = measured_in_memory(manifest, arrays, head, self.model.cameras[0])
+        fixed = self.config.head_width is not None, self.config.n_samples is not None
+        return keep_to_time(self.choice, target_ms, measure, *fixed)
+
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
         """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
         each number loses is kept in `lookups`."""
@@ -288,7 +297,7 @@ class _Bake:
             self.held_out.measure("k", grid, runner(head), self.n_samples)
             self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
 
-    def _new_head(self, own: HeadWeights, code_scale: float) -> HeadWeights:
+    def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
         """A small head that has not learned yet; without directions where the colours do not need them."""
         choice, n_bands = self.choice, min(self.choice.head_bands, own.sh_degree)
         lost = self.held_out.direction_loss()
@@ -346,7 +355,10 @@ class _Bake:
                 "--weight-floor"
             )
         megabytes = sum(n_bytes.values()) / 1e6
-        check_budget(self.config, last.loss_db, megabytes)
+        ms = None
+        if self.config.target_ms is not None:
+            ms = frame_ms(asset, self.model.cameras[0], self.n_samples)
+        check_budget(self.config, last.loss_db, megabytes, ms)
         missed = []
         if last.loss_db > self.choice.target_loss_db:
             missed.append(

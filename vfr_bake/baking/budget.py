@@ -32,11 +32,16 @@ def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:
     return n_fit
 
 
-def check_budget(config: BakeConfig, loss_db: float, megabytes: float) -> None:
-    """Raise TrainingError where the written files miss what was asked; it says what came nearest."""
-    limits = (("loss", config.max_loss_db, loss_db, "dB"), ("size", config.max_mb, megabytes, "MB"))
+def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float | None) -> None:
+    """Raise TrainingError where the written files miss what was asked; it says what came nearest. `ms` is the
+    time of a frame, where that was asked."""
+    limits = (
+        ("loss", config.max_loss_db, loss_db, "dB"),
+        ("size", config.max_mb, megabytes, "MB"),
+        ("time", config.target_ms, ms, "ms"),
+    )
     for name, limit, got, unit in limits:
-        if limit is not None and got > limit:
+        if limit is not None and got is not None and got > limit:
             raise TrainingError(
                 f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} ({loss_db:.2f} dB in "
                 f"{megabytes:.1f} MB): nothing was written: allow more, or change the preset"

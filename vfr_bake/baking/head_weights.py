@@ -41,11 +41,13 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
     )
 
 
-def small_head(like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: float) -> HeadWeights:
+def small_head(
+    like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: np.ndarray
+) -> HeadWeights:
     """A head of `like`'s form with random weights, which has everything to learn.
 
     It is `width` wide, has `n_layers` directional layers after the first and `n_bands` bands of spherical
-    harmonics; `code_scale` is the size of the features that it will be given, in codes.
+    harmonics; `code_scale` [n_channels] is the size of the features that it will be given, in codes.
     """
     random = np.random.default_rng(0)
 
@@ -55,7 +57,7 @@ def small_head(like: HeadWeights, width: int, n_layers: int, n_bands: int, code_
     n_encoded = n_bands**2 * like.n_sh_features
     first, bias = layer(like.n_channels, width)
     return HeadWeights(
-        spatial=((first / code_scale, bias),),
+        spatial=((first / code_scale[:, None], bias),),
         to_sh=layer(width, n_encoded, 1.0),
         directional_first=(layer(width, width)[0], layer(n_encoded, width, 1.0)[0], np.zeros(width)),
         directional=tuple(layer(width, width) for _ in range(n_layers)),

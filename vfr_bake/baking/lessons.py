@@ -25,6 +25,8 @@ from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
 RAYS_AT_ONCE = 1 << 14
+SOME = 4096
+"""Lessons that tell the size of composites."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,11 @@ class Lessons:
         out = np.empty((len(some), codes.shape[1]), np.float32)
         compose(some, self.starts, self.rows, self.shares, self.weights, codes, rounded, out)
         return out
+
+    def typical(self, codes: np.ndarray) -> np.ndarray:
+        """[n_channels] mean size of the composites of `codes`, of some lessons; never 0."""
+        some = np.arange(min(SOME, len(self))) * len(self) // min(SOME, len(self))
+        return np.maximum(np.abs(self.composed(codes, some)).mean(axis=0), 1e-3)
 
 
 @dataclass(frozen=True, eq=False)

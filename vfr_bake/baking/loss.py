@@ -84,6 +84,14 @@ class HeldOut:
         off = self._opacity * (shown - self._colours(self._features))
         return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
 
+    def loss_of(self, features: np.ndarray, opacity: np.ndarray) -> float:
+        """Expected loss in dB if every ray had composited `features` [n, n_channels] and `opacity` [n], and
+        the model's own head."""
+        rgb = (1 - opacity[:, None]) * self.background
+        met = np.flatnonzero(opacity > 0)
+        rgb[met] += opacity[met, None] * head_colours(self._field, features[met], self.rays_d[met])
+        return expected_loss(float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2)), self.model_psnr)
+
     def direction_loss(self) -> float:
         """Expected loss in dB if every colour were the mean of those seen from N_DIRECTIONS other rays'
         directions."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from exporters.mesh import TriangleMesh, take_faces
 from exporters.surface import extract_surface, remove_small_components
+from player.errors import ConfigError
 from vfr_bake.baking.visibility import Progress
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.metrics import to_8_bit
@@ -26,20 +27,21 @@ def bake_mesh(
     """The mesh in the WORLD frame, and how many floating parts were removed.
 
     `visible` [n, n, n] bool are the cells that some training view sees; faces away from all of them (the
-    inside of a solid) are dropped.
+    inside of a solid) are dropped. A field without a surface, an even fog, has an empty mesh.
     """
     aabb = np.array([[-1.0] * 3, [1.0] * 3])
 
     def density(points: np.ndarray) -> np.ndarray:
         return np.exp(model.field.log_densities(np.ascontiguousarray((points + 1) / 2)))
 
-    vertices, faces, normals = extract_surface(
-        density,
-        aabb,
-        resolution,
-        _level(model, visible, 2 / resolution),
-        lambda share: progress(round(share * 100), 100),
-    )
+    level = _level(model, visible, 2 / resolution)
+    try:
+        vertices, faces, normals = extract_surface(
+            density, aabb, resolution, level, lambda share: progress(round(share * 100), 100)
+        )
+    except ConfigError:  # every density is over the level, or under it: an even fog has no surface
+        none = np.zeros((0, 3))
+        return TriangleMesh(none, none.astype(np.int32), none, np.zeros((0, 4), np.uint8)), 0
     mesh = TriangleMesh(vertices, faces, normals, np.zeros((len(vertices), 4), np.uint8))
     mesh = take_faces(mesh, np.any(_seen(vertices, visible)[faces], axis=1))
     mesh, n_removed = remove_small_components(mesh, FLOATER_FRACTION)

@@ -23,7 +23,6 @@ class BakeChoice:
     """Most feature lookups per ray, k; 0 for every sample."""
     sample_loss_db: float
     """Fewer are taken where they lose no more than this, dB."""
-    weight_floor: float
     code_levels: int
     head_width: int
     head_layers: int
@@ -40,18 +39,18 @@ class BakeChoice:
 
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
-        cells_per_pixel=4.0, n_channels=18, channel_loss_db=0.05, n_samples=16, sample_loss_db=0.005,
-        weight_floor=0.01, code_levels=63, head_width=0, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
+        cells_per_pixel=4.0, n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005,
+        code_levels=127, head_width=0, head_layers=3, head_bands=4, head_bits=32,
+        refine_steps=500, mesh_resolution=96, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.25, n_channels=10, channel_loss_db=0.5, n_samples=8, sample_loss_db=0.05,
-        weight_floor=0.01, code_levels=31, head_width=64, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
+        cells_per_pixel=1.28, n_channels=14, channel_loss_db=0.25, n_samples=8, sample_loss_db=0.05,
+        code_levels=50, head_width=64, head_layers=3, head_bands=4, head_bits=32,
+        refine_steps=2000, mesh_resolution=64, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
-        cells_per_pixel=0.9, n_channels=8, channel_loss_db=1.5, n_samples=4, sample_loss_db=0.15,
-        weight_floor=0.02, code_levels=31, head_width=32, head_layers=1, head_bands=3, head_bits=32,
-        refine_steps=2000, mesh_resolution=96, target_loss_db=1.0,
+        cells_per_pixel=1.0, n_channels=10, channel_loss_db=0.8, n_samples=4, sample_loss_db=0.15,
+        code_levels=40, head_width=32, head_layers=1, head_bands=3, head_bits=32,
+        refine_steps=2000, mesh_resolution=56, target_loss_db=1.0,
     ),
 }  # fmt: skip

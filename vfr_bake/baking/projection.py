@@ -62,15 +62,18 @@ def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity
     return total / max(len(rendered), 1)
 
 
-def code_scales(vertex_features: np.ndarray, levels: int = 127) -> np.ndarray:
-    """Step [n_stored] of each channel's signed code: its largest magnitude at `levels`; 1 for a channel of
-    zeros.
+def code_step(values: np.ndarray, levels: int = 127) -> float:
+    """Step of the signed codes of projected `values` [n, n_stored]: the largest magnitude is at `levels`; 1
+    for zeros.
 
-    >>> code_scales(np.array([[127.0, 0.0], [-254.0, 0.0]])).tolist()
-    [2.0, 1.0]
+    It is the same for all channels: P makes an error in any of them weigh alike in the colours, so that the
+    least bytes for a given error are those of one step, and a channel of little use takes few bits by itself.
+
+    >>> code_step(np.array([[127.0, 0.0], [-254.0, 1.0]]))
+    2.0
     """
-    largest = np.abs(vertex_features).max(axis=0)
-    return np.where(largest > 0, largest / levels, 1.0)
+    largest = float(np.abs(values).max(initial=0))
+    return largest / levels if largest > 0 else 1.0
 
 
 def encode_features(codes: np.ndarray) -> np.ndarray:

@@ -24,11 +24,12 @@ from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 from vfr_bake.kernels.stored_features import descend, descend_density, weigh
 
 BATCH = 2048
-FULL_CODE = 127.0
-"""The largest feature code; in this unit the first weights are of the size that the learning rate fits."""
+UNIT = 4.0
+"""Mean sizes of a channel's composites that make a unit of it; so large a unit makes the first weights of the
+size that the learning rate fits."""
 HEAD_RATE = 5e-4
 """Adam's learning rate for a head that the full model had; it falls to zero along a cosine."""
-CODE_RATE = 1.0
+CODE_RATE = 0.25
 """Adagrad's learning rate of codes up to 127; it falls to zero along the same cosine."""
 
 DENSITY_RATE = 1.0
@@ -65,7 +66,8 @@ def refine(
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
-    head = FoldedHead(stored.head)
+    typical = lessons.typical(stored.features)
+    head = FoldedHead(stored.head, UNIT * typical)
     features, density = stored.features.copy(), stored.density.copy()
     steep, steep_density = np.zeros((2, len(features)), np.float32)
     where = (lessons.starts, lessons.rows, lessons.shares)
@@ -111,23 +113,26 @@ def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons,
 
 
 class FoldedHead(nn.Module):
-    """The exported graph of `exporters.onnx_head`, in torch."""
+    """The exported graph of `exporters.onnx_head`, in torch; composites are counted in `units` [n_channels],
+    so that channels of small codes are learned as fast as those of large ones."""
 
-    def __init__(self, weights: HeadWeights) -> None:
+    def __init__(self, weights: HeadWeights, units: np.ndarray | None = None) -> None:
         super().__init__()
         self._like = weights
+        self._units = np.ones(weights.n_channels) if units is None else units.astype(np.float64)
         self.harmonics = SphericalHarmonics(weights.sh_degree)
         layers = [*weights.spatial, weights.to_sh, *weights.directional, weights.output]
         d_bottleneck, d_sh, bias = weights.directional_first
         arrays = [array for layer in layers for array in layer] + [d_bottleneck, d_sh, bias]
+        arrays[0] = arrays[0] * self._units[:, None]
         self.arrays = nn.ParameterList([torch.tensor(a, dtype=torch.float32) for a in arrays])
-        self.arrays[0].data *= FULL_CODE
+        self._per_unit = torch.tensor(1 / self._units, dtype=torch.float32)
 
     def forward(self, codes: Tensor, dirs: Tensor) -> Tensor:
         """Colours [n, 3] from composited codes [n, n_stored] and unit dirs [n, 3]."""
         layers, (d_bottleneck, d_sh, bias) = self._layers()
         n_spatial = len(self._like.spatial)
-        h = codes / FULL_CODE
+        h = codes * self._per_unit
         for weight, b in layers[:n_spatial]:
             h = gelu(torch.addmm(b, h, weight))
         weight, b = layers[n_spatial]
@@ -151,7 +156,7 @@ class FoldedHead(nn.Module):
             return tuple(t.detach().double().numpy() for t in tensors)
 
         arrays: list[Layer] = [plain(layer) for layer in layers]  # type: ignore[misc]
-        arrays[0] = (arrays[0][0] / FULL_CODE, arrays[0][1])
+        arrays[0] = (arrays[0][0] / self._units[:, None], arrays[0][1])
         n_spatial = len(self._like.spatial)
         return HeadWeights(
             spatial=tuple(arrays[:n_spatial]),

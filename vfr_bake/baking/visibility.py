@@ -6,13 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from player.errors import TrainingError
 from vfr_bake.baking.views import views_between
 from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
-HITS = 16
+HITS = 8
 """Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
 closed."""
 VIEWS_OF_A_CELL = 0.4
@@ -22,14 +21,16 @@ Progress = Callable[[int, int], object]
 """Called with (done, of)."""
 
 
-def visible_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
-    """[resolution]^3 bool: cells in which a sample of some view's ray weighs at least `weight_floor`, and the
-    gaps of one cell between them. Views are the training cameras and as many between them.
+def marked_cells(
+    model: Model, resolution: int, weight_floors: tuple[float, ...], progress: Progress
+) -> np.ndarray:
+    """[resolution, resolution, resolution, n_floors] uint8, 1 for cells in which a sample of some view's ray
+    weighs at least each floor. Views are the training cameras and as many between them.
 
     Rays leave each camera as densely as it takes for every surface cell to be met HITS times over
-    all views, whatever the pictures' size. Raises TrainingError when nothing is seen.
+    all views, whatever the pictures' size.
     """
-    visible = np.zeros((resolution,) * 3, np.uint8)
+    marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
     cameras = model.model_cameras()
     cameras += views_between(model, len(cameras), seed=0)
     density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
@@ -40,28 +41,34 @@ def visible_cells(model: Model, resolution: int, weight_floor: float, progress: 
         rays_o, rays_d = camera.resized(*size).rays()
         mark_visible_cells(
             rays_o, rays_d, np.float32(step), model.occupancy.distance,
-            *model.field.kernel_arguments(), LIMITS, np.float32(weight_floor), visible,
+            *model.field.kernel_arguments(), LIMITS, np.array(weight_floors, np.float32), marks,
         )  # fmt: skip
         progress(index + 1, len(cameras))
-    if not visible.any():
-        raise TrainingError(
-            f"no cell weighs {weight_floor} in any training view: the model is empty or a thin fog: "
-            "train longer, or lower --weight-floor"
-        )
-    return close_gaps(visible.view(bool))
+    return marks
 
 
 def occupied_cells(model: Model, resolution: int) -> np.ndarray:
-    """[resolution]^3 bool: cells in which the training's occupancy grid allows matter."""
-    occupied = model.occupancy.occupied
-    index = np.arange(resolution) * len(occupied) // resolution
-    return occupied[np.ix_(index, index, index)]
+    """[resolution]^3 bool: cells in some part of which the training's occupancy grid allows matter."""
+    cells = model.occupancy.occupied
+    n = len(cells)
+    first = np.arange(resolution) * n // resolution
+    last = (np.arange(1, resolution + 1) * n - 1) // resolution
+    for axis in range(3):
+        parts = [cells.take(np.minimum(first + i, last), axis) for i in range(max(last - first) + 1)]
+        cells = np.logical_or.reduce(parts)
+    return cells
 
 
 def pixel_footprints(model: Model) -> np.ndarray:
     """[n_views] size of each training camera's pixels at the middle of the box, model units."""
     cameras = model.model_cameras()
     return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), 1e-6) / c.fx for c in cameras])
+
+
+def rays_of_views(model: Model, resolution: int) -> float:
+    """Rays that `marked_cells` sends out."""
+    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
+    return 2 * density**2 * sum(camera.width * camera.height for camera in model.cameras)
 
 
 def _ray_density(footprints: np.ndarray, cell: float) -> float:

@@ -210,8 +210,9 @@ def render_features(rays_o, rays_d, step, distance, grid, network, limits, out, 
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def mark_visible_cells(rays_o, rays_d, step, distance, grid, network, limits, weight_floor, visible):
-    """Set `visible` [r, r, r] (uint8) where a sample of some ray weighs at least `weight_floor`.
+def mark_visible_cells(rays_o, rays_d, step, distance, grid, network, limits, weight_floors, visible):
+    """Set `visible` [r, r, r, n] (uint8) where a sample of some ray weighs at least each of `weight_floors`
+    [n].
 
     Several threads may set one cell: all write the same 1, so the result does not depend on their order.
     """
@@ -237,11 +238,13 @@ def mark_visible_cells(rays_o, rays_d, step, distance, grid, network, limits, we
                 i += 1
                 encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
                 delta = np.exp(min(density_logit(feature, w1, b1, w2, b2, hidden), largest_logit)) * step
-                if -np.exp(-tau) * np.expm1(-delta) >= weight_floor:
-                    jx = min(max(np.int64(ux * kind(r)), 0), r - 1)
-                    jy = min(max(np.int64(uy * kind(r)), 0), r - 1)
-                    jz = min(max(np.int64(uz * kind(r)), 0), r - 1)
-                    visible[jx, jy, jz] = 1
+                weight = -np.exp(-tau) * np.expm1(-delta)
+                for level in range(weight_floors.shape[0]):
+                    if weight >= weight_floors[level]:
+                        jx = min(max(np.int64(ux * kind(r)), 0), r - 1)
+                        jy = min(max(np.int64(uy * kind(r)), 0), r - 1)
+                        jz = min(max(np.int64(uz * kind(r)), 0), r - 1)
+                        visible[jx, jy, jz, level] = 1
                 tau += delta
 
 

@@ -23,36 +23,22 @@ from vfr_bake.baking.bake import bake
 from vfr_bake.baking.budget import SMALL_FILES
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
-from vfr_bake.baking.projection import code_scales, encode_features, head_sensitivity, project
+from vfr_bake.baking.presets import PRESETS
+from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
 from vfr_bake.baking.refinement import FoldedHead, Stored, refine
 from vfr_bake.baking.views import views_between
-from vfr_bake.baking.visibility import close_gaps, corner_vertices, pixel_footprints, visible_cells
-from vfr_bake.config import BakeConfig, FieldConfig, FieldOptions, TrainConfig
+from vfr_bake.baking.visibility import corner_vertices, pixel_footprints
+from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
 from vfr_bake.kernels.stored_features import descend_density, weigh
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.trainer import Trainer
 
 
 def quiet(stage: str, done: int, of: int) -> None:
     """No progress."""
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    scene = demo.demo_scene(size=64, n_train=24, n_test=2)
-    field = FieldOptions(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
-    config = TrainConfig(
-        device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48
-    )
-    trainer = Trainer(scene, config)
-    for _ in trainer.run():
-        pass
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})
 
 
 def test_projection_is_the_best_of_its_rank() -> None:
@@ -87,32 +73,20 @@ def test_sensitivity_is_the_mean_square_of_finite_differences() -> None:
     np.testing.assert_allclose(head_sensitivity(head, features, dirs, opacity), expected, rtol=1e-6)
 
 
-def test_feature_codes_are_within_half_a_step() -> None:
-    values = np.random.default_rng(0).normal(size=(1000, 3)) * np.array([1e-30, 1.0, 1e30])
-    values[:, 1] = 0
-    scales = code_scales(values)
-    codes = encode_features(values / scales)
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+def test_feature_codes_are_within_half_a_step(size: float) -> None:
+    values = np.random.default_rng(0).normal(size=(1000, 3)) * np.array([size, 0, 0.1 * size])
+    step = code_step(values)
+    codes = encode_features(values / step)
     assert codes.dtype == np.int8 and np.abs(codes.astype(int)).max() == 127
-    assert (np.abs(codes * scales - values) <= scales * 0.5000001).all()
+    assert (np.abs(codes * step - values) <= step * 0.5000001).all()
+    assert np.abs(codes[:, 2].astype(int)).max() < 30, "a channel of little use takes few bits"
 
 
 def test_every_corner_of_a_visible_cell_is_stored() -> None:
     cells = np.random.default_rng(0).random((5, 5, 5)) < 0.1
     expected = {tuple(cell + corner) for cell in np.argwhere(cells) for corner in np.ndindex(2, 2, 2)}
     assert {tuple(v) for v in corner_vertices(cells)} == expected
-
-
-def test_gaps_of_one_cell_are_closed_and_nothing_grows() -> None:
-    cells = np.zeros((12, 12, 12), bool)
-    cells[5:8, 2:10, 2:10] = True
-    full = cells.copy()
-    random = np.random.default_rng(0)
-    for _ in range(6):  # single holes, some of them at the rim
-        cells[6, random.integers(3, 9), random.integers(3, 9)] = False
-    assert np.array_equal(close_gaps(cells), full)
-    corner = np.zeros((4, 4, 4), bool)
-    corner[0, 0, 0] = True
-    assert np.array_equal(close_gaps(corner), corner)
 
 
 def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Path) -> None:
@@ -279,7 +253,7 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     five = psnr(render(asset, camera, n_samples=5).rgb, full)
     one = psnr(render(asset, camera, n_samples=1).rgb, full)
     assert every > 35 and five > 32, "the grid, the codes and the choice of samples lose little"
-    assert one < five
+    assert one < five <= every + 0.5
     assert result.figures["psnr_to_full_model"] > 32
     losses = {stage["name"]: stage["psnr"] for stage in result.figures["stages"]}
     assert losses["refined"] > losses["codes"] + 1, "refinement gets back what the bake lost"
@@ -297,7 +271,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
         if name != "manifest.json":  # it lists the reports, which are written after it was counted
             assert (tmp_path / "asset" / name).stat().st_size == size
     assert sum(said["bytes"].values()) <= result.n_bytes
-    assert said["asked"]["n_channels"] == 8 and "channels" in said["left_out"]
+    assert said["asked"]["n_channels"] == PRESETS["fast"].n_channels and "channels" in said["left_out"]
     page = (tmp_path / "asset" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "<svg" in page
     assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
@@ -315,7 +289,7 @@ def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tm
     with pytest.raises(TrainingError, match=r"loss: expected at most 0\.001 dB, got"):
         bake(model, tmp_path / "asset", BakeConfig(max_loss_db=0.001, **small), quiet)
     assert list(tmp_path.iterdir()) == []
-    for name in ("max_mb", "max_loss_db"):
+    for name in ("max_mb", "max_loss_db", "target_ms", "max_memory"):
         with pytest.raises(ConfigError, match=f"{name}: expected more than 0, got 0"):
             BakeConfig(**{name: 0})
 
@@ -346,14 +320,6 @@ def test_views_between_lie_between(model: Model) -> None:
     assert not any(np.array_equal(a.c2w, b.c2w) for a, b in zip(views, other, strict=True))
 
 
-def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
-    small: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
-    culled = bake(model, tmp_path / "a", BakeConfig(**small), quiet)
-    whole = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
-    assert whole.n_vertices > 1.1 * culled.n_vertices
-    assert "cells" in culled.figures["left_out"] and "cells" not in whole.figures["left_out"]
-
-
 def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:
     bake(model, tmp_path / "asset", BakeConfig(mesh_resolution=96, refine_steps=0, check_views=1), quiet)
     mesh = read_ply(tmp_path / "asset" / "mesh.ply")
@@ -368,42 +334,10 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path
     assert colours.std(axis=0).min() > 10, "a colourful scene has colourful vertices"
 
 
-@pytest.mark.parametrize(("logit", "message"), [(-30, "got nothing: train longer"), (-2, "or a thin fog")])
-def test_an_empty_model_and_one_of_fog_are_refused_and_leave_nothing(
-    model: Model, tmp_path: Path, logit: float, message: str
-) -> None:
-    empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
-    with torch.no_grad():
-        empty.field.density.out.weight.fill_(0)
-        empty.field.density.out.bias.fill_(logit)
-    hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
-    with pytest.raises(TrainingError, match=message):
-        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_more_cells_than_memory_holds_are_refused(
-    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("vfr_bake.baking.bake.MOST_FLOATS", 16 * 1000)
-    with pytest.raises(
-        TrainingError, match=r"expected at most 1,000 .* got [\d,]+ of 110,592: is the model a fog"
-    ):
-        bake(model, tmp_path / "asset", BakeConfig(resolution=48), quiet)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
     (tmp_path / "asset").mkdir()
     with pytest.raises(OutputError, match="--force"):
         bake(model, tmp_path / "asset", BakeConfig(), quiet)
-
-
-def test_a_low_floor_stores_more(model: Model) -> None:
-    def count(floor: float) -> int:
-        return int(visible_cells(model, 64, floor, lambda done, of: None).sum())
-
-    assert count(0.001) > count(0.01) > count(0.2) > 0
 
 
 def test_the_grid_is_as_fine_as_the_pictures_and_never_finer_than_the_field(

@@ -1,0 +1,24 @@
+"""A small trained scene, which the tests of the bake share."""
+
+from __future__ import annotations
+
+import pytest
+
+from vfr_bake.config import FieldOptions, TrainConfig
+from vfr_bake.data import demo
+from vfr_bake.training.model_file import Model
+from vfr_bake.training.trainer import Trainer
+
+
+@pytest.fixture(scope="package")
+def model() -> Model:
+    scene = demo.demo_scene(size=64, n_train=24, n_test=2)
+    field = FieldOptions(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)
+    config = TrainConfig(
+        device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48
+    )
+    trainer = Trainer(scene, config)
+    for _ in trainer.run():
+        pass
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
+    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})

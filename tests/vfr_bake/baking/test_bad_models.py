@@ -1,0 +1,69 @@
+"""Models that cannot be baked well: a clear error that leaves nothing, or a measured fallback."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from player.asset import Asset
+from player.errors import ConfigError, TrainingError
+from player.render import render
+from vfr_bake.baking.bake import bake
+from vfr_bake.config import BakeConfig, TrainConfig
+from vfr_bake.data import demo
+from vfr_bake.rendering.render import render_image
+from vfr_bake.training.metrics import psnr
+from vfr_bake.training.model_file import Model
+from vfr_bake.training.trainer import Trainer
+
+
+def quiet(*_: object) -> None:
+    """No progress."""
+
+
+def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
+    empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
+    with torch.no_grad():
+        empty.field.density.out.weight.fill_(0)
+        empty.field.density.out.bias.fill_(-30)
+    hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
+    with pytest.raises(TrainingError, match="got nothing: train longer"):
+        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -> None:
+    settings = BakeConfig(resolution=32, weight_floor=0.9999, refine_steps=0, check_views=1)
+    with pytest.raises(TrainingError, match=r"no cell weighs 0\.9999 .* lower --weight-floor"):
+        bake(model, tmp_path / "asset", settings, quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_than_memory_holds_is_refused(model: Model, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.85 GB for 48 .* got 0\.8 "):
+        bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), quiet)
+    with pytest.raises(TrainingError, match=r"at most [\d,]+, .* got [\d,]+ of 117,649: is the model"):
+        bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.852), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
+    """All cameras within a thousandth of the box, looking where they looked: the grid is as fine as it may
+    be, and what they see from there is what is stored."""
+    middle = demo.CENTRE + demo.SCALE * np.array([0.0, 0.0, 0.3])  # above the ball, with the plate in view
+    cameras = []
+    for camera in model.cameras:
+        c2w = camera.c2w.copy()
+        c2w[:3, 3] = middle + 1e-3 * (c2w[:3, 3] - middle)
+        cameras.append(replace(camera, c2w=c2w))
+    near = replace(model, cameras=cameras)
+    settings = BakeConfig(preset="fidelity", mesh_resolution=16, refine_steps=0, check_views=8)
+    bake(near, tmp_path / "asset", settings, quiet)
+    asset = Asset.open(tmp_path / "asset", verify=True)
+    full = render_image(near.field, near.occupancy, near.model_cameras()[0], near.background)
+    assert full.std() > 0.05, "they see something"
+    assert psnr(render(asset, cameras[0]).rgb, full) > 28

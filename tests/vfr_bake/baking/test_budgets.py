@@ -1,0 +1,89 @@
+"""Time and memory: what a bake is told to keep to, and what it says beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from player.asset import Asset
+from player.errors import TrainingError
+from vfr_bake.baking import pace
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.estimate import N_RAYS, expected_seconds, make_plan
+from vfr_bake.baking.pace import keep_to_time
+from vfr_bake.baking.presets import PRESETS
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
+
+SMALL: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+
+
+def quiet(*_: object) -> None:
+    """No progress."""
+
+
+def took(width: int, k: int) -> float:
+    """A machine that needs 1 ms for each unit of the head's width and 10 for each lookup."""
+    return (width or 256) + 10 * (k or 40)
+
+
+def test_the_head_gives_before_the_lookups_do() -> None:
+    balanced = PRESETS["balanced"]
+    assert keep_to_time(balanced, 1000, took, False, False) == balanced
+    fewer = keep_to_time(balanced, 120, took, False, False)
+    assert (fewer.head_width, fewer.n_samples) == (64, 4)
+    narrow = keep_to_time(balanced, 70, took, False, False)
+    assert (narrow.head_width, narrow.n_samples) == (48, 1)
+    own = replace(balanced, head_width=0, n_samples=0)
+    assert keep_to_time(own, 1000, took, False, False) == own
+    assert keep_to_time(own, 400, took, False, False).n_samples == 8
+
+
+def test_what_was_asked_for_by_number_stays() -> None:
+    balanced = PRESETS["balanced"]
+    same_k = keep_to_time(balanced, 140, took, False, True)
+    assert (same_k.head_width, same_k.n_samples) == (32, 8)
+    same_head = keep_to_time(balanced, 120, took, True, False)
+    assert (same_head.head_width, same_head.n_samples) == (64, 4)
+    with pytest.raises(TrainingError, match=r"at most 70 ms, got 74 ms .* nothing was written"):
+        keep_to_time(balanced, 70, took, True, False)
+
+
+def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(TrainingError, match=r"800 x 800 in at most 0\.001 ms, got"):
+        bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), quiet)
+    # The files are measured again: what takes longer than it did before refinement is refused as well.
+    times = iter([1.0, 1.0, 9.0])
+    monkeypatch.setattr(pace, "frame_ms", lambda *_: next(times))
+    monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda *_: next(times))
+    with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
+        bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None:
+    bake(model, tmp_path / "a", BakeConfig(**SMALL), quiet)
+    bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), quiet)
+    a, b = (Asset.open(tmp_path / name).manifest for name in "ab")
+    assert (a.n_samples, a.files["head.onnx"].bytes) == (b.n_samples, b.files["head.onnx"].bytes)
+
+
+def test_less_memory_means_fewer_rays(model: Model) -> None:
+    plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in (0.9, 1.2, 4.0)]
+    assert [plan.n_rays for plan in plans] == sorted(plan.n_rays for plan in plans)
+    assert plans[0].n_rays < plans[1].n_rays < plans[2].n_rays == N_RAYS
+    assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, (0.9, 1.2, 4.0), strict=True))
+
+
+def test_more_work_is_expected_to_take_longer(model: Model) -> None:
+    def seconds(**settings: Any) -> float:
+        config = BakeConfig(**(SMALL | settings))
+        return expected_seconds(model, config, make_plan(model, config))
+
+    # Ten times the least difference in work: what the machine's noise does to a rate is far less.
+    assert seconds(refine_steps=1_000_000) > 10 * seconds()

@@ -1,0 +1,127 @@
+"""Which cells are stored, and that what is left out is measured in sum, not sample by sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from player.asset import Asset
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.culling import FLOORS, cull, whole
+from vfr_bake.baking.loss import HeldOut, expected_loss
+from vfr_bake.baking.visibility import close_gaps, marked_cells
+from vfr_bake.config import BakeConfig
+from vfr_bake.rendering.render import head_colours
+from vfr_bake.training.model_file import Model
+
+
+def quiet(*_: object) -> None:
+    """No progress."""
+
+
+def fog(model: Model, logit: float) -> Model:
+    """`model` with one thin density everywhere, seen by the same cameras; its colours stay."""
+    from copy import deepcopy
+
+    field = deepcopy(model.field)
+    with torch.no_grad():
+        field.density.out.weight.fill_(0)
+        field.density.out.bias.fill_(logit)
+    sampler = type(model.occupancy)(16, model.occupancy.step, seed=0)
+    sampler.restore(np.ones((16,) * 3, bool))
+    return Model(field, sampler, model.world_from_model, model.cameras, True, {}, {})
+
+
+def test_gaps_of_one_cell_are_closed_and_nothing_grows() -> None:
+    cells = np.zeros((12, 12, 12), bool)
+    cells[5:8, 2:10, 2:10] = True
+    full = cells.copy()
+    random = np.random.default_rng(0)
+    for _ in range(6):  # single holes, some of them at the rim
+        cells[6, random.integers(3, 9), random.integers(3, 9)] = False
+    assert np.array_equal(close_gaps(cells), full)
+    corner = np.zeros((4, 4, 4), bool)
+    corner[0, 0, 0] = True
+    assert np.array_equal(close_gaps(corner), corner)
+
+
+def test_a_low_floor_marks_more(model: Model) -> None:
+    floors = (0.2, 0.01, 0.001)
+    together = marked_cells(model, 64, floors, quiet)
+    assert 0 < together[..., 0].sum() < together[..., 1].sum() < together[..., 2].sum()
+    alone = marked_cells(model, 64, floors[1:2], quiet)
+    assert np.array_equal(together[..., 1], alone[..., 0])
+
+
+def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
+    small: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    culled = bake(model, tmp_path / "a", BakeConfig(**small), quiet)
+    everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
+    assert everything.n_vertices > 1.2 * culled.n_vertices
+    assert "cells" in culled.figures["left_out"] and "cells" not in everything.figures["left_out"]
+
+
+def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(model: Model) -> None:
+    """Against a sum in float64 over the model's own samples, those in cells below the floor left out."""
+    held_out, floor = HeldOut(model, 1), 0.3
+    cells = cull(model, 96, held_out, floor, 0.0, quiet)
+    marks = marked_cells(model, 96, (floor,), quiet)
+    visible = close_gaps(marks[..., 0].view(bool))
+    assert np.array_equal(cells.visible, visible)
+
+    def loss(stored: np.ndarray) -> float:
+        samples = model.occupancy.sample_all(model.field, held_out.rays_o, held_out.rays_d)
+        with torch.no_grad():
+            sigmas = model.field.density(samples.features).double().numpy()
+        index = np.minimum((samples.points.numpy() * 96).astype(int), 95)
+        optical = sigmas * samples.deltas.numpy() * stored[tuple(index.T)]
+        features = np.zeros((len(held_out.rays_o), samples.features.shape[1]), np.float32)
+        opacity = np.zeros(len(features), np.float32)
+        for ray, start, count in zip(samples.rays, samples.starts, samples.counts, strict=True):
+            part = slice(int(start), int(start + count))
+            before = np.cumsum(optical[part]) - optical[part]
+            weights = np.exp(-before) * -np.expm1(-optical[part])
+            features[ray] = weights @ samples.features[part].double().numpy()
+            opacity[ray] = weights.sum()
+        met = opacity > 0
+        rgb = (1 - opacity[:, None]) * held_out.background
+        rgb[met] += opacity[met, None] * head_colours(model.field, features[met], held_out.rays_d[met])
+        return expected_loss(float(np.mean((rgb - held_out.wanted) ** 2)), held_out.model_psnr)
+
+    expected = loss(visible) - loss(whole(model, 96).visible)
+    assert expected > 0.05, "a floor this high loses something"
+    # The model stops behind an optical depth of 6.9 by itself; without some cells it stops later.
+    assert cells.lost[floor] == pytest.approx(expected, rel=0.02)
+
+
+def test_the_highest_floor_that_loses_little_is_taken(model: Model) -> None:
+    held_out = HeldOut(model, 1)
+    losses = {floor: cull(model, 64, held_out, floor, 0.0, quiet).lost[floor] for floor in FLOORS}
+    assert losses[FLOORS[0]] > losses[FLOORS[-1]]
+    for floor, loss in losses.items():
+        chosen = cull(model, 64, held_out, None, loss * 1.001 + 1e-9, quiet)
+        assert losses[chosen.floor] <= loss * 1.001 + 1e-9 and chosen.floor >= floor
+        assert f"{chosen.floor:g}" in chosen.report()
+
+
+def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path: Path) -> None:
+    """Thin weights everywhere: one sample weighs less than any floor, the sum along a ray is the picture."""
+    thin = fog(model, -2)
+    small: dict[str, Any] = {"resolution": 32, "mesh_resolution": 16, "check_views": 1}
+    result = bake(thin, tmp_path / "asset", BakeConfig(preset="fidelity", refine_steps=0, **small), quiet)
+    assert result.figures["psnr_to_full_model"] > 35
+    assert len(Asset.open(tmp_path / "asset").arrays.density) == 33**3
+    assert result.figures["mesh_faces"] == 0, "an even fog has no surface"
+
+
+def test_where_every_floor_loses_too_much_nothing_is_left_out(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vfr_bake.baking.culling.FLOORS", (0.9, 0.5))
+    cells = cull(model, 48, HeldOut(model, 1), None, 0.001, quiet)
+    assert cells.floor == 0 and cells.report().startswith("none") and cells.lost
+    assert np.array_equal(cells.visible, whole(model, 48).visible)

@@ -1,0 +1,94 @@
+"""What a bake will take, before it starts, and what has to be smaller to fit into the memory that is allowed.
+
+Bytes are counted from the arrays that are held at the same time; seconds follow from how fast the model
+answers rays on this machine.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.errors import ConfigError
+from vfr_bake.baking.culling import FLOORS
+from vfr_bake.baking.refinement import BATCH
+from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
+
+PROGRAM_BYTES = 800_000_000
+"""Of Python, torch, numba and the model itself."""
+N_RAYS = 2_000_000
+"""Rays that head and stored values learn from, where there is memory for them."""
+FEWEST_RAYS = 100_000
+RAY_BYTES = 500
+"""Of a ray that is learned from: a third meets something, at about 10 samples of 76 bytes, and what the model
+shows there."""
+STORED_SHARE = 1.0
+"""Vertices for each cell that may hold matter: culling takes away what corners add."""
+N_TIMED = 8192
+"""Rays that tell how fast the model answers."""
+STEP_COST, VERTEX_COST = 2.5, 0.12
+"""Of a lesson in a step of refinement, and of a vertex, in rays of the model."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What follows from the memory allowed, and what is expected."""
+
+    resolution: int
+    """Cells per axis."""
+    n_rays: int
+    """Rays that are learned from."""
+    most_vertices: int
+    """More do not fit."""
+    n_bytes: int
+    """Peak of memory that is expected."""
+
+
+def make_plan(model: Model, config: BakeConfig) -> Plan:
+    """What to bake within `config.max_memory` gigabytes.
+
+    Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
+    """
+    choice, field = config.choice(), model.field.config
+    cell = float(np.median(pixel_footprints(model)))
+    resolution = config.resolution or round(2 * choice.cells_per_pixel / cell)
+    resolution = int(np.clip(resolution, 8, field.max_resolution))
+    n_floors = 0 if config.no_cull else len(FLOORS) if config.weight_floor is None else 1
+    cells = (n_floors + 4) * resolution**3
+    vertex_bytes = 4 * field.n_channels + 13 * min(choice.n_channels, field.n_channels) + 60
+    n_vertices = STORED_SHARE * float(np.count_nonzero(occupied_cells(model, resolution)))
+    allowed = config.max_memory * 1e9
+    left = allowed - PROGRAM_BYTES - n_vertices * vertex_bytes
+    n_rays = int(np.clip(left / RAY_BYTES, FEWEST_RAYS, N_RAYS))
+    room = allowed - PROGRAM_BYTES - n_rays * RAY_BYTES
+    if room <= 0 or PROGRAM_BYTES + cells > allowed:
+        least = (PROGRAM_BYTES + max(cells, FEWEST_RAYS * RAY_BYTES)) / 1e9
+        raise ConfigError(
+            f"max_memory: expected at least {least:.2f} GB for {resolution} cells per axis, got "
+            f"{config.max_memory:g} GB: allow more, or lower --resolution"
+        )
+    peak = PROGRAM_BYTES + max(cells, n_vertices * vertex_bytes + n_rays * RAY_BYTES)
+    return Plan(resolution, n_rays, int(room / vertex_bytes), int(min(peak, allowed)))
+
+
+def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
+    """How long the bake will take, from how long some of the model's own rays take here."""
+    choice, camera = config.choice(), model.model_cameras()[0]
+    rays_o, rays_d = camera.rays()
+    some = np.arange(N_TIMED) * len(rays_o) // N_TIMED
+    rays_o, rays_d = np.ascontiguousarray(rays_o[some]), np.ascontiguousarray(rays_d[some])
+    times = []
+    for _ in range(2):  # the first compiles
+        begin = time.perf_counter()
+        model.occupancy.composited_features(model.field, rays_o, rays_d)
+        times.append(time.perf_counter() - begin)
+    finer = max(model.occupancy.step * plan.resolution / 2, 1.0)
+    work = 0.0 if config.no_cull else finer * rays_of_views(model, plan.resolution)
+    work += plan.n_rays + VERTEX_COST * float(np.count_nonzero(occupied_cells(model, plan.resolution)))
+    n_rounds = 3 if choice.head_width else 2
+    work += n_rounds * choice.refine_steps * BATCH * STEP_COST
+    return times[-1] * work / N_TIMED
