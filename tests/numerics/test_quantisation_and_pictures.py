@@ -55,7 +55,9 @@ def test_every_feature_code_comes_back(scale: float, levels: int) -> None:
 def test_a_constant_channel_keeps_its_value(value: float) -> None:
     values = np.full((9, 1), value)
     step = code_scales(values, 127)
-    assert (encode_features(values / step) * step).tolist() == pytest.approx(values.tolist(), rel=1e-3)
+    kept = encode_features(values / step) * step
+    # a step of 1e-320 / 127 has seven bits left
+    np.testing.assert_allclose(kept, values, rtol=1e-2 if 0 < abs(value) < 1e-300 else 1e-6)
 
 
 def test_what_is_out_of_range_is_clipped_not_wrapped() -> None:
@@ -77,7 +79,7 @@ def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
     coords, masks, order = pack_vertices(vertices)
     values = vertices[order][:, axis] + shift
     codes, features = (values + 100).astype(np.uint8), values.astype(np.int8)[:, None]
-    return build_grid((coords, masks, codes, features), resolution, BOX, 0.01, (-9.0, 0.0))
+    return build_grid((coords, masks, codes, features), resolution, BOX, 0.01, (-4.0, 5.0))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -98,9 +100,9 @@ def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
     result = module.march(grid, rays_o, np.tile(d, (400, 1)), 0, (near, far))
     assert result.n_samples.tolist() == [1] * 400
     sigma = -np.log1p(-result.opacity.astype(np.float64)) / step
-    code = (np.log(sigma) + 9) * 255 / 9
+    code = (np.log(sigma) + 4) * 255 / 9
     at = rays_o[:, axis].astype(np.float64) * resolution / 2 + resolution / 2
-    # opacities of 2e-5 to 1e-2 in float32: relative 1e-6, of which a code is 9 / 255
+    # float32 opacities, relative 1e-6, a code being 9 / 255 of a logarithm
     np.testing.assert_allclose(code, at + 100, rtol=0, atol=2e-3)
     hits = result.hits
     assert len(hits) > 20

@@ -31,6 +31,10 @@ class Times:
     median: float
     p95: float
     quartiles: tuple[float, float]
+    uncertainty: float
+    """Half width of the interval in which two medians do not differ: 1.57 interquartile ranges over the root
+    of the number (the notches of McGill, Tukey and Larsen, 1978), of what is left of the times when the
+    round's view and the machine's state in it, which all settings share, are divided out."""
     frames: int
     march: float
     """Mean a frame, without the lookups."""
@@ -39,12 +43,6 @@ class Times:
     are in `march` then."""
     head: float
     rest: float
-
-    @property
-    def uncertainty(self) -> float:
-        """Half width of the interval in which two medians do not differ: 1.57 interquartile ranges over the
-        root of the number (the notches of McGill, Tukey and Larsen, 1978)."""
-        return 1.57 * (self.quartiles[1] - self.quartiles[0]) / self.frames**0.5
 
 
 def measure_times(
@@ -74,9 +72,26 @@ def measure_times(
     times = {}
     for (player, size), rounds in visits.items():
         slope = lookup_slope(rounds)
+        shared = [_mean_ms([visits[other, size][turn] for other in range(len(players))])
+                  for turn in range(n_rounds)]  # fmt: skip
         for k in samples:
-            times[player, k, size] = _times([answers[k] for answers in rounds], slope)
+            times[player, k, size] = _times([answers[k] for answers in rounds], slope, shared)
     return times
+
+
+def _mean_ms(visits: Sequence[dict[int, dict[str, Any]]]) -> float:
+    return float(np.mean([answer["ms"] for answers in visits for answer in answers.values()]))
+
+
+def notch(ms: np.ndarray, shared: Sequence[float]) -> float:
+    """The uncertainty of the median of `ms` [n], one frame a round, `shared` being the mean of all settings
+    in each round.
+
+    >>> notch(np.array([10.0, 40.0, 20.0]), [1.0, 4.0, 2.0])  # slow rounds, but always ten times the mean
+    0.0
+    """
+    low, high = np.percentile(ms / np.asarray(shared), [25, 75])
+    return float(1.57 * (high - low) * np.mean(shared) / len(ms) ** 0.5)
 
 
 def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
@@ -95,7 +110,7 @@ def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
     return None if below == 0 else max(above / below, 0.0)
 
 
-def _times(answers: Sequence[dict[str, Any]], slope: float | None) -> Times:
+def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
     ms, march, head, fetches = (
         np.array([answer[key] for answer in answers], np.float64)
         for key in ("ms", "march_ms", "head_ms", "fetches")
@@ -106,6 +121,7 @@ def _times(answers: Sequence[dict[str, Any]], slope: float | None) -> Times:
         median=float(np.median(ms)),
         p95=float(np.percentile(ms, 95)),
         quartiles=(float(low), float(high)),
+        uncertainty=notch(ms, shared),
         frames=len(ms),
         march=float(march.mean()) - (lookups or 0.0),
         lookups=lookups,

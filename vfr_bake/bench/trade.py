@@ -25,7 +25,7 @@ from vfr_bake.bench.commands import bake_command, eval_command, play_command
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import Setting, Trade, conclude
 from vfr_bake.bench.settings import Plan, Size
-from vfr_bake.bench.timing import Times, measure_times
+from vfr_bake.bench.timing import Times, measure_times, notch
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.data import load_scene
 from vfr_bake.training.metrics import (
@@ -284,6 +284,7 @@ def _whole_frames(milliseconds: list[float]) -> Times:
         median=whole,
         p95=float(np.percentile(milliseconds, 95)),
         quartiles=(float(low), float(high)),
+        uncertainty=notch(np.array(milliseconds), [1.0] * len(milliseconds)),
         frames=len(milliseconds),
         march=0.0,
         lookups=None,

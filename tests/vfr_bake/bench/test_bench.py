@@ -214,7 +214,7 @@ def test_rounds_ask_everybody_in_turn() -> None:
     assert len(asked) == 3 * 2 * (1 + 2), "one frame of each visit is not counted"
     for visits in (asked[i : i + 6] for i in (0, 6, 12)):
         assert sorted({name for name, _ in visits}) == ["a", "b"]
-    assert times[0, 2, (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 3, 4.0, 0.0, 3.0, 13.0)
+    assert times[0, 2, (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 0.0, 3, 4.0, 0.0, 3.0, 13.0)
     assert times[1, 1, (8, 8)].uncertainty == 0
 
 
