@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -26,6 +27,20 @@ _FILES = {
     "density": "density.codes",
     "features": "features.codes",
 }
+
+
+_HEADER_ERRORS = (
+    ValueError,
+    EOFError,
+    OSError,
+    SyntaxError,
+    TypeError,
+    OverflowError,
+    RecursionError,
+    TokenError,
+)
+"""What numpy raises for broken .npy files; the last one where it tries the header again as Python 2 wrote
+it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +282,7 @@ def _digest(path: Path) -> str:
 def _map_array(path: Path) -> np.ndarray:
     try:
         array = np.lib.format.open_memmap(path, mode="r")
-    except (ValueError, EOFError, OSError, SyntaxError, TypeError) as error:
+    except _HEADER_ERRORS as error:
         raise FormatError(f"{path}: expected a numpy array, got something else: {error}") from error
     if not isinstance(array, np.memmap) or not array.flags.c_contiguous:
         raise FormatError(f"{path}: expected one plain array in C order")

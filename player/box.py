@@ -37,9 +37,11 @@ def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entri
         parallel = d == 0
         outside = parallel & ((o < 0) | (o > size))
         divisor = np.where(parallel, np.float32(1), d)
-        a, b = (0 - o) / divisor, (size - o) / divisor
+        with np.errstate(over="ignore"):  # nearly parallel: infinitely far away is the right answer
+            a, b = (0 - o) / divisor, (size - o) / divisor
         t_in = np.where(parallel, t_in, np.maximum(t_in, np.minimum(a, b)))
         t_out = np.where(parallel, t_out, np.minimum(t_out, np.maximum(a, b)))
         t_out[outside] = -np.inf
-    point = np.clip(point + t_in * direction, np.float32(0), size)
+    with np.errstate(over="ignore", invalid="ignore"):  # of rays that miss; nobody asks where
+        point = np.clip(point + t_in * direction, np.float32(0), size)
     return Entries(t_in, t_out - t_in, point, direction)

@@ -148,7 +148,9 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
         raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
     unknown = sorted(set(document) - known - {"format"})
     if unknown and version <= VERSION:
-        raise FormatError(f"{where}: {unknown[0]}: expected no such key in version {list(version)}")
+        raise FormatError(
+            f"{where}: {ascii(unknown[0])[1:81]}: expected no such key in version {list(version)}"
+        )
     values = {}
     for key, parse in _PARSERS.items():
         values[key] = parse(f"{where}: {key}", document[key])

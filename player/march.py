@@ -100,7 +100,8 @@ def collect_samples(
     """
     n_rays = len(entries.t)
     tau = np.zeros(n_rays, np.float32)
-    first, length = np.zeros(n_rays, np.int32), entries.length
+    longest = np.float32(grid.most_samples - 1) * grid.step
+    first, length = np.zeros(n_rays, np.int32), np.minimum(entries.length, longest)
     if bounds is not None:
         ahead = np.maximum(bounds[0] - entries.t, 0) / grid.step - np.float32(0.5)
         first = np.maximum(np.floor(np.minimum(ahead, np.float32(1e9))), 0).astype(np.int32)

@@ -50,11 +50,10 @@ def march(
     n_rays = len(rays_o)
     near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
     far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
-    diagonal = float(np.linalg.norm(grid.resolution / grid.cells_per_unit.astype(np.float64)))
     opacity, depth = np.zeros(n_rays, F32), np.zeros(n_rays, F32)
     counts, hits = np.zeros(n_rays, np.int32), np.empty(n_rays, np.int64)
     features = np.zeros((n_rays, grid.n_channels), F32)
-    capacity = int(diagonal / float(grid.step)) + 3
+    capacity = grid.most_samples
     origin, scale = tuple(grid.aabb_min), tuple(grid.cells_per_unit)
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
@@ -85,7 +84,8 @@ def _march_rays(settings, lookup, stored, rays, k, scratch, out):
         t_in, t_out = _slab(ox, dx, size, F32(0.0), F32(np.inf))
         t_in, t_out = _slab(oy, dy, size, t_in, t_out)
         t_in, t_out = _slab(oz, dz, size, t_in, t_out)
-        length = min(t_out - t_in, far[ray] - t_in)
+        longest = F32(len(scratch_s) - 1) * step  # the scratch holds no more, whatever the ray
+        length = min(min(t_out - t_in, longest), far[ray] - t_in)
         if not length > F32(0.0):
             continue
         first = math.floor(max(near[ray] - t_in, F32(0.0)) / step - F32(0.5))

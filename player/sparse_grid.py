@@ -60,6 +60,13 @@ class SparseGrid:
     def n_channels(self) -> int:
         return self.features.shape[1]
 
+    @property
+    def most_samples(self) -> int:
+        """Lattice places on the box's diagonal, and three for rounding: a march ends there, whatever the
+        ray."""
+        diagonal = float(np.linalg.norm(self.resolution / self.cells_per_unit.astype(np.float64)))
+        return int(diagonal / float(self.step)) + 3
+
 
 def build_grid(
     arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],

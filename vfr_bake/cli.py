@@ -1,4 +1,5 @@
-"""`vfr-train`, `vfr-bake` and `vfr-eval`: settings from the command line, bars on stderr, results on stdout.
+"""`vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench`: settings from the command line, bars on stderr,
+results on stdout.
 
 Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C.
 """
@@ -40,6 +41,11 @@ def bake_main(argv: Sequence[str] | None = None) -> int:
 def eval_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-eval`."""
     return _run("vfr-eval", lambda: _eval(_parse("vfr-eval", "Eval", argv)))
+
+
+def bench_main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `vfr-bench`."""
+    return _run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
 
 
 def _run(name: str, command: Callable[[], int]) -> int:
@@ -112,12 +118,8 @@ def _with_cameras(data: str) -> str:
 
     if not needs_cameras(data):
         return data
-    bars: dict[str, _Bar] = {}
-    report = estimate_cameras(
-        Path(data), lambda stage, done, of: bars.setdefault(stage, _Bar(stage)).count(done, of)
-    )
-    for bar in bars.values():
-        bar.close()
+    with _Bars() as bars:
+        report = estimate_cameras(Path(data), bars.count)
     print(f"vfr-train: {report.summary()}", file=sys.stderr)
     return str(report.folder)
 
@@ -227,15 +229,8 @@ def _bake(options: Any) -> int:
         f"{plan.resolution} cells per axis, {plan.n_rays:,} rays to learn from",
         file=sys.stderr,
     )
-    bars: dict[str, _Bar] = {}
-
-    def report(stage: str, done: int, of: int) -> None:
-        bar = bars.setdefault(stage, _Bar(stage))
-        bar.count(done, of)
-        if done >= of:
-            bar.close()
-
-    result = bake(model, options.asset, options.config, report, options.force)
+    with _Bars() as bars:
+        result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6
     figures = {
         "asset": str(options.asset),
@@ -301,6 +296,25 @@ def _eval(options: Any) -> int:
     return 0
 
 
+def _bench(options: Any) -> int:
+    from vfr_bake.bench.page import table_lines, trade_page
+    from vfr_bake.bench.settings import plan_of
+    from vfr_bake.bench.trade import measure_trade
+    from vfr_bake.training.lpips import Lpips
+
+    plan = plan_of(options)
+    for target in (options.html, options.json):
+        if target is not None and str(target) != "-":
+            check_target(target, options.force)
+    lpips = None if options.lpips is None else Lpips(options.lpips)
+    with _Bars() as bars:
+        trade = measure_trade(plan, lpips, bars.count)
+    if options.html is not None:
+        write_bytes(options.html, trade_page(trade))
+    _result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))
+    return 0
+
+
 def _finite(figures: dict[str, Any]) -> dict[str, Any]:
     """None for infinite figures: the PSNR of equal pictures has no number in JSON."""
     from math import inf
@@ -323,6 +337,26 @@ def _result(target: Path | None, figures: dict[str, Any], sentence: str) -> None
     if target is not None:
         write_bytes(target, text.encode())
     print(sentence)
+
+
+class _Bars:
+    """One bar after the other, by what is being done."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, _Bar] = {}
+
+    def __enter__(self) -> _Bars:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for bar in self._bars.values():
+            bar.close()
+
+    def count(self, what: str, done: int, of: int) -> None:
+        bar = self._bars.setdefault(what, _Bar(what))
+        bar.count(done, of)
+        if done >= of:
+            bar.close()
 
 
 class _Bar:

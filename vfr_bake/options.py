@@ -1,5 +1,5 @@
-"""What the command lines of `vfr-train`, `vfr-bake` and `vfr-eval` take; `tyro` makes the parsers out of
-it."""
+"""What the command lines of `vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench` take; `tyro` makes the
+parsers out of it."""
 
 from __future__ import annotations
 
@@ -69,3 +69,38 @@ class Eval:
     pictures: Path | None = None
     """Also write photograph | rendered | error map of every view to this folder, replacing files of equal
     name. The error map is black for none, white for a difference of a quarter of the range or more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure what baked assets of one scene give and take: quality, time, size, memory, for every number of
+    lookups a ray.
+
+    Prints the Pareto front, with the commands that bake and play its settings, and what to choose.
+    """
+
+    assets: Positional[tuple[Path, ...]]
+    """Folders of assets of one scene."""
+    data: str
+    """The data set, as for vfr-train: its test views are compared."""
+    model: Path | None = None
+    """Also measure this full model, and count losses from it."""
+    views: int = 8
+    """Test views, spread evenly."""
+    sizes: tuple[str, ...] = ()
+    """Sizes of the timed frames, for example 400x400 800x800; the photographs' own, half and twice of it if
+    none is given. The front is drawn for the photographs' own, which is always measured."""
+    samples: tuple[int, ...] = (1, 2, 3, 4, 5, 8, 12, 16, 32, 0)
+    """Numbers of lookups a ray, 0 for every sample; the assets' own is always among them."""
+    frames: int = 20
+    """Timed frames of each setting and size."""
+    threads: int | None = None
+    """Threads of the player; one for each core if not given."""
+    lpips: Literal["alex", "vgg"] | None = None
+    """Also measure LPIPS with this network, whose weights have to be on this machine."""
+    html: Path | None = None
+    """Also write a page with plots, and where the loss sits, to this file."""
+    json: Path | None = None
+    """Also write everything as JSON to this file; - for stdout, instead of the table."""
+    force: bool = False
+    """Replace the files if they exist."""

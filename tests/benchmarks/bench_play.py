@@ -12,9 +12,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,24 +25,7 @@ from player.options import _positive, _size
 from player.play import peak_rss_mb
 from player.render import Renderer
 from player.transforms import read_cameras
-
-
-class Clock:
-    """Time spent in a function, over all threads."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.seconds = 0.0
-        self._function = function
-        self._lock = threading.Lock()
-
-    def __call__(self, *arguments: Any) -> Any:
-        start = time.perf_counter()
-        try:
-            return self._function(*arguments)
-        finally:
-            passed = time.perf_counter() - start
-            with self._lock:
-                self.seconds += passed
+from vfr_bake.bench.process import Clock
 
 
 def measure(asset: Asset, cameras: list, name: Any, n_threads: int | None, k: int | None) -> np.ndarray:

@@ -1,0 +1,22 @@
+"""A box full of one density and one feature, 16 cells across, in steps of an eighth of a cell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from player.bricks import pack_vertices
+from player.sparse_grid import SparseGrid, build_grid
+
+RESOLUTION = 16
+FEATURE = 100
+
+
+def fog(optical: float, resolution: int = RESOLUTION, step: float = 2 / 128) -> SparseGrid:
+    """`optical` is the optical depth of one step; 0 is the least that a manifest can say."""
+    vertices = np.argwhere(np.ones((resolution + 1,) * 3))
+    coords, masks, _ = pack_vertices(vertices)
+    low = -80.0 if optical == 0 else float(np.clip(np.log(optical / step), -80, 79))
+    codes = np.zeros(len(vertices), np.uint8)
+    features = np.full((len(vertices), 1), FEATURE, np.int8)
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    return build_grid((coords, masks, codes, features), resolution, box, step, (low, low + 1))

@@ -1,0 +1,204 @@
+"""Density and optical depth at their ends: the kernel, its twin, the GPU's torch and the player, against
+mpmath with 50 digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+
+from player import march, march_compiled
+from player.few_samples import Samples, equal_mass_bins
+from player.march import MAX_TAU
+from vfr_bake.field.density import LARGEST_LOGIT, TruncatedExp
+from vfr_bake.rendering.compositing import composite, composite_reference
+from vfr_bake.torch_kernels.compositing import composite as composite_torch
+
+Composite = Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
+COMPOSITES = [
+    pytest.param(composite, id="numba"),
+    pytest.param(composite_reference, id="twin"),
+    pytest.param(composite_torch, id="torch"),
+]
+DTYPES = [torch.float32, torch.float64]
+mpmath.mp.dps = 50
+
+DEPTHS: dict[str, list[float]] = {
+    "none": [],
+    "nothing": [0.0, 0.0, 0.0],
+    "one": [0.7],
+    "subnormal": [1e-42, 1e-40, 2e-39],
+    "1e-8 to 1e8": [1e-8, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e8],
+    "1e8 to 1e-8": [1e8, 1e4, 1e2, 1.0, 1e-2, 1e-8],
+    "opaque first": [1e6, 1.0, 0.5],
+    "opaque last": [1e-3, 0.2, 1e6],
+    "10,000 thin": [1e-7] * 10_000,
+    "10,000 thin, dense after": [1e-5] * 10_000 + [3.0],
+    "growing": [2.0**-i for i in range(40, 0, -1)],
+}
+
+
+@cache
+def exact(depths: tuple[float, ...]) -> tuple[list[mpmath.mpf], mpmath.mpf]:
+    """Weights and opacity."""
+    tau, weights = mpmath.mpf(0), []
+    for depth in depths:
+        weights.append(mpmath.exp(-tau) * -mpmath.expm1(-mpmath.mpf(depth)))
+        tau += mpmath.mpf(depth)
+    return weights, -mpmath.expm1(-tau)
+
+
+def one_ray(function: Composite, depths: torch.Tensor, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    n = len(depths)
+    return function(depths, features, torch.ones_like(depths), torch.tensor([0]), torch.tensor([n]))
+
+
+@pytest.mark.parametrize("function", COMPOSITES)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", DEPTHS)
+def test_weights_are_those_of_50_digits(function: Composite, dtype: torch.dtype, name: str) -> None:
+    """Relative error of a weight: a rounding in each sum of depths before it, times the depth, and four of
+    its own; below the least normal number nothing is promised, and less than it is lost."""
+    depths = torch.tensor(DEPTHS[name], dtype=dtype)
+    _, opacity, weights = one_ray(function, depths, torch.ones(len(depths), 1, dtype=dtype))
+    expected, alpha = exact(tuple(depths.tolist()))
+    unit, tiny = torch.finfo(dtype).eps, torch.finfo(dtype).tiny
+    tau = np.cumsum(np.minimum(depths.double().numpy(), 1e3))
+    for i, (ours, wanted) in enumerate(zip(weights.tolist(), expected, strict=True)):
+        allowed = float(wanted) * unit * (4 + (i + 1) * min(float(tau[i]), 800.0)) + tiny
+        assert abs(mpmath.mpf(ours) - wanted) <= allowed, (i, ours, float(wanted))
+    total = math.fsum(weights.tolist())
+    assert abs(mpmath.mpf(opacity[0].item()) - alpha) <= unit * (2 + len(depths)) * float(alpha) + tiny
+    assert abs(total - opacity[0].item()) <= 2 * unit * max(len(depths), 1) * total + tiny, "2 ulp a sample"
+
+
+@pytest.mark.parametrize("function", COMPOSITES)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", [name for name in DEPTHS if len(DEPTHS[name]) < 100])
+def test_gradients_are_those_of_50_digits(function: Composite, dtype: torch.dtype, name: str) -> None:
+    """Of L = sum_c g_c F_c + a A + sum_i v_i w_i: dL/d d_i = T_{i+1} u_i - sum_{j>i} w_j u_j + a exp(-tau),
+    with u_i = v_i + g.F_i."""
+    torch.manual_seed(0)
+    depths = torch.tensor(DEPTHS[name], dtype=dtype, requires_grad=True)
+    features = torch.randn(len(depths), 3, dtype=dtype, requires_grad=True)
+    out, opacity, weights = one_ray(function, depths, features)
+    g, a = torch.randn(3, dtype=dtype), 0.75
+    v = torch.randn(len(depths), dtype=dtype)
+    ((out[0] * g).sum() + a * opacity[0] + (v * weights).sum()).backward()
+    w, alpha = exact(tuple(depths.tolist()))
+    inner = [mpmath.mpf(x) for x in (v.double() + features.detach().double() @ g.double()).tolist()]
+    tau, through = mpmath.mpf(0), []
+    for depth in depths.tolist():
+        tau += mpmath.mpf(depth)
+        through.append(mpmath.exp(-tau))
+    unit = torch.finfo(dtype).eps
+    for i in range(len(depths)):
+        behind = mpmath.fsum(w[j] * inner[j] for j in range(i + 1, len(depths)))
+        wanted = through[i] * inner[i] - behind + a * (1 - alpha)
+        assert abs(mpmath.mpf(depths.grad[i].item()) - wanted) <= 60 * unit * (1 + len(depths))
+        for c in range(3):
+            of_feature = mpmath.mpf(features.grad[i, c].item())
+            assert abs(of_feature - w[i] * mpmath.mpf(g[c].item())) <= 30 * unit * (1 + len(depths))
+
+
+@pytest.mark.parametrize("function", COMPOSITES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_two_half_steps_are_one_step(function: Composite, dtype: torch.dtype) -> None:
+    torch.manual_seed(1)
+    sigmas = torch.exp(torch.empty(200, dtype=dtype).uniform_(-20, 4))
+    features = torch.rand(200, 2, dtype=dtype)
+    whole = one_ray(function, sigmas, features)
+    half = one_ray(function, sigmas.repeat_interleave(2) / 2, features.repeat_interleave(2, dim=0))
+    unit = torch.finfo(dtype).eps
+    torch.testing.assert_close(half[0], whole[0], rtol=400 * unit, atol=0)
+    torch.testing.assert_close(half[1], whole[1], rtol=400 * unit, atol=0)
+    torch.testing.assert_close(
+        half[2].reshape(-1, 2).sum(1), whole[2], rtol=10 * float(sigmas.sum()) * unit, atol=0
+    )
+
+
+@pytest.mark.parametrize("function", COMPOSITES)
+def test_a_nan_stays_in_its_ray(function: Composite) -> None:
+    """One bad cell spoils the rays that meet it, which the optimiser then skips, and no other."""
+    sigmas = torch.tensor([1.0, 2.0, math.nan, 1.0, 3.0, 0.5], requires_grad=True)
+    features = torch.ones(6, 2, requires_grad=True)
+    starts, counts = torch.tensor([0, 2, 4]), torch.tensor([2, 2, 2])
+    out, opacity, weights = function(sigmas, features, torch.ones(6), starts, counts)
+    assert torch.isnan(opacity[1]) and torch.isfinite(opacity[[0, 2]]).all()
+    assert torch.isfinite(out[[0, 2]]).all() and torch.isfinite(weights[[0, 1, 4, 5]]).all()
+    (out[[0, 2]].sum() + opacity[[0, 2]].sum()).backward()
+    assert torch.isfinite(sigmas.grad[[0, 1, 4, 5]]).all()
+    clean = function(sigmas.detach()[:2], features[:2], torch.ones(2), starts[:1], counts[:1])
+    assert torch.equal(out[0], clean[0][0])
+
+
+@pytest.mark.parametrize("logit", [math.inf, -math.inf, 1e30, -1e30, 15.0, np.nextafter(15.0, 16.0), -15.0])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_an_infinite_pre_activation_is_clamped(logit: float, dtype: torch.dtype) -> None:
+    """The densest is opaque in one step, the gradient is that of the clamped value: it can come back."""
+    x = torch.tensor([logit], dtype=dtype, requires_grad=True)
+    y = TruncatedExp.apply(x)
+    y.sum().backward()
+    wanted = math.exp(min(max(float(x.item()), -LARGEST_LOGIT), LARGEST_LOGIT))
+    assert y.item() == pytest.approx(wanted, rel=4 * torch.finfo(dtype).eps)
+    assert x.grad is not None and x.grad.item() == y.item()
+
+
+def test_a_nan_pre_activation_stays_one() -> None:
+    """It is not hidden: the loss becomes NaN, and the step is skipped and counted."""
+    assert math.isnan(TruncatedExp.apply(torch.tensor([math.nan])).item())
+
+
+# --- the player ---
+
+
+@pytest.mark.parametrize("tau", [0.0, 1e-45, 1e-38, 1e-20, 1e-8, 9.99e-6, 1e-5, 1.01e-5, 1e-3, 0.5, 6.9, 1e6])
+def test_the_players_opacity_is_that_of_50_digits(tau: float) -> None:
+    ours = float(march_compiled._opacity(np.float32(tau)))
+    wanted = -mpmath.expm1(-mpmath.mpf(float(np.float32(tau))))
+    assert abs(mpmath.mpf(ours) - wanted) <= 2**-23 * float(wanted) + 2e-45
+    assert 0 <= ours <= 1
+
+
+@pytest.mark.parametrize("module", [march, march_compiled], ids=["numpy", "numba"])
+@pytest.mark.parametrize(
+    "optical", [0.0, 1e-38, 1e-8, 1e-4, 0.09, 0.0999, 0.1001, 0.5, 6.0, 7.0, 1e3, 1e6], ids=str
+)
+def test_a_fog_of_one_density(module: object, optical: float) -> None:
+    """A box of one density along x: tau is samples times optical, the march stops behind MAX_TAU, and the
+    weights are those of 50 digits."""
+    from tests.numerics.fog import fog
+
+    grid = fog(optical)
+    rays = np.float32([[-3, 0.05, 0.05]]), np.float32([[1, 0, 0]])
+    result = module.march(grid, *rays, 0)  # type: ignore[attr-defined]
+    step_tau = float(np.exp(np.float64(grid.density_low)) * np.float64(grid.step))
+    limit = float(MAX_TAU)
+    inside = round(2 / float(grid.step))
+    taken = inside if step_tau == 0 else min(inside, math.floor(limit / step_tau) + 1)
+    assert abs(int(result.n_samples[0]) - taken) <= 1
+    wanted = -mpmath.expm1(-mpmath.mpf(step_tau) * int(result.n_samples[0]))
+    assert abs(mpmath.mpf(float(result.opacity[0])) - wanted) <= 1e-5 * float(wanted) + 1e-44
+    if len(result.hits):  # one constant feature: the weights' sum
+        total = float(result.features[0, 0]) / 100
+        assert total == pytest.approx(float(result.opacity[0]), rel=2 * 2**-23 * taken + 1e-6)
+
+
+@pytest.mark.parametrize(
+    "weights", [[1e-38, 1.0, 1e-38], [1.0, 1e-45, 1.0], [1.0] * 7, [2.0**-i for i in range(60)]]
+)
+def test_bins_of_ties_and_of_weights_below_resolution(weights: list[float]) -> None:
+    """Equal masses keep the mean to float64, however small the parts."""
+    s = np.arange(1, len(weights) + 1, dtype=np.float32)
+    w = np.float32(weights)
+    samples = Samples(np.zeros(len(s), np.int64), s, w)
+    k = 2
+    bins = equal_mass_bins(samples, k)
+    mean = math.fsum((w.astype(np.float64) * s).tolist()) / math.fsum(w.astype(np.float64).tolist())
+    assert bins.s.mean() == pytest.approx(mean, rel=1e-6)
+    assert (np.diff(bins.s) >= 0).all() and bins.s.min() >= 1 and bins.s.max() <= len(s)

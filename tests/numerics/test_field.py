@@ -1,0 +1,175 @@
+"""Contraction, spherical harmonics and hash grid at their ends, against mpmath and float64 loops."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from exporters.spherical_harmonics import MAX_DEGREE, sh_monomials
+from tests.reference import hash_grid_feature, spherical_harmonics
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.hash_grid import HashGrid
+from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+from vfr_bake.kernels.contraction import contracted_unit
+from vfr_bake.torch_kernels.hash_grid import encode
+from vfr_bake.torch_kernels.proposals import contracted_unit as contracted_torch
+
+mpmath.mp.dps = 50
+ONE = np.float32(1)
+UNIT = 2.0**-24
+
+
+def exact_contraction(point: tuple[float, ...]) -> list[float]:
+    """u = (c(x) + 2) / 4 with 50 digits."""
+    x = [mpmath.mpf(c) for c in point]
+    norm = mpmath.sqrt(mpmath.fsum(c * c for c in x))
+    scale = mpmath.mpf(1) if norm <= 1 else (2 - 1 / norm) / norm
+    return [float((c * scale + 2) / 4) for c in x]
+
+
+AROUND_ONE = [float(np.nextafter(ONE, np.float32(side))) for side in (0, 2)]
+SIZES = [0.0, 1e-45, 1e-38, 1e-20, 0.5, *AROUND_ONE, 1.0, 2.0, 1e4, 1e15, 1e19, 1e20, 1e30, 3e38]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (0.6, 0, -0.8), (-0.5, 0.5, 0.70710678)])
+def test_contraction_is_equation_10_with_50_digits(size: float, direction: tuple[float, ...]) -> None:
+    point = np.float32(np.array(direction) * size)
+    wanted = exact_contraction(tuple(point.tolist()))
+    numba = contracted_unit(*point, ONE)
+    torched = contracted_torch(torch.from_numpy(point)[None])[0].tolist()
+    for ours in (numba, torched):
+        np.testing.assert_allclose(ours, wanted, rtol=0, atol=4 * UNIT)
+        assert all(-UNIT <= c <= 1 + 2 * UNIT for c in ours), "lookups clamp the cell, see below"
+
+
+@given(st.tuples(*[st.floats(-2, 2, width=32)] * 3))
+def test_contraction_keeps_the_order_along_a_ray(point: tuple[float, ...]) -> None:
+    """Twice as far away is farther out, across the unit sphere too."""
+    if math.hypot(*point) < 1e-3:
+        return
+    once = contracted_unit(*np.float32(point), ONE)
+    twice = contracted_unit(*np.float32([2 * c for c in point]), ONE)
+    size = [math.dist(u, (0.5, 0.5, 0.5)) for u in (once, twice)]
+    assert size[0] <= size[1] + 4 * UNIT and size[1] <= 0.5 + 4 * UNIT
+
+
+POLES = np.concatenate([np.eye(3), -np.eye(3)])
+NEAR_POLES = np.array([[1e-8, 0, 1], [0, -1e-20, -1], [1e-30, 1e-30, 1], [-0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("degree", range(1, MAX_DEGREE + 1))
+def test_harmonics_at_the_poles(degree: int) -> None:
+    """At a pole only m = 0 is left; float32 by torch is within 2e-5 of float64, coefficients being up to 200
+    with powers up to 7."""
+    dirs = np.concatenate([POLES, NEAR_POLES])
+    exponents, coefficients = sh_monomials(degree)
+    ours = np.prod(dirs[:, None, :] ** exponents, axis=-1) @ coefficients
+    np.testing.assert_allclose(ours, spherical_harmonics(dirs, degree), rtol=0, atol=1e-7)
+    single = SphericalHarmonics(degree)(torch.from_numpy(dirs).float()).double().numpy()
+    np.testing.assert_allclose(single, ours, rtol=0, atol=2e-5)
+    for row in (ours[2], ours[5]):
+        others = [row[band * band + band + m] for band in range(degree) for m in range(-band, band + 1) if m]
+        assert not np.any(others)
+
+
+def test_harmonics_are_orthonormal_in_float32() -> None:
+    """By quadrature that is exact for the products; what training computes, summed in float64."""
+    z, weight_z = np.polynomial.legendre.leggauss(MAX_DEGREE)
+    phi = np.arange(2 * MAX_DEGREE) * (np.pi / MAX_DEGREE)
+    z, phi = (axis.ravel() for axis in np.meshgrid(z, phi, indexing="ij"))
+    root = np.sqrt(1 - z**2)
+    dirs = np.stack([root * np.cos(phi), root * np.sin(phi), z], axis=-1)
+    y = SphericalHarmonics(MAX_DEGREE)(torch.from_numpy(dirs).float()).double().numpy()
+    weights = np.repeat(weight_z, 2 * MAX_DEGREE) * (np.pi / MAX_DEGREE)
+    np.testing.assert_allclose(y.T @ (weights[:, None] * y), np.eye(MAX_DEGREE**2), rtol=0, atol=1e-4)
+
+
+def small_grid(dtype: torch.dtype, resolution: int) -> HashGrid:
+    torch.manual_seed(3)
+    config = FieldConfig(n_levels=3, base_resolution=4, max_resolution=resolution, log2_table_size=12)
+    grid = HashGrid(config).to(dtype)
+    torch.nn.init.uniform_(grid.table, -1, 1)
+    return grid
+
+
+def hard_coordinates(resolution: int) -> list[float]:
+    """0, 1, cell borders and the numbers beside them."""
+    borders = [0.0, 1 / resolution, 0.25, 0.5, (resolution - 1) / resolution, 1.0]
+    beside = [float(np.nextafter(np.float32(b), np.float32(to))) for b in borders for to in (0, 1)]
+    return sorted({float(np.float32(c)) for c in [*borders, *beside, 1e-45, 1e-30]})
+
+
+@pytest.mark.parametrize("resolution", [40, 512, 4096])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
+    """Of the position as the type holds it: at a resolution of N a position is off by N 2^-24 cells."""
+    grid = small_grid(dtype, resolution)
+    some = hard_coordinates(resolution)
+    random = np.random.default_rng(0)
+    points = np.stack([random.permutation(some) for _ in range(3)], axis=1)
+    points = np.concatenate([points, np.repeat(np.array(some)[:, None], 3, axis=1)])
+    table = grid.table.detach().double().numpy()
+    layout = grid.layout
+    wanted = np.stack(
+        [hash_grid_feature(p, table, layout.resolutions, layout.offsets, 2**12) for p in points]
+    )
+    tensor = torch.from_numpy(points).to(dtype)
+    unit = torch.finfo(dtype).eps
+    for ours in (grid(tensor), grid.reference(tensor), encode(tensor, grid.table, layout.levels(grid.table))):
+        np.testing.assert_allclose(ours.detach().numpy(), wanted, rtol=0, atol=12 * unit * resolution)
+
+
+def test_hash_grid_does_not_jump_at_a_cell_border() -> None:
+    """On both sides of every border of the finest level the features differ by the step times the slope."""
+    grid = small_grid(torch.float32, 4096)
+    borders = np.arange(1, 4096, 7, dtype=np.float64) / 4096
+    sides = []
+    for to in (0, 1):
+        x = np.nextafter(borders.astype(np.float32), np.float32(to))
+        sides.append(grid(torch.from_numpy(np.stack([x, np.full_like(x, 0.3), np.full_like(x, 0.7)], 1))))
+    jump = (sides[0] - sides[1]).detach().abs().max().item()
+    assert jump <= 2 * 4096 * 2.0**-23 * 2 * 2, "two ulps apart, entries within 1, two axes' rounding"
+
+
+def test_points_a_rounding_outside_the_cube_are_served_from_its_last_cell() -> None:
+    """What contraction makes of points very far away, 2^-24 outside; the features differ by no more."""
+    grid = small_grid(torch.float32, 4096)
+    inside = torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 0.0]])
+    outside = torch.tensor([[-UNIT, 1 + 2 * UNIT, 0.5], [1 + 2 * UNIT, 1.0, -UNIT]])
+    table = grid.table
+    for function in (grid, grid.reference, lambda x: encode(x, table, grid.layout.levels(table))):
+        off = (function(outside) - function(inside)).detach().abs().max().item()
+        assert off <= 2 * 2 * 4096 * 3 * UNIT
+
+
+def test_gradient_of_the_table_at_borders_is_autograds() -> None:
+    grid = small_grid(torch.float64, 512)
+    coordinates = torch.tensor(hard_coordinates(512), dtype=torch.float64)
+    points = torch.stack([coordinates, coordinates.flip(0), coordinates], dim=1)
+    upstream = torch.randn(len(points), 6, dtype=torch.float64)
+    grads = [
+        torch.autograd.grad(values, grid.table, upstream)[0]
+        for values in (grid(points), grid.reference(points))
+    ]
+    torch.testing.assert_close(grads[0], grads[1], rtol=0, atol=1e-12)
+
+
+def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
+    """x xor y 2654435761 xor z 805459861, in Python's integers, at vertices whose products need 53 bits."""
+    size = 2**12
+    vertices = [(0, 0, 0), (1, 2**20, 2**20), (2**20, 2**20 - 1, 1), (2**21, 2**21, 2**21 - 1)]
+    grid = small_grid(torch.float32, 4096)
+    level = 2
+    assert grid.layout.hashed[level]
+    for x, y, z in vertices:
+        wanted = (x ^ (y * 2654435761) ^ (z * 805459861)) % size
+        row = grid._rows(torch.tensor([[x, y, z]]), level) - int(grid.layout.offsets[level])
+        assert row.item() == wanted
+        assert max(y * 2654435761, z * 805459861) < 2**63

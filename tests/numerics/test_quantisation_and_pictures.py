@@ -1,0 +1,223 @@
+"""Codes, heads and pictures at their ends, and what must not change a picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from exporters.colour import linear_from_srgb, srgb_from_linear
+from player import march, march_compiled
+from player.asset import Asset, GridArrays
+from player.bricks import pack_vertices
+from player.density import decode_density, encode_density
+from player.packing import pack_codes, unpack_codes
+from player.render import Frame, Renderer, render
+from player.sparse_grid import SparseGrid, build_grid
+from player.transforms import read_cameras
+from tests.numerics.fog import fog
+from tests.player.conftest import RESOLUTION, STEP, shells
+from vfr_bake.baking.projection import code_scales, encode_features
+
+MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
+BOX = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+# --- codes ---
+
+
+@given(st.floats(-80, 79), st.floats(1e-2, 160))
+def test_every_density_code_comes_back(low: float, width: float) -> None:
+    """From the float32 densities that a player computes, in any range that a manifest can say."""
+    high = min(low + width, 80.0)
+    codes = np.arange(256)
+    sigmas = decode_density(codes, (low, high)).astype(np.float64)
+    # float32: the exponent is rounded to 80 * 2^-24, which is a step of the code in the narrowest ranges
+    wrong = np.abs(encode_density(np.log(sigmas), (low, high)).astype(int) - codes)
+    assert wrong.max() <= (0 if high - low > 0.01 * 255 * 80 * 2**-22 else 1)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-38, 1e-30, 1.0, 1e30, 1e300])
+@pytest.mark.parametrize("levels", [7, 31, 63, 127])
+def test_every_feature_code_comes_back(scale: float, levels: int) -> None:
+    codes = np.arange(-levels, levels + 1)[:, None]
+    values = codes * (scale / levels)
+    step = code_scales(values, levels)
+    assert np.isfinite(step).all() and (step > 0).all()
+    assert encode_features(values / step).astype(int).tolist() == codes.tolist()
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-320, 5.0, -1e30])
+def test_a_constant_channel_keeps_its_value(value: float) -> None:
+    values = np.full((9, 1), value)
+    step = code_scales(values, 127)
+    kept = encode_features(values / step) * step
+    # a step of 1e-320 / 127 has seven bits left
+    np.testing.assert_allclose(kept, values, rtol=1e-2 if 0 < abs(value) < 1e-300 else 1e-6)
+
+
+def test_what_is_out_of_range_is_clipped_not_wrapped() -> None:
+    assert encode_features(np.array([-1e9, -127.6, 127.6, 1e9])).tolist() == [-127, -127, 127, 127]
+
+
+@given(st.lists(st.integers(0, 255), max_size=300), st.integers(1, 4))
+def test_packed_codes_come_back(values: list[int], n_channels: int) -> None:
+    codes = np.array(values * n_channels, np.uint8).reshape(-1, n_channels)
+    assert np.array_equal(unpack_codes(pack_codes(codes), codes.shape, "u1", "codes"), codes)
+
+
+# --- bricks ---
+
+
+def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
+    """Density code and features that grow by one a vertex along an axis: linear across every brick border."""
+    vertices = np.argwhere(np.ones((resolution + 1,) * 3))
+    coords, masks, order = pack_vertices(vertices)
+    values = vertices[order][:, axis] + shift
+    codes, features = (values + 100).astype(np.uint8), values.astype(np.int8)[:, None]
+    return build_grid((coords, masks, codes, features), resolution, BOX, 0.01, (-4.0, 5.0))
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
+    """Density is found from the opacity of rays one sample long, features by one fetch, at places all over
+    the bricks' borders; a shift by half a voxel would be half a code off."""
+    resolution = 24
+    grid = ramp(resolution, axis)
+    random = np.random.default_rng(0)
+    places = random.uniform(0.1, 23.9, (400, 3))
+    places[:200, axis] = random.choice([8, 16], 200) + random.uniform(-1e-2, 1e-2, 200)
+    rays_o = (places * 2 / resolution - 1).astype(np.float32)
+    d = np.zeros(3, np.float32)
+    d[(axis + 1) % 3] = 1
+    step = float(grid.step)
+    near, far = np.zeros(400, np.float32), np.full(400, 0.75 * step, np.float32)
+    result = module.march(grid, rays_o, np.tile(d, (400, 1)), 0, (near, far))
+    assert result.n_samples.tolist() == [1] * 400
+    sigma = -np.log1p(-result.opacity.astype(np.float64)) / step
+    code = (np.log(sigma) + 4) * 255 / 9
+    at = rays_o[:, axis].astype(np.float64) * resolution / 2 + resolution / 2
+    # float32 opacities, relative 1e-6, a code being 9 / 255 of a logarithm
+    np.testing.assert_allclose(code, at + 100, rtol=0, atol=2e-3)
+    hits = result.hits
+    assert len(hits) > 20
+    features = result.features[:, 0] / result.opacity[hits]
+    np.testing.assert_allclose(features, at[hits], rtol=0, atol=1e-4)
+    shifted = module.march(ramp(resolution, axis, 1), rays_o, np.tile(d, (400, 1)), 0, (near, far))
+    other = shifted.features[:, 0] / shifted.opacity[shifted.hits]
+    assert np.abs(other - at[shifted.hits] - 1).max() < 1e-4, "and a shift of a voxel shows as one code"
+
+
+# --- choice of samples ---
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("optical", [1e-4, 0.01, 0.3, 5.0])
+def test_k_changes_no_bit_of_the_opacity(module: ModuleType, optical: float) -> None:
+    grid = fog(optical)
+    rays_o = np.float32(np.random.default_rng(0).uniform(-0.9, 0.9, (50, 3)))
+    rays_o[:, 0] = -3
+    rays_d = np.tile(np.float32([1, 0, 0]), (50, 1))
+    results = [module.march(grid, rays_o, rays_d, k) for k in (0, 1, 2, 5, 1000)]
+    for result in results[1:]:
+        assert result.opacity.tobytes() == results[0].opacity.tobytes()
+        np.testing.assert_allclose(result.features, results[0].features, rtol=2e-5, atol=0)
+
+
+# --- pictures ---
+
+
+def test_8_bit_rounding_at_every_joint() -> None:
+    """A level begins half a level below it, in float32."""
+    joints = (np.arange(255) + 0.5) / 255
+    below, above = (joints - 1e-6).astype(np.float32), (joints + 1e-6).astype(np.float32)
+    for values, levels in ((below, np.arange(255)), (above, np.arange(1, 256))):
+        rgb = np.repeat(values[:, None, None], 3, axis=2)
+        zeros = np.zeros((255, 1), np.float32)
+        frame = Frame(rgb, zeros, zeros, zeros, (0.0, 0.0, 0.0))
+        assert (frame.to_uint8()[:, 0, 0] == levels).all()
+
+
+def test_srgb_at_its_joint() -> None:
+    for joint, curve in ((0.04045, linear_from_srgb), (0.0031308, srgb_from_linear)):
+        values = np.nextafter(joint, [0, joint, 1])
+        low, at, high = curve(values)
+        assert low <= at <= high + 1e-7 and high - low < 1e-6
+    values = np.linspace(0, 1, 4001)
+    np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(values)), values, rtol=0, atol=1e-7)
+    assert (np.diff(linear_from_srgb(values)) > 0).all()
+
+
+@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(colour=st.tuples(*[st.floats(0, 1, width=32)] * 3))
+def test_background_and_opacity_compose(colour: tuple[float, ...], shells_asset: Asset) -> None:
+    """Over any background the picture is the one over black plus what shows through."""
+    camera = read_cameras(shells_asset.path("cameras.json"))[0].resized(40, 30)
+    black = render(shells_asset, camera, background=(0.0, 0.0, 0.0), march="numba")
+    over = render(shells_asset, camera, background=colour, march="numba")
+    wanted = black.rgb + (1 - black.opacity[..., None]) * np.float32(colour)
+    np.testing.assert_allclose(over.rgb, wanted, rtol=0, atol=3e-7)
+    assert over.opacity.tobytes() == black.opacity.tobytes()
+
+
+# --- invariance ---
+
+
+@pytest.fixture(scope="module")
+def shells_asset(shells_folder) -> Asset:
+    return Asset.open(shells_folder)
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(move=st.tuples(*[st.floats(-50, 50)] * 3), scale=st.floats(0.01, 100), quarter=st.integers(0, 3))
+def test_scene_and_cameras_moved_together_look_the_same(
+    move: tuple[float, ...], scale: float, quarter: int, shells_asset: Asset
+) -> None:
+    """The asset is placed elsewhere in the world, turned by quarters and scaled; the camera goes with it."""
+    turn = np.eye(4)
+    c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter]
+    turn[:2, :2] = [[c, -s], [s, c]]
+    turn[:3, :3] *= scale
+    turn[:3, 3] = move
+    placed = turn @ np.array(shells_asset.manifest.world_from_model)
+    manifest = replace(shells_asset.manifest, world_from_model=tuple(map(tuple, placed.tolist())))
+    moved = Asset(shells_asset.folder, manifest, shells_asset.arrays)
+    camera = read_cameras(shells_asset.path("cameras.json"))[1].resized(40, 30)
+    with Renderer(shells_asset, 1, "numba") as a, Renderer(moved, 1, "numba") as b:
+        one, other = a.render(camera), b.render(camera.transformed(turn))
+    # rays in the model frame are the same up to float64 rounding of 50 units, seen as 1e-5 of a colour
+    assert np.abs(one.rgb - other.rgb).max() < 0.02 and np.abs(one.rgb - other.rgb).mean() < 1e-5
+    assert np.abs(one.opacity - other.opacity).mean() < 1e-6
+    np.testing.assert_allclose(other.depth, one.depth * scale, rtol=2e-3, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("module", MARCHES)
+def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleType) -> None:
+    """x -> y, y -> -x: vertices and rays turn, bricks and skips are others, the pictures are not."""
+    vertices, codes, features = shells()
+    turned = np.stack([RESOLUTION - vertices[:, 1], vertices[:, 0], vertices[:, 2]], axis=1)
+    _, _, order = pack_vertices(turned)
+    grids = []
+    for points, which in ((vertices, np.arange(len(vertices))), (turned, order)):
+        c, m, _ = pack_vertices(points)
+        arrays = GridArrays(c, m, codes[which], features[which])
+        grids.append(build_grid((c, m, arrays.density, arrays.features), RESOLUTION, BOX, STEP, (-2.0, 6.0)))
+    random = np.random.default_rng(0)
+    rays_o = random.normal(size=(500, 3)).astype(np.float32) * 2
+    rays_d = random.uniform(-1, 1, (500, 3)) - rays_o
+    rays_d = (rays_d / np.linalg.norm(rays_d, axis=1, keepdims=True)).astype(np.float32)
+
+    def turn(rays: np.ndarray) -> np.ndarray:
+        return np.stack([-rays[:, 1], rays[:, 0], rays[:, 2]], axis=1)
+
+    a = module.march(grids[0], rays_o, rays_d, 5)
+    b = module.march(grids[1], turn(rays_o), turn(rays_d), 5)
+    same = a.n_samples == b.n_samples
+    assert same.mean() > 0.99, "a sample within rounding of a cell's border may fall to either side"
+    np.testing.assert_allclose(a.opacity[same], b.opacity[same], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(a.depth[same], b.depth[same], rtol=0, atol=2e-4)

@@ -1,0 +1,200 @@
+"""Rays at their ends: where they enter the box against exact fractions, and that every march ends within a
+bound that is computed and counted."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from player import march, march_compiled
+from player.box import enter_box
+from player.cameras import Camera
+from player.errors import FormatError
+from player.manifest import Manifest
+from tests.numerics.fog import fog
+from tests.player.conftest import look_at
+
+MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
+THIN = fog(1e-6)
+DIAGONAL = 2 * 3**0.5
+HALF = 0.5**0.5
+
+
+def most_samples(step: float) -> int:
+    """The bound: lattice places on the box's diagonal, and three for rounding."""
+    return int(DIAGONAL / step) + 3
+
+
+def exact_slabs(o: np.ndarray, d: np.ndarray) -> tuple[Fraction, Fraction] | None:
+    """Entry (at least 0) and exit of a ray in [-1, 1]^3, of the float32 numbers as they are; None where it
+    misses."""
+    low, high = Fraction(0), None
+    for a, b in zip(o.tolist(), d.tolist(), strict=True):
+        if b == 0:
+            if not -1 <= a <= 1:
+                return None
+            continue
+        first, second = sorted([(-1 - Fraction(a)) / Fraction(b), (1 - Fraction(a)) / Fraction(b)])
+        low, high = max(low, first), second if high is None else min(high, second)
+    return None if high is None or high < low else (low, high)
+
+
+NAMED: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "along x": ((-3, 0.1, 0.2), (1, 0, 0)),
+    "along -y with -0.0": ((0.1, 3, -0.2), (-0.0, -1, 0.0)),
+    "along z with -0.0": ((0.1, 0.3, -3), (0.0, -0.0, 1)),
+    "from a face": ((-1, 0.3, 0.1), (1, 0, 0)),
+    "from a face, away": ((1, 0.3, 0.1), (1, 0, 0)),
+    "in a face": ((-3, 1, 0.1), (1, 0, 0)),
+    "just outside a face": ((-3, 1.00001, 0.1), (1, 0, 0)),
+    "from an edge": ((-1, -1, 0.1), (HALF, HALF, 0)),
+    "along an edge": ((-3, -1, -1), (1, 0, 0)),
+    "from a corner, inwards": ((-1, -1, -1), (3**-0.5, 3**-0.5, 3**-0.5)),
+    "through a corner, past": ((-3, -1, 1), (HALF, 0, HALF)),
+    "from inside": ((0.2, -0.1, 0.3), (0.6, 0, -0.8)),
+    "behind": ((3, 0, 0), (1, 0, 0)),
+    "grazing": ((-3, 0.999999, 0), (1, 0, 0)),
+    "tangent at an edge": ((-2, 0, 0), (HALF, HALF, 0)),
+    "from far away": ((1e5, 0.3, 0.1), (-1, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("module", MARCHES)
+def test_entry_and_exit_are_the_fractions(name: str, module: ModuleType) -> None:
+    o, d = (np.float32([row]) for row in NAMED[name])
+    entries = enter_box(THIN, o, d)
+    wanted = exact_slabs(o[0], d[0])
+    scale = max(1.0, float(np.abs(o).max()))
+    rounding = 8 * 2**-24 * scale  # the origin in cells, its difference to the face, the quotient
+    length = 0.0 if wanted is None else float(wanted[1] - wanted[0])
+    assert max(float(entries.length[0]), 0.0) == pytest.approx(length, abs=2 * rounding)
+    if length > 2 * rounding:
+        assert wanted is not None
+        assert float(entries.t[0]) == pytest.approx(float(wanted[0]), abs=rounding)
+        place = o[0].astype(np.float64) + float(wanted[0]) * d[0].astype(np.float64)
+        np.testing.assert_allclose(entries.point[:, 0], (place + 1) * 8, rtol=0, atol=16 * rounding)
+    assert ((entries.point >= 0) & (entries.point <= 16)).all()
+    taken = int(module.march(THIN, o, d, 5).n_samples[0])
+    # where the lattice ends within rounding of the exit one sample more or less is met
+    assert abs(taken - length / float(THIN.step)) <= 1 + 2 * rounding / float(THIN.step)
+    assert taken <= most_samples(float(THIN.step))
+
+
+coordinate = st.floats(-3, 3, width=32)
+component = st.one_of(st.floats(-1, 1, width=32), st.sampled_from([0.0, -0.0, 1e-30, -1e-38, 1.0]))
+
+
+@given(st.tuples(coordinate, coordinate, coordinate), st.tuples(component, component, component))
+def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tuple[float, ...]) -> None:
+    norm = math.sqrt(math.fsum(x * x for x in d))
+    if norm < 1e-3:
+        return
+    rays_o, rays_d = np.float32([o]), np.float32([[x / norm for x in d]])
+    wanted = exact_slabs(rays_o[0], rays_d[0])
+    length = 0.0 if wanted is None else float(wanted[1] - wanted[0])
+    for module in (march, march_compiled):
+        result = module.march(THIN, rays_o, rays_d, 1)
+        # a direction of 1e-30 along an axis meets its faces within rounding of 1e-6 / 1e-30: all or nothing
+        clear = all(abs(abs(x) - 1) > 1e-5 for x in o)
+        if clear:
+            assert abs(int(result.n_samples[0]) - length / float(THIN.step)) <= 1.01
+        assert np.isfinite(result.opacity).all() and np.isfinite(result.depth).all()
+        assert int(result.n_samples[0]) <= most_samples(float(THIN.step))
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("size", [1e-45, 1e-30, 1e-20, 1e-6, 1e3, 1e20, 1e38])
+def test_directions_that_are_not_unit_end_all_the_same(module: ModuleType, size: float) -> None:
+    """They are outside the contract: nothing is promised but an end, and finite numbers."""
+    rays_o = np.float32([[0.1, 0.2, 0.3], [-3, 0.1, 0.2], [0.1, -1, 0.2]])
+    rays_d = (np.float32([[1, 0, 0], [1, 0, 0], [0.6, 0.8, 0]]) * np.float64(size)).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        result = module.march(THIN, rays_o, rays_d, 5)
+    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+    assert np.isfinite(result.opacity).all()
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_rays_that_are_no_numbers_end_and_spoil_no_other(module: ModuleType, bad: float) -> None:
+    good = np.float32([[-3, 0.1, 0.2]]), np.float32([[1, 0, 0]])
+    rays_o = np.float32([[-3, 0.1, 0.2], [bad, 0, 0], [-3, 0, 0], [-3, 0.1, 0.2]])
+    rays_d = np.float32([[1, 0, 0], [1, 0, 0], [1, bad, 0], [1, 0, 0]])
+    with np.errstate(invalid="ignore", over="ignore"):
+        result = module.march(THIN, rays_o, rays_d, 5)
+    alone = module.march(THIN, *good, 5)
+    for ray in (0, 3):
+        assert result.opacity[ray] == alone.opacity[0] and result.depth[ray] == alone.depth[0]
+    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+
+
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
+@pytest.mark.parametrize("module", MARCHES)
+def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: ModuleType, far: float) -> None:
+    """In float32 the box's length along the ray is off by a sixteenth at 1e6 units and by everything at 1e8:
+    the renderer moves origins nearer (FAR_AWAY); here they are taken as they are, along the diagonal."""
+    unit = 3**-0.5
+    offsets = np.random.default_rng(0).uniform(-0.02, 0.02, (200, 3))
+    rays_o = (np.full((200, 3), -far * unit) + offsets).astype(np.float32)
+    rays_d = np.full((200, 3), unit, np.float32)
+    result = module.march(THIN, rays_o, rays_d, 5)
+    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+    assert np.isfinite(result.features).all()
+
+
+def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted: each round moves every ray on by one place at least."""
+    rounds = 0
+    locate = march._locate
+
+    def counting(*arguments: object) -> object:
+        nonlocal rounds
+        rounds += 1
+        return locate(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(march, "_locate", counting)
+    rays = [np.float32([row]) for row in NAMED["from a corner, inwards"]]
+    for size in (1.0, 1e-20, 1e-3):
+        rounds = 0
+        march.march(THIN, rays[0], (rays[1] * size).astype(np.float32), 5)
+        assert 0 < rounds <= most_samples(float(THIN.step))
+
+
+@pytest.mark.parametrize("module", MARCHES)
+def test_an_empty_box_is_left_in_a_few_jumps(module: ModuleType) -> None:
+    result = module.march(fog(1e-6, step=2 / 20000), np.float32([[-3, 5, 0]]), np.float32([[1, 0, 0]]), 5)
+    assert result.n_samples.tolist() == [0] and not result.opacity.any()
+
+
+@pytest.mark.parametrize("aabb", [((0, 0, 0), (0, 1, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, 1, 2e9))])
+def test_boxes_without_thickness_are_refused(aabb: tuple) -> None:
+    with pytest.raises(FormatError, match="aabb: expected"):
+        Manifest(generator="t", resolution=8, step=0.1, density_range=(-5, 5), n_channels=1,
+                 view_size=(4, 3), aabb=aabb)  # fmt: skip
+
+
+@pytest.mark.parametrize("focal", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("place", [4.0, 1e4, 1e9])
+def test_rays_of_a_camera_are_unit(focal: float, place: float) -> None:
+    """The contract that marches rely on, from the widest lens to the longest."""
+    camera = Camera("c", look_at((place, 2, 5), (1, 2, 3)), 9, 7, focal, focal, 4.5, 3.5)
+    _, rays_d = camera.rays()
+    lengths = np.linalg.norm(rays_d.astype(np.float64), axis=1)
+    np.testing.assert_allclose(lengths, 1, rtol=0, atol=2**-23)
+
+
+def test_indices_of_the_largest_grid_fit_their_integers() -> None:
+    """Dense tables are addressed in 32 bits, everything a brick holds in 64."""
+    from player.bricks import bricks_per_axis
+    from player.manifest import MAX_RESOLUTION
+
+    n = bricks_per_axis(MAX_RESOLUTION)
+    assert n**3 < 2**31 and n**3 * 64 < 2**31 * 2
+    assert np.int64(n**3) * 729 > 2**31, "so densities are addressed in 64 bits"

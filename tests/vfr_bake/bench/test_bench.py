@@ -1,0 +1,244 @@
+"""`vfr-bench` on the analytic asset, whose photographs are its own pictures with every sample fetched."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from player.asset import Asset
+from player.render import render
+from player.transforms import read_cameras, write_cameras
+from vfr_bake.bench.front import Point, beats, pareto_front, recommend
+from vfr_bake.bench.process import Process
+from vfr_bake.bench.result import MAX_PSNR
+from vfr_bake.bench.timing import Times, lookup_slope, measure_times
+from vfr_bake.bench.worst import APART, worst_pixels
+from vfr_bake.cli import bench_main
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.field import VfrField
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.training.model_file import Model, save_model
+
+
+@pytest.fixture(scope="module")
+def data(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The asset's views as a NeRF-synthetic folder."""
+    folder = tmp_path_factory.mktemp("shells")
+    asset = Asset.open(shells_folder)
+    cameras = read_cameras(asset.path("cameras.json"))
+    for split, some in (("train", cameras[:3]), ("test", cameras[3:])):
+        named = [replace(camera, name=f"./{split}/r_{i}") for i, camera in enumerate(some)]
+        (folder / split).mkdir()
+        for camera in named:
+            frame = render(asset, camera, n_samples=0, march="numba")
+            Image.fromarray(frame.to_uint8()).convert("RGBA").save(folder / f"{camera.name}.png")
+        (folder / f"transforms_{split}.json").write_bytes(write_cameras(named))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A field that has learned nothing, in the asset's frame."""
+    asset = Asset.open(shells_folder)
+    field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
+    grid = OccupancyGrid(8, step=0.2, seed=0)
+    grid.restore(np.ones((8, 8, 8), bool))
+    cameras = read_cameras(asset.path("cameras.json"))
+    path = tmp_path_factory.mktemp("model") / "model.pt"
+    save_model(path, Model(field, grid, asset.world_from_model, cameras, False, {}, {}))
+    return path
+
+
+QUICK = ["--frames", "2", "--sizes", "24x20", "--threads", "1"]
+
+
+@pytest.fixture(scope="module")
+def results(shells_folder: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+    out = tmp_path_factory.mktemp("results")
+    arguments = [str(shells_folder), "--data", str(data), "--samples", "1", "2", "0", *QUICK]
+    assert bench_main([*arguments, "--json", str(out / "t.json"), "--html", str(out / "t.html")]) == 0
+    return json.loads((out / "t.json").read_text()), (out / "t.html").read_text()
+
+
+def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder: Path) -> None:
+    rows = results[0]["settings"]
+    assert [row["samples"] for row in rows] == [1, 2, 5, 0], "5 is the asset's own"
+    asset = Asset.open(shells_folder)
+    for row in rows:
+        assert row["n_bytes"] == sum(entry.bytes for entry in asset.manifest.files.values())
+        assert row["what"]["resolution"] == 64 and row["what"]["n_channels"] == 4
+        assert set(row["times"]) == {"48x40", "24x20"}
+        for times in row["times"].values():
+            low, high = times["quartiles"]
+            assert times["frames"] == 2 and 0 < low <= times["median"] <= high <= times["p95"] + 1e-9
+            parts = times["march"] + times["lookups"] + times["head"] + times["rest"]
+            assert min(times["march"], times["lookups"], times["head"]) >= 0
+            assert parts == pytest.approx((low + high) / 2, rel=1e-6), (
+                "two frames: mean of all = of quartiles"
+            )
+        assert row["peak_mb"] > 20 and row["first_picture_ms"] > 10
+        assert row["commands"][1].startswith(f"vfr-play {shells_folder} --samples {row['samples']} ")
+
+
+def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
+    """The photographs are the asset's own pictures: nothing is lost with every sample, more with fewer."""
+    rows = {row["samples"]: row["scores"] for row in results[0]["settings"]}
+    assert rows[0]["psnr"] is None and rows[0]["ssim"] == 1 and rows[0]["loss_db"] == 0
+    assert rows[1]["psnr"] < rows[2]["psnr"] < rows[5]["psnr"] < MAX_PSNR
+    assert rows[1]["loss_db"] == pytest.approx(MAX_PSNR - rows[1]["psnr"])
+    assert rows[1]["psnr_to_model"] is None and rows[1]["lpips"] is None
+
+
+def test_the_page_shows_plots_and_pictures(results: tuple[dict, str], shells_folder: Path) -> None:
+    document, page = results
+    assert page.count("<svg") == 3 and page.count('src="data:image/png;base64,') == 1
+    assert "http" not in page and document["recommendation"] in page.replace("&#x27;", "'")
+    on_front = [row for row in document["settings"] if row["on_front"]]
+    assert on_front and all(row["commands"][1] in page for row in on_front)
+    worst = document["worst_pixels"][str(shells_folder)]
+    assert [pixel["error"] for pixel in worst] == sorted([p["error"] for p in worst], reverse=True)
+
+
+def test_against_the_full_model(
+    model: Path,
+    data: Path,
+    shells_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("vfr_bake.bench.trade.N_FIRST_PICTURES", 1)
+    arguments = [str(shells_folder), "--data", str(data), "--model", str(model), "--samples", "5", *QUICK]
+    assert bench_main([*arguments, "--json", str(tmp_path / "t.json")]) == 0
+    first, *rows = json.loads((tmp_path / "t.json").read_text())["settings"]
+    assert first["name"] == str(model) and first["scores"]["loss_db"] == 0
+    assert first["n_bytes"] == model.stat().st_size and first["commands"] == [f"vfr-eval {model} {data}"]
+    assert first["times"]["48x40"]["median"] > 0
+    for row in rows:
+        assert row["scores"]["psnr_to_model"] < 40
+        assert row["scores"]["loss_db"] == pytest.approx(first["scores"]["psnr"] - row["scores"]["psnr"])
+    title, *lines, sentence = capsys.readouterr().out.splitlines()
+    assert title.split() == ["setting", "PSNR", "loss", "SSIM", "ms", "p95", "MB"]
+    assert sum(row["on_front"] for row in (first, *rows)) == len(lines) // 2
+    assert re.search(r"k=5 +[\d.]+ +-[\d.]+ +[\d.]+ +\d+ ±\d+ +\d+ +[\d.]+$", lines[0])
+    assert lines[1].strip().startswith("vfr-play ") and sentence.startswith(
+        "For at most 0.1 dB below the full"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--views", "0"], "views: expected at least 1, got 0"),
+        (["--frames", "1"], "frames: expected at least 2, got 1"),
+        (["--sizes", "0x5"], "sizes: expected WIDTHxHEIGHT, from 1x1 on, got '0x5'"),
+        (["--samples", "-3"], "samples: expected 0 to 1024, got [-3]"),
+        (["--threads", "0"], "threads: expected at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(
+    options: list[str], message: str, shells_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench_main([str(shells_folder), "--data", "nowhere", *options]) == 1
+    assert capsys.readouterr().err == f"vfr-bench: error: {message}\n"
+
+
+def test_a_player_that_fails_says_why(shells_folder: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(shells_folder, tmp_path / "broken")
+    (broken / "head.onnx").write_bytes(b"")
+    with (
+        Process("vfr_bake.bench.player_frames", str(broken), str(broken / "cameras.json"), "1") as process,
+        pytest.raises(Exception, match=r"head\.onnx: size: expected \d+ bytes, got 0"),
+    ):
+        process.ask(view=0, size=[8, 8], samples=1, rgb=None)
+
+
+# --- the front ---
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    points = [
+        Point("best", 31, 200, 1, 30),
+        Point("fast", 29, 50, 1, 30),
+        Point("small", 28, 60, 1, 10),
+        Point("beaten", 28.9, 55, 1, 30),
+    ]
+    assert pareto_front(points) == [True, True, True, False]
+    assert pareto_front([*points, Point("perfect", 40, 1, 0, 1)]) == [False] * 4 + [True]
+
+
+def test_noise_throws_nothing_out() -> None:
+    steady, noisy = Point("a", 30, 100, 1, 10), Point("b", 30, 104, 8, 10)
+    assert not beats(steady, noisy) and not beats(noisy, steady)
+    assert beats(steady, replace(noisy, uncertainty=1.0))
+    assert beats(replace(noisy, psnr=30.1), steady), "as fast as can be told, and better"
+
+
+def test_what_nothing_reaches_is_said() -> None:
+    sentence = recommend([Point("only", 28, 500, 1, 40)], 31, "the model")
+    assert sentence.count("there is none, nearest is only (3.00 dB, 500 ms, 40 MB)") == 3
+
+
+# --- times ---
+
+
+def test_lookups_are_told_from_the_march() -> None:
+    """Frames of views with very different marches: 2 us a fetch are found all the same."""
+    random = np.random.default_rng(0)
+    rounds = [
+        {k: {"fetches": 1000 * k, "march_ms": base + 2 * k + random.normal(0, 0.1)} for k in (1, 2, 4, 8)}
+        for base in random.uniform(10, 400, 40)
+    ]
+    assert lookup_slope(rounds) == pytest.approx(0.002, rel=0.02)
+    assert lookup_slope([{5: {"fetches": 9, "march_ms": 3.0}}]) is None
+
+
+def test_rounds_ask_everybody_in_turn() -> None:
+    asked: list[tuple[str, int]] = []
+
+    def player(name: str):
+        def ask(*, samples: int, **_: object) -> dict:
+            asked.append((name, samples))
+            return {"ms": 10.0 * samples, "march_ms": 4.0, "head_ms": 3.0, "fetches": samples}
+
+        return ask
+
+    times = measure_times([player("a"), player("b")], 2, [(8, 8)], [1, 2], 3, lambda done, of: None)
+    assert len(asked) == 3 * 2 * (1 + 2), "one frame of each visit is not counted"
+    for visits in (asked[i : i + 6] for i in (0, 6, 12)):
+        assert sorted({name for name, _ in visits}) == ["a", "b"]
+    assert times[0, 2, (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 0.0, 3, 4.0, 0.0, 3.0, 13.0)
+    assert times[1, 1, (8, 8)].uncertainty == 0
+
+
+# --- where the loss sits ---
+
+
+def test_worst_pixels_are_those_that_were_spoiled(shells_folder: Path) -> None:
+    asset = Asset.open(shells_folder)
+    cameras = read_cameras(asset.path("cameras.json"))[:2]
+    frames = [render(asset, camera, 5, march="numpy") for camera in cameras]
+    wanted = [frame.rgb.copy() for frame in frames]
+    wanted[1][20, 24] += 0.5
+    wanted[1][21, 24] += 0.4  # beside the worst: does not count again
+    wanted[0][3, 2] += 0.25
+    first, second, *_ = worst = worst_pixels(asset, cameras, wanted, [frame.rgb for frame in frames])
+    assert (first.view, first.column, first.row) == (cameras[1].name, 24, 20)
+    assert first.error == pytest.approx(0.5, abs=1e-6)
+    assert (second.view, second.column, second.row) == (cameras[0].name, 2, 3)
+    assert first.opacity == pytest.approx(frames[1].opacity[20, 24], abs=1e-6)
+    assert first.n_samples <= frames[1].n_samples[20, 24]
+    weights = [weight for _, weight in first.weights]
+    assert weights == sorted(weights, reverse=True) and sum(weights) <= first.opacity + 1e-5
+    t = [t for t, _ in first.weights]
+    assert min(t) <= frames[1].depth[20, 24] <= max(t)
+    inside = [pixel for pixel in worst if pixel.view == cameras[1].name]
+    for a in inside:
+        assert all(a is b or max(abs(a.column - b.column), abs(a.row - b.row)) >= APART for b in inside)

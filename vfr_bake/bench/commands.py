@@ -1,0 +1,51 @@
+"""The commands that bake, play or score a setting again."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+from player.asset import Asset
+from vfr_bake.baking.presets import PRESETS
+from vfr_bake.config import BakeConfig
+
+GIVEN = ("resolution", "max_mb", "max_loss_db")
+"""Settings of `vfr-bake` that no preset decides, and that change the asset."""
+
+
+def bake_command(folder: str, asset: Asset) -> str:
+    """What bakes an asset like this one, out of the settings that it remembers; "" if it remembers none."""
+    settings = asset.manifest.provenance.get("bake", {})
+    preset = settings.get("preset")
+    if preset not in PRESETS:
+        return ""
+    chosen: dict[str, Any] = {name: settings.get(name) for name in GIVEN}
+    usual = PRESETS[preset]
+    for name in BakeConfig.__dataclass_fields__:
+        if hasattr(usual, name) and settings.get(name, getattr(usual, name)) != getattr(usual, name):
+            chosen[name] = settings[name]
+    options = [word for name, value in chosen.items() if value is not None
+               for word in (f"--{name.replace('_', '-')}", f"{value:g}")]  # fmt: skip
+    if settings.get("no_cull"):
+        options.append("--no-cull")
+    return shlex.join(["vfr-bake", "model.pt", folder, "--preset", preset, *options])
+
+
+def play_command(folder: str, samples: int, size: tuple[int, int]) -> str:
+    """What plays an asset with k = `samples`.
+
+    >>> play_command("my out", 5, (400, 300))
+    "vfr-play 'my out' --samples 5 --size 400x300 --orbit 60 --output frames/"
+    """
+    width, height = size
+    words = ["--samples", str(samples), "--size", f"{width}x{height}", "--orbit", "60", "--output", "frames/"]
+    return shlex.join(["vfr-play", folder, *words])
+
+
+def eval_command(model: str, data: str) -> str:
+    """What renders the test views with the full model.
+
+    >>> eval_command("model.pt", "demo")
+    'vfr-eval model.pt demo'
+    """
+    return shlex.join(["vfr-eval", model, data])

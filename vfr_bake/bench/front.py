@@ -1,0 +1,91 @@
+"""The Pareto front: the settings that nothing else beats in quality, time and size at once.
+
+Quality is in dB, time in ms a frame, size in MB. Times are known to within their uncertainty only, and a
+setting is not thrown out because of noise: A beats B if A is at least as good, at least as small and not
+slower beyond the uncertainty of both, and better, smaller or faster (beyond the uncertainty) in something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+MAX_LOSS_DB, MAX_MS, MAX_MB = 0.1, 100.0, 20.0
+"""What a setting is recommended for."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """What one setting gives and takes."""
+
+    name: str
+    psnr: float
+    """dB against the photographs."""
+    ms: float
+    uncertainty: float
+    """Of `ms`."""
+    megabytes: float
+
+
+def beats(a: Point, b: Point) -> bool:
+    """Whether nobody has a reason left to choose b.
+
+    >>> slow, fast = Point("slow", 30.0, 90.0, 2.0, 8.0), Point("fast", 30.0, 50.0, 2.0, 8.0)
+    >>> beats(fast, slow), beats(slow, fast), beats(slow, slow)
+    (True, False, False)
+    """
+    noise = a.uncertainty + b.uncertainty
+    no_worse = a.psnr >= b.psnr and a.megabytes <= b.megabytes and a.ms <= b.ms + noise
+    return no_worse and (a.psnr > b.psnr or a.megabytes < b.megabytes or a.ms < b.ms - noise)
+
+
+def pareto_front(points: Sequence[Point]) -> list[bool]:
+    """Which of the points are on the front."""
+    return [not any(beats(other, point) for other in points) for point in points]
+
+
+def recommend(points: Sequence[Point], reference: float, against: str) -> str:
+    """One sentence: what to play for at most MAX_LOSS_DB, MAX_MS, MAX_MB.
+
+    `points` are those of assets, `reference` the PSNR that losses are counted from, `against` its name.
+
+    >>> some = [Point("k 5", 30.0, 90.0, 1.0, 24.0), Point("k 2", 29.0, 50.0, 1.0, 18.0)]
+    >>> recommend(some, 30.05, "the model")
+    'For at most 0.1 dB below the model play k 5 (0.05 dB, 90 ms, 24 MB); for at most 100 ms a frame play \
+k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).'
+    """
+
+    def told(point: Point) -> str:
+        return f"{reference - point.psnr:.2f} dB, {point.ms:.0f} ms, {point.megabytes:.0f} MB"
+
+    def best(fitting: list[Point], wanted: str, otherwise: Point, key: str) -> str:
+        if not fitting:
+            return f"for {wanted} there is none, nearest is {otherwise.name} ({told(otherwise)})"
+        if key == "ms":
+            chosen = min(fitting, key=lambda point: (point.ms, -point.psnr))
+        else:
+            chosen = max(fitting, key=lambda point: (point.psnr, -point.ms))
+        return f"for {wanted} play {chosen.name} ({told(chosen)})"
+
+    parts = [
+        best(
+            [point for point in points if reference - point.psnr <= MAX_LOSS_DB],
+            f"at most {MAX_LOSS_DB:g} dB below {against}",
+            max(points, key=lambda point: point.psnr),
+            "ms",
+        ),
+        best(
+            [point for point in points if point.ms <= MAX_MS],
+            f"at most {MAX_MS:g} ms a frame",
+            min(points, key=lambda point: point.ms),
+            "psnr",
+        ),
+        best(
+            [point for point in points if point.megabytes <= MAX_MB],
+            f"at most {MAX_MB:g} MB",
+            min(points, key=lambda point: point.megabytes),
+            "psnr",
+        ),
+    ]
+    sentence = "; ".join(parts)
+    return f"{sentence[0].upper()}{sentence[1:]}."

@@ -1,0 +1,93 @@
+"""A process that renders on request: what is timed in it is disturbed by nothing else that the bench does.
+
+One line of JSON asks for a frame, one line answers. Pictures travel as .npy files, so that lines stay short.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from player.errors import VfrError
+
+Answer = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+class Process:
+    """A module of this package, run as a program of its own; a context manager."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self._name = module.rpartition(".")[2]
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+        )
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """What the process answers. Raises VfrError: it failed, with its own message, or it ended."""
+        requests, answers = self._process.stdin, self._process.stdout
+        assert requests is not None and answers is not None
+        try:
+            requests.write(json.dumps(request) + "\n")
+            requests.flush()
+        except OSError:  # it ended; if it said why, that is still to be read
+            pass
+        line = answers.readline()
+        if not line:
+            raise VfrError(f"{self._name}: expected an answer, got none: the process ended")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise VfrError(answer["error"])
+        return answer
+
+
+def serve(start: Callable[[], Answer], requests: TextIO, answers: TextIO) -> None:
+    """Answer each request until there are no more; what goes wrong is the answer, and the end.
+
+    >>> import io
+    >>> out = io.StringIO()
+    >>> serve(lambda: lambda request: {"twice": 2 * request["n"]}, io.StringIO('{"n": 4}\\n'), out)
+    >>> out.getvalue()
+    '{"twice": 8}\\n'
+    """
+    try:
+        answer = start()
+        for line in requests:
+            answers.write(json.dumps(answer(json.loads(line))) + "\n")
+            answers.flush()
+    except VfrError as error:
+        answers.write(json.dumps({"error": str(error)}) + "\n")
+        answers.flush()
+
+
+class Clock:
+    """Time spent in a function, over all threads."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.seconds = 0.0
+        self._function = function
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> Any:
+        start = time.perf_counter()
+        try:
+            return self._function(*arguments)
+        finally:
+            passed = time.perf_counter() - start
+            with self._lock:
+                self.seconds += passed

@@ -1,0 +1,101 @@
+"""What the bench has found: a row for every setting, which of them are on the front, and what to choose."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vfr_bake.bench.front import Point, pareto_front, recommend
+from vfr_bake.bench.settings import Size
+from vfr_bake.bench.timing import Times
+from vfr_bake.bench.worst import WorstPixel
+
+MAX_PSNR = 99.0
+"""What the PSNR of equal pictures, which has no bound, counts as in a loss, dB."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One row of the trade."""
+
+    name: str
+    """The asset's folder and k, or the model's file."""
+    asset: str | None
+    """The folder; None for the full model."""
+    samples: int | None
+    """k; 0 is every sample. None for the full model."""
+    what: dict[str, Any]
+    """Preset, head, resolution, channels, number formats: what the asset is made of."""
+    scores: dict[str, float | None]
+    """psnr, ssim, lpips (8-bit pictures), psnr_float, ssim_float: means against the photographs;
+    psnr_to_model, ssim_to_model: against the full model's unrounded pictures, None without one; loss_db:
+    what is lost against it (without a model, against the best setting)."""
+    times: dict[Size, Times]
+    n_bytes: int
+    """Of the asset without its reports, or of the model file."""
+    peak_mb: float | None
+    """Most memory of the process that played it at the photographs' size, all k."""
+    first_picture_ms: float | None
+    """From starting a process to its first picture of the photographs' size, Python included, what numba
+    compiles being in its cache."""
+    commands: tuple[str, ...]
+    """What bakes it, where the asset remembers, and what plays it."""
+    on_front: bool = False
+
+    @property
+    def point(self) -> Point:
+        """The setting on the front, with its time at the first of the sizes."""
+        first = next(iter(self.times.values()))
+        quality = min(self.scores["psnr"] or 0.0, MAX_PSNR)
+        return Point(self.name, quality, first.median, first.uncertainty, self.n_bytes / 1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Trade:
+    """All rows, and what they say."""
+
+    settings: list[Setting]
+    recommendation: str
+    sizes: list[Size]
+    """The first one is that of the first photograph, for which the front is drawn."""
+    conditions: dict[str, Any]
+    """Views, rounds, threads, march."""
+    pictures: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """By asset, its worst view: what was wanted and what was played, [h, w, 3] in [0, 1]."""
+    worst: dict[str, list[WorstPixel]] = field(default_factory=dict)
+    """By asset, its worst pixels with the asset's own k."""
+
+    def document(self) -> dict[str, Any]:
+        """The content of the JSON file."""
+        return {
+            "recommendation": self.recommendation,
+            "conditions": self.conditions,
+            "settings": [_plain(setting) for setting in self.settings],
+            "worst_pixels": {name: [asdict(pixel) for pixel in some] for name, some in self.worst.items()},
+        }
+
+
+def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setting], str]:
+    """All settings, the model's first, with losses and front; and the sentence that recommends some."""
+    best = max(setting.point.psnr for setting in settings)
+    reference = best if model is None else model.point.psnr
+    every = settings if model is None else [model, *settings]
+    front = pareto_front([setting.point for setting in every])
+    told = [
+        replace(setting, on_front=on, scores=setting.scores | {"loss_db": reference - setting.point.psnr})
+        for setting, on in zip(every, front, strict=True)
+    ]
+    sentence = recommend(
+        [setting.point for setting in settings], reference, "the full model" if model else "the best setting"
+    )
+    return told, sentence
+
+
+def _plain(setting: Setting) -> dict[str, Any]:
+    """A row as JSON: a PSNR without bound is null."""
+    row = asdict(setting)
+    row["scores"] = {key: None if value == float("inf") else value for key, value in row["scores"].items()}
+    row["times"] = {f"{width}x{height}": asdict(times) for (width, height), times in setting.times.items()}
+    return row

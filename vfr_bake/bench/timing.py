@@ -1,0 +1,130 @@
+"""Frame times, measured in rounds that ask every process in turn, so that a busy minute of the machine falls
+on all of them.
+
+In a round each asset and size is visited once, in an order of its own; a visit renders one view with every k,
+in an order of its own too, after a frame that is not counted. Times are those of whole frames.
+
+March and lookups are one loop, which has no seams to time. Of the same view the lookups alone differ with k:
+the slope b of the march's time against the fetches, fitted over all rounds with the mean of each visit taken
+out, makes `lookups = b x fetches`, and the march is what remains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vfr_bake.bench.settings import Size
+
+Ask = Callable[..., dict[str, Any]]
+SEED = 0
+"""Of the order within the rounds."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """A setting's frames of one size; milliseconds."""
+
+    median: float
+    p95: float
+    quartiles: tuple[float, float]
+    uncertainty: float
+    """Half width of the interval in which two medians do not differ: 1.57 interquartile ranges over the root
+    of the number (the notches of McGill, Tukey and Larsen, 1978), of what is left of the times when the
+    round's view and the machine's state in it, which all settings share, are divided out."""
+    frames: int
+    march: float
+    """Mean a frame, without the lookups."""
+    lookups: float | None
+    """Mean a frame; None where only one k was played, so that march and lookups cannot be told apart: they
+    are in `march` then."""
+    head: float
+    rest: float
+
+
+def measure_times(
+    players: Sequence[Ask],
+    n_views: int,
+    sizes: Sequence[Size],
+    samples: Sequence[int],
+    n_rounds: int,
+    progress: Callable[[int, int], object],
+) -> dict[tuple[int, int, Size], Times]:
+    """Times of every (player, k, size); each in `players` asks one process for a frame."""
+    random = np.random.default_rng(SEED)
+    visits: dict[tuple[int, Size], list[dict[int, dict[str, Any]]]] = {}
+    done, total = 0, n_rounds * len(players) * len(sizes)
+    for turn in range(n_rounds):
+        places = [(player, size) for player in range(len(players)) for size in sizes]
+        for index in random.permutation(len(places)):
+            player, size = places[index]
+            ask = players[player]
+            request = {"view": turn % n_views, "size": size, "rgb": None}
+            ask(**request, samples=samples[0])
+            order = random.permutation(len(samples))
+            answers = {samples[i]: ask(**request, samples=samples[i]) for i in order}
+            visits.setdefault((player, size), []).append(answers)
+            done += 1
+            progress(done, total)
+    times = {}
+    for (player, size), rounds in visits.items():
+        slope = lookup_slope(rounds)
+        shared = [_mean_ms([visits[other, size][turn] for other in range(len(players))])
+                  for turn in range(n_rounds)]  # fmt: skip
+        for k in samples:
+            times[player, k, size] = _times([answers[k] for answers in rounds], slope, shared)
+    return times
+
+
+def _mean_ms(visits: Sequence[dict[int, dict[str, Any]]]) -> float:
+    return float(np.mean([answer["ms"] for answers in visits for answer in answers.values()]))
+
+
+def notch(ms: np.ndarray, shared: Sequence[float]) -> float:
+    """The uncertainty of the median of `ms` [n], one frame a round, `shared` being the mean of all settings
+    in each round.
+
+    >>> notch(np.array([10.0, 40.0, 20.0]), [1.0, 4.0, 2.0])  # slow rounds, but always ten times the mean
+    0.0
+    """
+    low, high = np.percentile(ms / np.asarray(shared), [25, 75])
+    return float(1.57 * (high - low) * np.mean(shared) / len(ms) ** 0.5)
+
+
+def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
+    """Milliseconds a fetch; None where the number of fetches never differs.
+
+    >>> lookup_slope([{1: {"fetches": 10, "march_ms": 7.0}, 2: {"fetches": 20, "march_ms": 9.0}}])
+    0.2
+    """
+    above = below = 0.0
+    for answers in rounds:
+        fetches = np.array([a["fetches"] for a in answers.values()], np.float64)
+        march = np.array([a["march_ms"] for a in answers.values()], np.float64)
+        fetches -= fetches.mean()
+        above += float(fetches @ (march - march.mean()))
+        below += float(fetches @ fetches)
+    return None if below == 0 else max(above / below, 0.0)
+
+
+def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
+    ms, march, head, fetches = (
+        np.array([answer[key] for answer in answers], np.float64)
+        for key in ("ms", "march_ms", "head_ms", "fetches")
+    )
+    lookups = None if slope is None else min(slope * float(fetches.mean()), float(march.mean()))
+    low, high = np.percentile(ms, [25, 75])
+    return Times(
+        median=float(np.median(ms)),
+        p95=float(np.percentile(ms, 95)),
+        quartiles=(float(low), float(high)),
+        uncertainty=notch(ms, shared),
+        frames=len(ms),
+        march=float(march.mean()) - (lookups or 0.0),
+        lookups=lookups,
+        head=float(head.mean()),
+        rest=float((ms - march - head).mean()),
+    )

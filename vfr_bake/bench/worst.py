@@ -1,0 +1,83 @@
+"""Where the loss sits: the pixels that are farthest off, and what their rays met."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from player.asset import Asset
+from player.box import enter_box
+from player.cameras import Camera
+from player.march import collect_samples
+
+N_WORST = 10
+APART = 8
+"""Pixels: two of the worst in one view are at least so far apart, so that one wire does not take them all."""
+N_WEIGHTS = 6
+"""Heaviest samples of a ray that are listed."""
+
+
+@dataclass(frozen=True)
+class WorstPixel:
+    """One pixel and its ray."""
+
+    view: str
+    column: int
+    row: int
+    error: float
+    """Largest difference of the three channels, 0..1."""
+    wanted: tuple[float, ...]
+    played: tuple[float, ...]
+    n_samples: int
+    """Density samples with weight."""
+    opacity: float
+    weights: tuple[tuple[float, float], ...]
+    """(t in world units, weight) of the heaviest samples, heaviest first."""
+
+
+def worst_pixels(
+    asset: Asset, cameras: Sequence[Camera], wanted: Sequence[np.ndarray], played: Sequence[np.ndarray]
+) -> list[WorstPixel]:
+    """The N_WORST pixels of all views, worst first.
+
+    `cameras` are in the world frame, the pictures [h, w, 3] in [0, 1] of their sizes.
+    """
+    places = []
+    for view, (a, b) in enumerate(zip(wanted, played, strict=True)):
+        error = np.abs(a.astype(np.float64) - b).max(axis=2)
+        places += [(float(error[y, x]), view, x, y) for x, y in _peaks(error)]
+    places.sort(key=lambda place: -place[0])
+    found = []
+    for error, view, x, y in places[:N_WORST]:
+        n, opacity, weights = _ray(asset, cameras[view], x, y)
+        a, b = wanted[view][y, x], played[view][y, x]
+        colours = tuple(map(float, a)), tuple(map(float, b))
+        found.append(WorstPixel(cameras[view].name, x, y, error, *colours, n, opacity, weights))
+    return found
+
+
+def _peaks(error: np.ndarray) -> list[tuple[int, int]]:
+    """The worst pixels (x, y) of one view that are APART from each other."""
+    left = error.copy()
+    peaks = []
+    for _ in range(N_WORST):
+        y, x = map(int, np.unravel_index(np.argmax(left), left.shape))
+        if left[y, x] < 0:
+            break
+        peaks.append((x, y))
+        left[max(y - APART, 0) : y + APART + 1, max(x - APART, 0) : x + APART + 1] = -1
+    return peaks
+
+
+def _ray(asset: Asset, camera: Camera, x: int, y: int) -> tuple[int, float, tuple[tuple[float, float], ...]]:
+    """Samples with weight, opacity, and the heaviest samples of one pixel's ray."""
+    index = y * camera.width + x
+    rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays(index, index + 1)
+    entries = enter_box(asset.grid, rays_o, rays_d)
+    samples, tau, _ = collect_samples(asset.grid, entries, None)
+    heaviest = np.argsort(-samples.weights, kind="stable")[:N_WEIGHTS]
+    t = (float(entries.t[0]) + samples.s[heaviest]) * asset.scale
+    weights = tuple(zip(t.tolist(), samples.weights[heaviest].tolist(), strict=True))
+    return len(samples.s), float(-np.expm1(-tau[0])), weights
