@@ -18,6 +18,8 @@ from player.sparse_grid import ABSENT, SparseGrid
 
 try:
     import numba
+
+    from player.eight_rows import LANES, add_rows
 except ImportError:  # an extra: without it `player.march` runs
     numba = None
 
@@ -29,14 +31,25 @@ def available() -> bool:
     return numba is not None
 
 
-def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
+    """A function compiled by numba where that is installed; it runs without the interpreter's lock and may
+    not allocate.
+
+    Without counted references: the threads would count the grid's arrays in turns, millions of times a
+    picture.
+    """
     if numba is None:
         return function
-    options = {"nogil": True, "fastmath": False, "error_model": "numpy"}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": inline}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to keep the compiled code in: compile again in every process
         return numba.njit(**options)(function)
+
+
+def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A part of a compiled function, inlined: a call would pass 60 words."""
+    return compiled(function, inline=True)
 
 
 def march(
@@ -61,18 +74,19 @@ def march(
         (grid.bricks, grid.base, grid.ranks, grid.features),
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
         n_samples,
-        (np.empty(capacity, F32), np.empty(capacity, F32), np.empty(8, np.int64), np.empty(8, F32)),
+        (np.empty(capacity, F32), np.empty(capacity, F32), np.empty(8, np.int64), np.empty(8, F32),
+         np.zeros((1, -(-grid.n_channels // LANES) * LANES), F32)),
         (opacity, depth, counts, features, hits),
-    )
+    )  # fmt: skip
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits])
 
 
-@_jit
+@compiled
 def _march_rays(settings, lookup, stored, rays, k, scratch, out):
     """Every ray: its samples into the scratch arrays, then its fetches into the next row of `features`."""
     resolution, n_per_axis, step, low, slope, origin, scale = settings
     rays_o, rays_d, near, far = rays
-    scratch_s, scratch_w, corner_rows, corner_shares = scratch
+    scratch_s, scratch_w, corner_rows, corner_shares, one_row = scratch
     opacity, depth, counts, features, hits = out
     n_hits = 0
     for ray in range(len(near)):
@@ -105,10 +119,13 @@ def _march_rays(settings, lookup, stored, rays, k, scratch, out):
         opacity[ray] = mass
         depth[ray] = t_in + F32(moment / total)
         if mass > MIN_OPACITY:
+            one_row[:] = F32(0.0)
             _gather(
                 stored, (resolution, n_per_axis), point, (dx, dy, dz), scratch_s, scratch_w, n, total, mass,
-                k, corner_rows, corner_shares, features, n_hits,
+                k, corner_rows, corner_shares, one_row, 0,
             )  # fmt: skip
+            for c in range(features.shape[1]):
+                features[n_hits, c] = one_row[0, c]
             hits[n_hits] = ray
             n_hits += 1
     return n_hits
@@ -145,6 +162,8 @@ def _collect(settings, lookup, point, direction, first, length, scratch_s, scrat
     ex, ey, ez = point
     dx, dy, dz = direction
     last = resolution - 1
+    per_step = F32(1.0) / step
+    inverse = _inverse(dx), _inverse(dy), _inverse(dz)
     tau = F32(0.0)
     trans = F32(1.0)
     total = 0.0
@@ -162,10 +181,10 @@ def _collect(settings, lookup, point, direction, first, length, scratch_s, scrat
         if slot < 0:
             reach = -1 - slot
             leave = min(
-                _leave(ex, dx, x >> 3, reach),
-                min(_leave(ey, dy, y >> 3, reach), _leave(ez, dz, z >> 3, reach)),
+                _leave(ex, inverse[0], x >> 3, reach),
+                min(_leave(ey, inverse[1], y >> 3, reach), _leave(ez, inverse[2], z >> 3, reach)),
             )
-            i = max(i + 1, math.floor(min(leave, length) / step - F32(0.5)) + 1)
+            i = max(i + 1, int(min(leave, length) * per_step + F32(0.5)))
             continue
         i += 1
         lx, ly, lz = x & 7, y & 7, z & 7
@@ -198,13 +217,20 @@ def _collect(settings, lookup, point, direction, first, length, scratch_s, scrat
 
 
 @_jit
-def _leave(e, d, brick, reach):
-    """s at which a ray leaves the bricks within `reach` of `brick` along one axis, a margin early."""
-    if d > F32(0.0):
-        return (F32((brick + reach + 1) * 8) - SKIP_MARGIN - e) / d
-    if d < F32(0.0):
-        return (F32((brick - reach) * 8) + SKIP_MARGIN - e) / d
-    return F32(np.inf)
+def _inverse(d):
+    """1 / d, infinite for a ray that stays where it is along this axis."""
+    return F32(1.0) / d if d != F32(0.0) else F32(np.inf)
+
+
+@_jit
+def _leave(e, inverse, brick, reach):
+    """s at which a ray leaves the bricks within `reach` of `brick` along one axis, a margin early; `inverse`
+    is one over its direction there."""
+    if math.isinf(inverse):
+        return F32(np.inf)
+    if inverse > F32(0.0):
+        return (F32((brick + reach + 1) * 8) - SKIP_MARGIN - e) * inverse
+    return (F32((brick - reach) * 8) + SKIP_MARGIN - e) * inverse
 
 
 @_jit
@@ -268,28 +294,82 @@ def _fetch(stored, sizes, point, direction, s, weight, rows, shares, out, row):
     last = resolution - 1
     x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
     fx, fy, fz = gx - F32(x), gy - F32(y), gz - F32(z)
+    held = np.int64(bricks[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)])
+    if max(x & 7, max(y & 7, z & 7)) < 7 and held >= 0:
+        total = _corners_of_brick(base[held], ranks, held * 512 + _bit(x, y, z), (fx, fy, fz), rows, shares)
+    else:
+        total = _corners(stored, n_per_axis, (x, y, z), (fx, fy, fz), rows, shares)
+    if total < MIN_TOTAL:
+        return False
+    _add(features, rows, shares, weight / total, out, row)
+    return True
+
+
+@_jit
+def _bit(x, y, z):
+    return (x & 7) * 64 + (y & 7) * 8 + (z & 7)
+
+
+@_jit
+def _corners_of_brick(first, ranks, at, fraction, rows, shares):
+    """Rows and interpolation weights of the corners of a cell within one brick; returns the weights' sum.
+
+    Of what is not stored the weight is 0.
+    """
     total = F32(0.0)
     for corner in range(8):
         ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
-        share = (fx if ix else F32(1.0) - fx) * (fy if iy else F32(1.0) - fy) * (fz if iz else F32(1.0) - fz)
-        vx, vy, vz = x + ix, y + iy, z + iz
+        rank = np.int64(ranks[at + (ix * 64 + iy * 8 + iz)])
+        rows[corner] = first + rank if rank != ABSENT else 0
+        shares[corner] = _share(fraction, ix, iy, iz) if rank != ABSENT else F32(0.0)
+        total += shares[corner]
+    return total
+
+
+@_jit
+def _corners(stored, n_per_axis, cell, fraction, rows, shares):
+    """`_corners_of_brick` for a cell whose corners lie in several bricks."""
+    bricks, base, ranks, _ = stored
+    total = F32(0.0)
+    for corner in range(8):
+        ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
+        vx, vy, vz = cell[0] + ix, cell[1] + iy, cell[2] + iz
         brick = np.int64(bricks[((vx >> 3) * n_per_axis + (vy >> 3)) * n_per_axis + (vz >> 3)])
         rows[corner] = 0
         shares[corner] = F32(0.0)
         if brick >= 0:
-            rank = np.int64(ranks[brick * 512 + ((vx & 7) * 64 + (vy & 7) * 8 + (vz & 7))])
+            rank = np.int64(ranks[brick * 512 + _bit(vx, vy, vz)])
             if rank != ABSENT:
                 rows[corner] = base[brick] + rank
-                shares[corner] = share
-                total += share
-    if total < MIN_TOTAL:
-        return False
-    scale = weight / total
-    s0, s1, s2, s3 = shares[0] * scale, shares[1] * scale, shares[2] * scale, shares[3] * scale
-    s4, s5, s6, s7 = shares[4] * scale, shares[5] * scale, shares[6] * scale, shares[7] * scale
-    r0, r1, r2, r3, r4, r5, r6, r7 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
-    for c in range(features.shape[1]):
-        front = s0 * features[r0, c] + s1 * features[r1, c] + s2 * features[r2, c] + s3 * features[r3, c]
-        back = s4 * features[r4, c] + s5 * features[r5, c] + s6 * features[r6, c] + s7 * features[r7, c]
-        out[row, c] += front + back
-    return True
+                shares[corner] = _share(fraction, ix, iy, iz)
+                total += shares[corner]
+    return total
+
+
+@_jit
+def _share(fraction, ix, iy, iz):
+    fx, fy, fz = fraction
+    return (fx if ix else F32(1.0) - fx) * (fy if iy else F32(1.0) - fy) * (fz if iz else F32(1.0) - fz)
+
+
+@_jit
+def _add(features, rows, shares, scale, out, row):
+    """Add `scale` times the weighted rows to `out[row]`, in registers where there is room to read and write
+    them whole."""
+    n_channels = features.shape[1]
+    wide = out.shape[1] // LANES * LANES
+    last = max(
+        max(max(rows[0], rows[1]), max(rows[2], rows[3])), max(max(rows[4], rows[5]), max(rows[6], rows[7]))
+    )
+    if n_channels <= wide and last * n_channels + wide <= features.size:
+        eight = (rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7])
+        parts = (
+            shares[0] * scale, shares[1] * scale, shares[2] * scale, shares[3] * scale,
+            shares[4] * scale, shares[5] * scale, shares[6] * scale, shares[7] * scale,
+        )  # fmt: skip
+        for first in range(0, n_channels, LANES):
+            add_rows(features, eight, parts, out, row, first)
+        return
+    for corner in range(8):
+        for c in range(n_channels):
+            out[row, c] += shares[corner] * scale * features[rows[corner], c]

@@ -18,7 +18,7 @@ from player.errors import ConfigError
 from player.files import write_bytes
 from player.frame_files import Target, encode_frame, frame_key, unfinished
 from player.progress import Bar, duration
-from player.render import FRAME_BYTES, Background, March, Renderer, check_size
+from player.render import FRAME_BYTES, Background, March, Renderer, check_size, import_ahead
 from player.transforms import read_cameras
 from player.views import frame_rate, read_views
 
@@ -66,6 +66,7 @@ def play(arguments: argparse.Namespace, say: Callable[[str], object]) -> tuple[d
     """
     target = Target.of(arguments.output, arguments.format)
     target.check(arguments.force, arguments.resume)
+    import_ahead()
     asset = Asset.open(arguments.asset)
     every = _views(asset, arguments)
     cameras, paths = every[arguments.frames], target.paths(every, arguments.frames)

@@ -8,8 +8,10 @@ on the size of a task.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from types import ModuleType
@@ -106,6 +108,12 @@ class Renderer:
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
         self.march, self._module = choose_march(march)
+        self._write_pixels, self._directions = write_pixels, None
+        if self.march == "numba":
+            from player import pixels_compiled
+
+            self._write_pixels = pixels_compiled.write_pixels
+            self._directions = pixels_compiled.directions
         self.asset = asset
         self._grid = asset.grid
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
@@ -182,7 +190,7 @@ class Renderer:
         """[h, w, 3] normals, on the caller's thread: the renderer may have been closed."""
         normals = np.zeros((view.camera.height * view.camera.width, 3), np.float32)
         for blocks in tasks:
-            index, rays_o, rays_d, bounds = view.rays(blocks)
+            index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
             normals[index] = self._normals(rays_o, rays_d, bounds)
         return normals.reshape(view.camera.height, view.camera.width, 3)
 
@@ -194,24 +202,53 @@ class Renderer:
         self, frame: Frame, normals: np.ndarray | None, view: _View, blocks: np.ndarray, k: int
     ) -> None:
         """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
-        index, rays_o, rays_d, bounds = view.rays(blocks)
+        index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
         result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
-        depth = result.depth if view.start == 0 else np.where(result.depth > 0, result.depth + view.start, 0)
-        frame.opacity[index] = result.opacity
-        frame.depth[index] = depth * np.float32(self.asset.scale)
-        frame.n_samples[index] = result.n_samples
         if frame.features is not None:
             frame.features[index[result.hits]] = result.features
         if normals is not None:
             normals[index] = self._normals(rays_o, rays_d, bounds)
         rgb = self._head(result.features, rays_d[result.hits])
-        if frame.background == "transparent":
-            frame.rgb[index[result.hits]] = rgb
-            return
-        behind = np.asarray(frame.background, np.float32)
-        colours = (1 - result.opacity)[:, None] * behind
-        colours[result.hits] += rgb * result.opacity[result.hits][:, None]
-        frame.rgb[index] = colours
+        self._write_pixels(
+            (frame.rgb, frame.opacity, frame.depth, frame.n_samples),
+            index,
+            result,
+            rgb,
+            None if frame.background == "transparent" else frame.background,
+            (view.start, self.asset.scale),
+        )
+
+
+def write_pixels(
+    frame: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    index: np.ndarray,
+    result: MarchResult,
+    rgb: np.ndarray,
+    behind: tuple[float, float, float] | None,
+    depth_from: tuple[float, float],
+) -> None:
+    """Write what the march and the head have found for some pixels.
+
+    Args:
+        frame: rgb [n, 3], opacity, depth and number of samples [n] of the whole picture.
+        index: [n_rays] which pixels.
+        result: of the march.
+        rgb: [n_hits, 3] the head's colours.
+        behind: the background's colour; None leaves colours as the head gives them.
+        depth_from: way before the rays' origins, model units, and world units in a model unit.
+    """
+    start, scale = depth_from
+    to_rgb, to_opacity, to_depth, to_samples = frame
+    depth = result.depth if start == 0 else np.where(result.depth > 0, result.depth + np.float32(start), 0)
+    to_opacity[index] = result.opacity
+    to_depth[index] = depth * np.float32(scale)
+    to_samples[index] = result.n_samples
+    if behind is None:
+        to_rgb[index[result.hits]] = rgb
+        return
+    colours = (1 - result.opacity)[:, None] * np.asarray(behind, np.float32)
+    colours[result.hits] += rgb * result.opacity[result.hits][:, None]
+    to_rgb[index] = colours
 
 
 class _View(NamedTuple):
@@ -238,10 +275,17 @@ class _View(NamedTuple):
             near, far = np.where(seen, np.float32(0), near), np.where(seen, np.float32(np.inf), far)
         return cls(camera, start, np.flatnonzero(seen), near, far)
 
-    def rays(self, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bounds]:
-        """Of the pixels in some blocks: their index in the picture, origins, directions and bounds."""
+    def rays(
+        self, blocks: np.ndarray, directions: Callable[..., np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bounds]:
+        """Of the pixels in some blocks: their index in the picture, origins, directions and bounds;
+        `directions` may be a faster way to find the third."""
         columns, rows, owner = _pixels(self.camera, blocks, self.near.shape[1])
-        rays_o, rays_d = _rays(self.camera, columns, rows, self.start)
+        if directions is None or self.start:
+            rays_o, rays_d = _rays(self.camera, columns, rows, self.start)
+        else:
+            rays_d = directions(self.camera, columns, rows)
+            rays_o = np.broadcast_to(self.camera.c2w[:3, 3].astype(np.float32), rays_d.shape)
         bounds = (self.near.reshape(-1)[owner], self.far.reshape(-1)[owner])
         return rows * self.camera.width + columns, rays_o, rays_d, bounds
 
@@ -301,6 +345,19 @@ def choose_march(name: March) -> tuple[str, ModuleType]:
     from player import march
 
     return "numpy", march
+
+
+def import_ahead() -> None:
+    """Begin to import what rendering needs, on a thread of its own, while the caller opens the asset: both
+    take half a second."""
+
+    def imports() -> None:
+        with suppress(ImportError):  # told by whoever needs it
+            import onnxruntime  # noqa: F401
+
+            choose_march("auto")
+
+    threading.Thread(target=imports, daemon=True).start()
 
 
 @lru_cache(maxsize=2)

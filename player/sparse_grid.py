@@ -118,7 +118,7 @@ def build_grid(
         bricks=index.reshape(-1),
         base=base,
         ranks=ranks,
-        features=np.array(features, np.int8, order="C"),
+        features=np.ascontiguousarray(features, np.int8),
     )
 
 

@@ -33,7 +33,10 @@ LAZY = {
     "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton", "pycolmap"},
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
-TOP_LEVEL_EXCEPTIONS = {("player/march_compiled.py", "numba"), ("vfr_bake/options.py", "tyro")}
+TOP_LEVEL_EXCEPTIONS = {
+    *(("player/march_compiled.py", "numba"), ("player/eight_rows.py", "numba"), ("player/dense_tiles.py", "numba")),
+    ("vfr_bake/options.py", "tyro"),
+}
 
 MODULES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
 IDS = [path.relative_to(REPOSITORY).as_posix() for path in MODULES]

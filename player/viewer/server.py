@@ -16,7 +16,7 @@ import numpy as np
 from player.asset import Asset
 from player.cameras import focus_point, orbit, world_up
 from player.errors import ConfigError, MissingExtraError
-from player.render import Renderer
+from player.render import Renderer, import_ahead
 from player.transforms import read_cameras
 from player.viewer.window import Window
 
@@ -36,6 +36,7 @@ def serve(arguments: argparse.Namespace) -> None:
     if arguments.background == "transparent":
         raise ConfigError("--background: expected a colour for the viewer, got transparent")
     viser = _viser(files)
+    import_ahead()
     asset = Asset.open(arguments.asset)
     host = arguments.host or HOST
     port = free_port(host, arguments.port)

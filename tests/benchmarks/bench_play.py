@@ -1,81 +1,214 @@
-"""Milliseconds a frame of an asset: march with lookups, head, and the rest; numpy against numba.
+"""Milliseconds a frame of an asset: march, lookups, head and the rest, beside what the machine could do.
 
     python tests/benchmarks/bench_play.py out/ --cameras transforms_test.json --size 800x800
+    python tests/benchmarks/bench_play.py fidelity/ balanced/ fast/ --curves
 
-March and head are timed inside their tasks and divided by the number of threads: what they take of a frame
-when all threads are busy. Medians over the frames. The two marches must give the same picture within one
-level of eight bits.
+Parts are processor time of all threads, divided by their number: what they take of a frame when all are busy.
+What is left of the wall's clock is waiting, for another program or for the last task. Lookups cannot be
+timed apart: they are k / (k - 1) of what k fetches a ray take longer than one. Medians over the frames. The
+two marches must give the same picture within one level of eight bits.
+
+With `--curves`, tables of time against pixels, threads and assets, numba alone.
 """
 
 from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: the threads are ours, as in the player
 
 import argparse
 import statistics
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from player.asset import Asset
-from player.cameras import orbit
+from player.cameras import Camera, orbit
+from player.head import count_parameters
+from player.march import MIN_OPACITY
 from player.options import _positive, _size
 from player.play import peak_rss_mb
-from player.render import Renderer
+from player.render import Frame, Renderer, default_threads
 from player.transforms import read_cameras
 from vfr_bake.bench.process import Clock
 
+SIZES = (200, 400, 566, 800, 1131)
+"""Edges of the square pictures of the curve: pixels double, but for the first step."""
 
-def measure(asset: Asset, cameras: list, name: Any, n_threads: int | None, k: int | None) -> np.ndarray:
-    rows, n_hits, n_samples = [], [], []
+
+class Parts(NamedTuple):
+    """Milliseconds a frame."""
+
+    wall: float
+    march: float
+    lookups: float
+    head: float
+    rest: float
+    n_rays_hit: float
+    n_samples: float
+    n_fetches: float
+
+    @property
+    def waiting(self) -> float:
+        return self.wall - self.march - self.lookups - self.head - self.rest
+
+
+def measure(
+    asset: Asset, cameras: list[Camera], name: Any, n_threads: int | None, k: int | None
+) -> tuple[Parts, Frame]:
+    """Medians over the cameras, and the last frame."""
+    k = asset.manifest.n_samples if k is None else k
+    rows = []
     with Renderer(asset, n_threads, name) as renderer:
         march, head = Clock(renderer._module.march), Clock(renderer._head)
         renderer._module, renderer._head = SimpleNamespace(march=march), head  # type: ignore[assignment]
         renderer.render(cameras[0].resized(64, 64), k)
         for camera in cameras:
             march.seconds = head.seconds = 0.0
-            start = time.perf_counter()
+            begin, processor = time.perf_counter(), time.process_time()
             frame = renderer.render(camera, k)
-            total = time.perf_counter() - start
-            parts = march.seconds / renderer.n_threads, head.seconds / renderer.n_threads
-            rows.append([1000 * t for t in (total, *parts, total - sum(parts))])
-            hit = frame.opacity > 1 / 1024
-            n_hits.append(hit.mean())
-            n_samples.append(frame.n_samples.sum() / max(hit.sum(), 1))
-        total, in_march, in_head, rest = (statistics.median(column) for column in zip(*rows, strict=True))
+            wall, used = time.perf_counter() - begin, time.process_time() - processor
+            in_march, in_head = march.seconds, head.seconds
+            march.seconds = 0.0
+            renderer.render(camera, 1)
+            lookups = max(in_march - march.seconds, 0.0) * k / max(k - 1, 1)
+            taken = frame.n_samples[frame.opacity > MIN_OPACITY]
+            fetches = np.minimum(taken, k).sum() if k else taken.sum()
+            times = (in_march - lookups, lookups, in_head, used - in_march - in_head)
+            shares = [1000 * seconds / renderer.n_threads for seconds in times]
+            rows.append([1000 * wall, *shares, len(taken), frame.n_samples.sum(), fetches])
+    return Parts(*(statistics.median(column) for column in zip(*rows, strict=True))), frame
+
+
+def on_threads(n_threads: int, work: Callable[[], object]) -> float:
+    """Least processor time, in seconds, that one of the threads needs for `work` while all of them do it."""
+
+    def timed() -> float:
+        start = time.thread_time()
+        work()
+        return time.thread_time() - start
+
+    with ThreadPoolExecutor(n_threads) as pool:
+        rounds = [[pool.submit(timed) for _ in range(n_threads)] for _ in range(5)]
+        return min(max(future.result() for future in every) for every in rounds)
+
+
+def machine(n_threads: int) -> tuple[float, float]:
+    """GFLOP/s of a matrix product in float32, and GB/s that a copy reads and writes, of all threads."""
+    rng = np.random.default_rng(0)
+    a, b = (rng.random((768, 768), np.float32) for _ in range(2))
+    rate = n_threads * 2 * 768**3 / on_threads(n_threads, lambda: a @ b)
+    source = np.ones(1 << 24, np.float32)
+    target = [np.empty_like(source) for _ in range(n_threads)]
+    turn = iter(range(1 << 30))
+    seconds = on_threads(n_threads, lambda: np.copyto(target[next(turn) % n_threads], source))
+    return rate / 1e9, n_threads * 2 * source.nbytes / seconds / 1e9
+
+
+def bounds(asset: Asset, parts: Parts, rates: tuple[float, float]) -> str:
+    """How long the machine would take for the operations and bytes of a frame at its full rates.
+
+    A density sample reads eight codes, an entry of the table and a byte of live cells, and costs some 60
+    operations; a fetch reads eight rows with their ranks; the head multiplies and adds once a parameter.
+    """
+    flops, speed = rates
+    width = asset.manifest.n_channels
+    march = parts.n_samples * (8 + 4 + 1) / speed / 1e6, parts.n_samples * 60 / flops / 1e6
+    lookups = (
+        parts.n_fetches * 8 * (width + 2) / speed / 1e6, parts.n_fetches * 8 * (2 * width + 4) / flops / 1e6
+    )  # fmt: skip
+    head = 2 * count_parameters(asset.path("head.onnx").read_bytes()) * parts.n_rays_hit / flops / 1e6
+    return (
+        f"at {flops:.0f} GFLOP/s and {speed:.1f} GB/s at least: march {max(march):.1f} ms "
+        f"({parts.march / max(march):.0f} times that), lookups {max(lookups):.1f} ms "
+        f"({parts.lookups / max(lookups):.0f} times), head {head:.1f} ms ({parts.head / head:.1f} times)"
+    )
+
+
+def line(parts: Parts) -> str:
+    return (
+        f"{parts.wall:7.1f} ms a frame = march {parts.march:.1f} + lookups {parts.lookups:.1f} + head "
+        f"{parts.head:.1f} + rest {parts.rest:.1f} + waiting {parts.waiting:.1f}"
+    )
+
+
+def views(asset: Asset, path: Path | None, size: tuple[int, int], n_frames: int) -> list[Camera]:
+    own = asset.manifest.view_size[0], asset.manifest.view_size[1]
+    if path is None:
+        return orbit(read_cameras(asset.path("cameras.json"), own), n_frames, size)
+    return [camera.resized(*size) for camera in read_cameras(path, own)[:n_frames]]
+
+
+def compare(asset: Asset, cameras: list[Camera], n_threads: int, k: int | None) -> int:
+    """Both marches on the same views; the greatest difference of their last pictures, in levels."""
+    rates = machine(n_threads)
+    pictures = []
+    for name in ("numba", "numpy"):
+        parts, frame = measure(asset, cameras, name, n_threads, k)
+        pictures.append(frame.to_uint8().astype(int))
+        hit = parts.n_rays_hit / frame.opacity.size
+        print(f"{name:6} {n_threads} threads: {line(parts)}")
         print(
-            f"{renderer.march:6} {renderer.n_threads} threads: {total:7.1f} ms a frame = march and lookups "
-            f"{in_march:.1f} + head {in_head:.1f} + rest {rest:.1f}; {100 * np.mean(n_hits):.0f} % of the "
-            f"pixels hit, {np.mean(n_samples):.1f} density samples each"
+            f"       {100 * hit:.0f} % of the pixels hit, {parts.n_samples / max(parts.n_rays_hit, 1):.1f} "
+            f"density samples and {parts.n_fetches / max(parts.n_rays_hit, 1):.1f} fetches each\n"
+            f"       {bounds(asset, parts, rates)}"
         )
-    return frame.to_uint8()
+    return int(np.abs(pictures[0] - pictures[1]).max())
+
+
+def curves(assets: list[Asset], arguments: argparse.Namespace, n_threads: int) -> None:
+    first = assets[0]
+    print("\n| pixels | ms a frame | ns a pixel |\n|---|---|---|")
+    for edge in SIZES:
+        cameras = views(first, arguments.cameras, (edge, edge), arguments.frames)
+        parts, _ = measure(first, cameras, "numba", n_threads, arguments.samples)
+        print(f"| {edge}x{edge} | {parts.wall:.0f} | {1e6 * parts.wall / edge**2:.0f} |")
+    print("\n| threads | ms a frame | times threads |\n|---|---|---|")
+    for n in range(1, n_threads + 1):
+        cameras = views(first, arguments.cameras, arguments.size, arguments.frames)
+        parts, _ = measure(first, cameras, "numba", n, arguments.samples)
+        print(f"| {n} | {parts.wall:.0f} | {parts.wall * n:.0f} |")
+    print("\n| asset, MB | vertices | ms a frame | march | lookups | head | rest |")
+    print("|---|---|---|---|---|---|---|")
+    for asset in assets:
+        cameras = views(asset, arguments.cameras, arguments.size, arguments.frames)
+        parts, _ = measure(asset, cameras, "numba", n_threads, arguments.samples)
+        size = sum(entry.bytes for entry in asset.manifest.files.values()) / 1e6
+        print(
+            f"| {asset.folder.name}, {size:.0f} | {len(asset.arrays.density):,} | {parts.wall:.0f} | "
+            f"{parts.march:.0f} | {parts.lookups:.0f} | {parts.head:.0f} | {parts.rest:.0f} |"
+        )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("asset", type=Path)
+    parser.add_argument("assets", type=Path, nargs="+")
     parser.add_argument("--cameras", type=Path, help="transforms.json; else an orbit")
     parser.add_argument("--size", type=_size, default=(800, 800))
     parser.add_argument("--frames", type=_positive, default=8)
-    parser.add_argument("--threads", type=_positive)
+    parser.add_argument("--threads", type=_positive, default=default_threads())
     parser.add_argument("--samples", type=int)
+    parser.add_argument("--curves", action="store_true", help="time against pixels, threads and assets")
     arguments = parser.parse_args()
     start = time.perf_counter()
-    asset = Asset.open(arguments.asset)
-    size = asset.manifest.view_size[0], asset.manifest.view_size[1]
-    asset.grid  # noqa: B018
-    print(f"opened in {1000 * (time.perf_counter() - start):.0f} ms: {len(asset.arrays.density):,} vertices")
-    if arguments.cameras:
-        cameras = read_cameras(arguments.cameras, size)[: arguments.frames]
-        cameras = [camera.resized(*arguments.size) for camera in cameras]
-    else:
-        cameras = orbit(read_cameras(asset.path("cameras.json"), size), arguments.frames, arguments.size)
-    pictures = [
-        measure(asset, cameras, name, arguments.threads, arguments.samples) for name in ("numba", "numpy")
-    ]
-    worst = int(np.abs(pictures[0].astype(int) - pictures[1]).max())
+    assets = [Asset.open(path) for path in arguments.assets]
+    assets[0].grid  # noqa: B018
+    print(f"opened in {1000 * (time.perf_counter() - start):.0f} ms")
+    if arguments.curves:
+        curves(assets, arguments, arguments.threads)
+        return 0
+    worst = 0
+    for asset in assets:
+        cameras = views(asset, arguments.cameras, arguments.size, arguments.frames)
+        print(f"{asset.folder}: {len(asset.arrays.density):,} vertices")
+        worst = max(worst, compare(asset, cameras, arguments.threads, arguments.samples))
     print(f"worst difference {worst} of 255; peak memory {peak_rss_mb()} MB")
     return 0 if worst <= 1 else 1
 

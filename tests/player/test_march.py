@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -145,6 +146,18 @@ def test_bounds_do_not_change_a_bit(module: ModuleType, asset: Asset) -> None:
     near, far = np.maximum(radius - 1.2, 0).astype(np.float32), (radius + 1.2).astype(np.float32)
     for a, b in zip(free, module.march(asset.grid, rays_o, rays_d, 5, (near, far)), strict=True):
         assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("n_channels", [1, 15, 16, 17, 40])
+def test_numba_is_numpy_in_any_number_of_channels(n_channels: int, asset: Asset) -> None:
+    """Channels are added up sixteen at a time, the last rows in memory one by one."""
+    features = np.random.default_rng(8).integers(-128, 128, (len(asset.grid.features), n_channels), np.int8)
+    grid = replace(asset.grid, features=features)
+    rays = random_rays(2000, seed=8)
+    for k in (0, 5):
+        a, b = march.march(grid, *rays, k), march_compiled.march(grid, *rays, k)
+        assert a.features.shape == b.features.shape == (len(a.hits), n_channels)
+        np.testing.assert_allclose(a.features, b.features, rtol=0, atol=40 * FEATURES)  # noise, not 3 a cell
 
 
 @pytest.mark.parametrize("module", MARCHES)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from player import pixels_compiled
 from player import render as render_module
 from player.asset import Asset
 from player.bounds import BLOCK, block_bounds
@@ -15,7 +16,7 @@ from player.cameras import Camera
 from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
 from player.head import CHUNK, Head, count_parameters
 from player.images import png_bytes
-from player.march import march
+from player.march import MarchResult, march
 from player.render import MAX_PIXELS, Renderer, render
 from player.transforms import read_cameras
 from tests.player.conftest import head_bytes, look_at
@@ -198,6 +199,31 @@ def test_a_camera_far_away_sees_what_a_parallel_one_sees(distance: float, asset:
 def test_a_camera_far_away_with_an_ordinary_lens_sees_background(asset: Asset, camera: Camera) -> None:
     far = replace(camera, c2w=look_at((1e8, 2, 3), (1, 2, 3)))
     assert (render(asset, far, background=(0.0, 0.5, 1.0)).to_uint8() == [0, 128, 255]).all()
+
+
+@pytest.mark.parametrize("behind", [None, (0.25, 0.5, 1.0)])
+@pytest.mark.parametrize("hits", [[], [0, 3], [4], [0, 1, 2, 3, 4]])
+def test_compiled_pixels_are_numpys(behind: tuple[float, float, float] | None, hits: list[int]) -> None:
+    """Every field of the frame, pixels in any order, rays that were met but not shaded."""
+    rng = np.random.default_rng(1)
+    depth = rng.uniform(1, 2, 5).astype(np.float32) * [1, 0, 1, 1, 1]
+    opacity, rgb = rng.uniform(0, 1, 5).astype(np.float32), rng.uniform(0, 1, (len(hits), 3))
+    counts, none = np.arange(5, dtype=np.int32), np.zeros((len(hits), 4), np.float32)
+    result = MarchResult(opacity, depth.astype(np.float32), counts, np.array(hits, np.int64), none)
+    frames = []
+    for write in (render_module.write_pixels, pixels_compiled.write_pixels):
+        frame = (*(np.full(shape, 7, np.float32) for shape in ((6, 3), 6, 6)), np.full(6, 7, np.int32))
+        write(frame, np.array([5, 0, 3, 1, 2]), result, rgb.astype(np.float32), behind, (0.5, 2.0))
+        frames.append(frame)
+    for a, b in zip(*frames, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-7, atol=0)
+        assert (a[4] == 7).all(), "a pixel that no ray goes through"
+
+
+def test_compiled_directions_are_the_cameras(camera: Camera) -> None:
+    rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    expected = camera.rays()[1]
+    np.testing.assert_allclose(pixels_compiled.directions(camera, columns, rows), expected, rtol=0, atol=6e-8)
 
 
 def test_a_frame_that_was_put_together_has_no_normals() -> None:
