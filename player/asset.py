@@ -125,6 +125,7 @@ class Asset:
             np.array(m.aabb),
             m.step,
             (low, high),
+            m.contracted,
         )
 
     @cached_property

@@ -105,7 +105,7 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else n_threads
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
-        self.march, self._module = choose_march(march)
+        self.march, self._module = choose_march(march, asset.manifest.contracted)
         self.asset = asset
         self._grid = asset.grid
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
@@ -195,7 +195,8 @@ class Renderer:
     ) -> None:
         """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
         index, rays_o, rays_d, bounds = view.rays(blocks)
-        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
+        within = None if self._grid.contracted else bounds
+        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, within)
         depth = result.depth if view.start == 0 else np.where(result.depth > 0, result.depth + view.start, 0)
         frame.opacity[index] = result.opacity
         frame.depth[index] = depth * np.float32(self.asset.scale)
@@ -228,6 +229,10 @@ class _View(NamedTuple):
 
     @classmethod
     def of(cls, grid: SparseGrid, camera: Camera) -> _View:
+        if grid.contracted:  # all of space: every pixel may meet something, from the camera on
+            shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
+            every = np.arange(shape[0] * shape[1])
+            return cls(camera, 0.0, every, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32))
         near, far = block_bounds(grid, camera)
         seen = far >= near
         size = grid.resolution / grid.cells_per_unit.astype(np.float64)
@@ -288,19 +293,20 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def choose_march(name: March) -> tuple[str, ModuleType]:
+def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
+    """Name and module of a march through a box, or through contracted space."""
     if name != "numpy":
-        from player import march_compiled
+        from player import contracted_march_compiled, march_compiled
 
         if march_compiled.available():
-            return "numba", march_compiled
+            return "numba", contracted_march_compiled if contracted else march_compiled
         if name == "numba":
             raise MissingExtraError(
                 "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
             )
-    from player import march
+    from player import contracted_march, march
 
-    return "numpy", march
+    return "numpy", contracted_march if contracted else march
 
 
 @lru_cache(maxsize=2)

@@ -30,6 +30,8 @@ from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
+from vfr_bake.baking.contracted import lattice_step, weighty_cells
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
@@ -86,18 +88,19 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     model shows, or misses `max_loss_db` or `max_mb`; then nothing is written.
     """
     check_target(folder, force)
-    _check_bakeable(model)
+    _check_bakeable(model, config)
     work = _Bake(model, config, report)
     return work.run(folder, force)
 
 
-def _check_bakeable(model: Model) -> None:
+def _check_bakeable(model: Model, config: BakeConfig) -> None:
     """Raises ConfigError for a field that an asset cannot hold."""
-    _ = model.occupancy  # says so if the scene is unbounded
-    config = model.field.config
+    field = model.field.config
     for name, needed in (("compositing", "features"), ("activation", "gelu")):
-        if getattr(config, name) != needed:
-            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(config, name)}")
+        if getattr(field, name) != needed:
+            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(field, name)}")
+    if field.unbounded and config.no_cull:
+        raise ConfigError("--no-cull: expected the model of an object, got that of an unbounded scene")
 
 
 class _Bake:
@@ -119,6 +122,8 @@ class _Bake:
             size = self.choice.mesh_resolution or layout.resolution
             mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
         mesh_bytes = ply_bytes(mesh)
+        if layout.contracted:
+            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         stored, taught = self._store(layout, len(mesh_bytes))
         stored = self._refine(stored, layout, taught)
         head = self._head(stored, layout, taught)
@@ -148,21 +153,9 @@ class _Bake:
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> tuple[np.ndarray, Layout]:
-        model, choice = self.model, self.choice
-        cell = float(np.median(pixel_footprints(model)))
-        resolution = self.config.resolution or round(2 * choice.cells_per_pixel / cell)
-        resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
+        model, unbounded = self.model, self.model.field.config.unbounded
         with self._part("visibility"):
-            held = occupied_cells(model, resolution)
-            if self.config.no_cull:
-                visible = held
-            else:
-                visible = visible_cells(model, resolution, choice.weight_floor, self._progress("visibility"))
-                share = 1 - float(visible.sum()) / max(int(held.sum()), 1)
-                self.left_out["cells"] = (
-                    f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
-                    f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
-                )
+            visible, step = self._weighty_cells() if unbounded else self._visible_cells()
         n_cells, most = int(visible.sum()), MOST_FLOATS // model.field.config.n_channels
         if n_cells > most:
             raise TrainingError(
@@ -170,7 +163,35 @@ class _Bake:
                 f"{n_cells:,} of {visible.size:,}: is the model a fog? Lower --resolution, or raise "
                 "--weight-floor"
             )
-        return visible, make_layout(visible, float(model.occupancy.step))
+        return visible, make_layout(visible, step, unbounded)
+
+    def _weighty_cells(self) -> tuple[np.ndarray, float]:
+        """Cells and march step of an unbounded scene."""
+        resolution, floor = (
+            self.config.resolution or self.choice.contracted_resolution,
+            self.choice.weight_floor,
+        )
+        resolution = min(resolution, self.model.field.config.max_resolution)
+        visible = weighty_cells(self.model, resolution, floor, self._progress("visibility"))
+        self.left_out["cells"] = f"{1 - visible.mean():.1%} of contracted space: no view gives them {floor:g}"
+        return visible, lattice_step(resolution)
+
+    def _visible_cells(self) -> tuple[np.ndarray, float]:
+        """The same of an object."""
+        model, choice = self.model, self.choice
+        cell = float(np.median(pixel_footprints(model)))
+        resolution = self.config.resolution or round(2 * choice.cells_per_pixel / cell)
+        resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
+        held = occupied_cells(model, resolution)
+        if self.config.no_cull:
+            return held, float(model.occupancy.step)
+        visible = visible_cells(model, resolution, choice.weight_floor, self._progress("visibility"))
+        share = 1 - float(visible.sum()) / max(int(held.sum()), 1)
+        self.left_out["cells"] = (
+            f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
+            f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
+        )
+        return visible, float(model.occupancy.step)
 
     def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
@@ -181,7 +202,8 @@ class _Bake:
         cameras = model.model_cameras()
         with self._part("teacher"):
             views = cameras + views_between(model, len(cameras), seed=1)
-            taught = teach(model, views, N_RAYS, 0, self._progress("teacher"))
+            n_rays = UNBOUNDED_RAYS if layout.contracted else N_RAYS
+            taught = teach(model, views, n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             features, density = evaluate_vertices(model, layout, self._progress("grid"))
             own = fold_head(model.field.head, model.field.head.first_weights().astype(np.float64))
@@ -319,6 +341,8 @@ class _Bake:
             generator=f"vfr-bake {__version__}",
             resolution=layout.resolution,
             step=layout.step,
+            aabb=layout.aabb,
+            contracted=layout.contracted,
             density_range=layout.density_range,
             n_channels=n_channels,
             view_size=(camera.width, camera.height),
@@ -362,7 +386,7 @@ class _Bake:
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         with Renderer(asset) as renderer:
             for camera in views_between(self.model, N_PICTURES, seed=3):
-                full = render_image(self.model.field, self.model.occupancy, camera, self.model.background)
+                full = render_image(self.model.field, self.model.sampler, camera, self.model.background)
                 world: Camera = camera.transformed(self.model.world_from_model)
                 yield camera.name, full, renderer.render(world).rgb
 
