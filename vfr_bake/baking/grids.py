@@ -43,6 +43,17 @@ class Layout:
         edge = 2.0 if self.contracted else 1.0
         return (-edge,) * 3, (edge,) * 3
 
+    def unit_points(self, rows: slice) -> np.ndarray:
+        """[n, 3] float32: where the vertices in `rows` are looked up in the unit cube of the field. Corners
+        of cells that stick out of contracted space, where the field has learnt nothing, take what is at its
+        border."""
+        points = self.vertices[rows] / self.resolution
+        if self.contracted:
+            centred = points - 0.5
+            norm = np.linalg.norm(centred, axis=-1, keepdims=True)
+            points = np.where(norm > 0.5, centred * (0.5 / np.maximum(norm, 0.5)) + 0.5, points)
+        return points.astype(np.float32)
+
     def arrays(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
         """The asset's arrays, from codes that need not be whole: [n_vertices], [n_vertices, n_channels]."""
         whole = np.clip(np.rint(density), 0, 255).astype(np.uint8)
@@ -85,7 +96,7 @@ def evaluate_vertices(
     density = np.empty(n, np.float32)
     for start in range(0, n, VERTEX_CHUNK):
         rows = slice(start, start + VERTEX_CHUNK)
-        points = (layout.vertices[rows] / layout.resolution).astype(np.float32)
+        points = layout.unit_points(rows)
         features[rows] = model.field.features(points)
         density[rows] = encode_density(model.field.log_densities(points), layout.density_range)
         progress(min(start + VERTEX_CHUNK, n), n)
