@@ -15,6 +15,7 @@ import numpy as np
 from exporters.asset_mesh import Scene
 from exporters.crop import parse_crop
 from exporters.formats import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
+from exporters.inner_region import inner_region
 from exporters.mesh import TriangleMesh
 from exporters.mesh_export import export_mesh, mesh_paths, world_mesh
 from player.asset import Asset
@@ -64,6 +65,8 @@ def export_asset(
         _check_target(asset_path, path, name, options.force)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True)
+    if name not in ("exr", "json", "onnx"):
+        asset = inner_region(asset)
     if is_mesh:
         facts = export_mesh(asset, target, options, name, _matrix(asset, options, name), report)
         return {"file": str(target), "format": name, **facts}

@@ -140,6 +140,7 @@ class Asset:
             np.array(m.aabb),
             m.step,
             (low, high),
+            m.contracted,
         )
 
     @cached_property

@@ -22,6 +22,11 @@ class Entries(NamedTuple):
     direction: np.ndarray
     """[3, n] float32, cells per model unit."""
 
+    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, n_places] at `s` [n_places] behind the entries of the rays `ray`
+        [n_places]."""
+        return self.point[:, ray] + s * self.direction[:, ray]
+
 
 def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entries:
     """Rays to grid coordinates, each moved to where it enters the box (slabs; t >= 0).

@@ -13,11 +13,10 @@ MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of equal
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from player.box import Entries
 from player.sparse_grid import ABSENT, SparseGrid
 
 MIN_TOTAL = np.float32(1e-3)
@@ -27,13 +26,22 @@ BLOCK = 4096
 """Fetches at a time: what they gather stays in the second-level cache."""
 
 
+class Places(Protocol):
+    """Rays in grid coordinates: `player.box.Entries`, `player.contracted_rays.ContractedRays`."""
+
+    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, n_places] at the places `s` [n_places] on the rays `ray` [n_places]."""
+        ...
+
+
 class Samples(NamedTuple):
     """Samples with weight, grouped by ray, in the order of the march."""
 
     ray: np.ndarray
     """[n_samples] int64."""
     s: np.ndarray
-    """[n_samples] float32, distance from the entry into the box, model units."""
+    """[n_samples] float32, distance from the entry into the box, model units; in contracted space an
+    angle."""
     weights: np.ndarray
     """[n_samples] float32."""
 
@@ -58,7 +66,7 @@ class Bins(NamedTuple):
 
 
 def fetch_features(
-    grid: SparseGrid, entries: Entries, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
+    grid: SparseGrid, entries: Places, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
 ) -> np.ndarray:
     """Sum of weight times feature over the fetches of each ray in `hits`: [n_hits, n_channels] float32.
 
@@ -157,7 +165,7 @@ def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
 
 
 def _add(
-    grid: SparseGrid, entries: Entries, fetches: Samples, rows: np.ndarray, out: np.ndarray
+    grid: SparseGrid, entries: Places, fetches: Samples, rows: np.ndarray, out: np.ndarray
 ) -> np.ndarray:
     """Add each fetch to the row of its ray; returns the indices of those where too little is stored."""
     gaps = []
@@ -168,7 +176,7 @@ def _add(
     edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
     for start, stop in itertools.pairwise(edges):
         ray, s, weights = (column[start:stop] for column in fetches)
-        values, total = _fetch(grid, entries.point[:, ray] + s * entries.direction[:, ray])
+        values, total = _fetch(grid, entries.at(ray, s))
         poor = total < MIN_TOTAL
         scale = np.where(poor, np.float32(0), weights / np.where(poor, np.float32(1), total))
         values *= scale[:, None]

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from player.asset import Asset
+from player.contracted_rays import MAX_SPEED
 from player.head import count_parameters
 from player.manifest import Manifest
 from player.transforms import read_cameras
 
 MANIFEST_KEYS = (
-    "version", "generator", "resolution", "aabb", "world_from_model", "step", "n_samples", "density_range",
-    "n_channels", "background", "colour_space", "view_size", "provenance",
+    "version", "generator", "resolution", "aabb", "world_from_model", "contracted", "step", "n_samples",
+    "density_range", "n_channels", "background", "colour_space", "view_size", "provenance",
 )  # fmt: skip
 
 CONTENT = {
@@ -62,7 +63,9 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
             for name, n in sorted(known["bytes"].items(), key=lambda item: -item[1])
         ]),
         *_section("scene", [
-            ("world box", f"{size} units, from {_numbers(low)} to {_numbers(high)}"),
+            ("inner region" if m.contracted else "world box",
+             f"{size} units, from {_numbers(low)} to {_numbers(high)}"),
+            *([("around it", "the rest of space, contracted")] if m.contracted else []),
             ("world units", f"{scale:.5g} in a model unit"),
             ("colours", f"{m.colour_space}, over {_numbers(m.background)}"),
         ]),
@@ -71,7 +74,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
              f"({share:.2%}) in {known['n_bricks']:,} bricks of 8 x 8 x 8"),
             ("features", f"{m.n_channels} channels of 8 bits, fetched "
              f"{f'at {m.n_samples} places a ray' if m.n_samples else 'at every sample'}"),
-            ("step", f"{m.step * scale:.5g} world units, {m.step * m.resolution / _edge(m):.2g} of a cell"),
+            ("step", _step(m, scale)),
             ("head", f"{known['head_parameters']:,} parameters, once a pixel"),
         ]),
     ]  # fmt: skip
@@ -118,9 +121,17 @@ def _edge(m: Manifest) -> float:
     return max(high - low for low, high in zip(*m.aabb, strict=True))
 
 
+def _step(m: Manifest, scale: float) -> str:
+    cells = m.step * m.resolution / _edge(m)
+    if m.contracted:
+        return f"an angle of {m.step:.5g}, {cells * MAX_SPEED:.2g} of a cell at most"
+    return f"{m.step * scale:.5g} world units, {cells:.2g} of a cell"
+
+
 def _world_box(asset: Asset) -> list[list[float]]:
-    """Least and greatest world coordinates of the box's corners."""
-    box = np.array(asset.manifest.aabb)
+    """Least and greatest world coordinates of the box's corners; in contracted space of the cube around what
+    is not contracted."""
+    box = np.array(asset.manifest.aabb) / (2 if asset.manifest.contracted else 1)
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2], 1] for i, j, k in np.ndindex(2, 2, 2)])
     world = (corners @ asset.world_from_model.T)[:, :3]
     return [world.min(axis=0).tolist(), world.max(axis=0).tolist()]

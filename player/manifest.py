@@ -1,4 +1,4 @@
-"""The format `vfr-asset`, version 2.0: this docstring is its specification, the module parses and writes
+"""The format `vfr-asset`, version 2.1: this docstring is its specification, the module parses and writes
 the manifest.
 
 An asset is a folder. It holds no absolute path and plays wherever it is moved.
@@ -19,25 +19,30 @@ GRID. The box `aabb`, in the model frame, has `resolution` R cells and R + 1 ver
 vertex i is at `lo + i (hi - lo) / R`. Vertices are stored in bricks of 8 x 8 x 8 as `player.bricks`
 describes. A cell is live when its eight corners are stored; outside live cells the density is 0.
 
+CONTRACTED. Where `contracted` is true the box is [-2, 2]^3 of contracted coordinates (`player.contraction`),
+which are those of the model frame inside its unit ball and hold the rest of space around it.
+
 DENSITY. `log sigma = lo + (hi - lo) code / 255` with `density_range`; the code is interpolated, sigma is
 per model unit.
 
 FEATURES. The features of a ray are the sum of weight times trilinear code; scales are folded into the head.
 `dirs` are unit directions in the model frame.
 
-MARCH. `player.march`, with the step `step`; `n_samples` fetches as `player.few_samples` chooses them.
+MARCH. `player.march`, with the step `step`; `player.contracted_march` where `contracted` is true. `n_samples`
+fetches as `player.few_samples` chooses them.
 
 COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [2, 0]; unknown keys of a newer minor are ignored |
+| `version` | [major, minor] | [2, 1]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
 | `resolution` | integer, 1..2048 | cells per axis |
 | `aabb` | 2 x 3 numbers | box, model frame |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
-| `step` | number > 0 | distance between samples, model units; at most 65536 along the diagonal |
+| `contracted` | true or false | since 2.1; false where it is missing |
+| `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
 | `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
 | `n_channels` | integer, 1..1024 | |
@@ -48,7 +53,8 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | `provenance` | object | settings and measured figures, free form |
 
 Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
-History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports.
+History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports; 2.1,
+contracted.
 """
 
 from __future__ import annotations
@@ -63,7 +69,9 @@ from typing import Any
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
-VERSION = (2, 0)
+VERSION = (2, 1)
+SINCE = {"contracted": (2, 1)}
+"""Keys that older minor versions have not: their manifests stand for the default."""
 NAME = "manifest.json"
 FILES = (
     "brick_coords.npy",
@@ -77,6 +85,7 @@ FILES = (
 MAX_BYTES = 16 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
+CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
 
@@ -108,6 +117,7 @@ class Manifest:
     view_size: tuple[int, ...]
     aabb: tuple[Vector, ...] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     world_from_model: tuple[Vector, ...] = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
+    contracted: bool = False
     n_samples: int = 5
     background: Vector = (1.0, 1.0, 1.0)
     colour_space: str = "srgb"
@@ -142,7 +152,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
-    known = {f.name for f in fields(Manifest)}
+    known = {f.name for f in fields(Manifest)} - {key for key, since in SINCE.items() if version < since}
     missing = sorted(known - set(document))
     if missing:
         raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
@@ -152,8 +162,8 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
             f"{where}: {ascii(unknown[0])[1:81]}: expected no such key in version {list(version)}"
         )
     values = {}
-    for key, parse in _PARSERS.items():
-        values[key] = parse(f"{where}: {key}", document[key])
+    for key in known:
+        values[key] = _PARSERS[key](f"{where}: {key}", document[key])
     absent = [name for name in FILES if name not in values["files"]]
     if complete and absent:
         raise FormatError(f"{where}: files: expected {absent[0]}, got {sorted(values['files'])}")
@@ -162,7 +172,8 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
 
 def manifest_bytes(manifest: Manifest) -> bytes:
     """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
-    document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
+    names = {f.name for f in fields(manifest)} - {k for k, since in SINCE.items() if manifest.version < since}
+    document: dict[str, Any] = {name: getattr(manifest, name) for name in names}
     document["format"] = FORMAT
     document["files"] = {
         name: {"bytes": entry.bytes, "sha256": entry.sha256} for name, entry in manifest.files.items()
@@ -200,6 +211,12 @@ def _parse_version(where: str, value: object) -> tuple[int, ...]:
 def _text(where: str, value: object) -> str:
     if not isinstance(value, str):
         raise FormatError(f"{where}: expected text, got {_show(value)}")
+    return value
+
+
+def _boolean(where: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise FormatError(f"{where}: expected true or false, got {_show(value)}")
     return value
 
 
@@ -311,6 +328,8 @@ def _check_together(manifest: Manifest) -> None:
         raise FormatError(f"manifest: aabb: expected lower corner below upper, got {manifest.aabb}")
     if not manifest.density_range[0] < manifest.density_range[1]:
         raise FormatError(f"manifest: density_range: expected low < high, got {manifest.density_range}")
+    if manifest.contracted and manifest.aabb != CONTRACTED_AABB:
+        raise FormatError(f"manifest: aabb: expected {CONTRACTED_AABB} where contracted, got {manifest.aabb}")
     if math.dist(low, high) > MAX_STEPS * manifest.step:
         raise FormatError(
             f"manifest: step: expected at most {MAX_STEPS} steps along the diagonal, got {manifest.step}"
@@ -324,6 +343,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "aabb": _matrix(2, 3),
     "world_from_model": _similarity,
     "step": _number(1e-9, 1e9),
+    "contracted": _boolean,
     "n_samples": _integer(0, 1024),
     "density_range": _numbers(2, -80, 80),
     "n_channels": _integer(1, 1024),

@@ -126,7 +126,7 @@ def collect_samples(
         if not alive.all():
             keep = np.flatnonzero(alive)
             state = tuple(a[..., keep] for a in state)
-    return _weigh(parts, tau, n_rays)
+    return weigh(parts, tau, n_rays)
 
 
 def _locate(
@@ -181,7 +181,7 @@ def _take_chunk(grid: SparseGrid, state: list[np.ndarray], tau: np.ndarray) -> t
     at = np.flatnonzero(is_live)
     f = [g.reshape(-1)[at] - cell.reshape(-1)[at] for g, cell in fractions]
     where = known.reshape(-1)[at].astype(np.int64) * 729 + corner.reshape(-1)[at]
-    code = _trilinear(grid.density, where, [x.astype(np.float32) for x in f])
+    code = trilinear(grid.density, where, [x.astype(np.float32) for x in f])
     optical = np.zeros((len(rays), CHUNK + 1), np.float32)
     optical[:, 0] = tau[rays]
     row, column = np.divmod(at, CHUNK)
@@ -196,7 +196,7 @@ def _take_chunk(grid: SparseGrid, state: list[np.ndarray], tau: np.ndarray) -> t
     return rays[row], s.reshape(-1)[at[kept]], depth_of_sample, before, after
 
 
-def _trilinear(density: np.ndarray, at: np.ndarray, f: list[np.ndarray]) -> np.ndarray:
+def trilinear(density: np.ndarray, at: np.ndarray, f: list[np.ndarray]) -> np.ndarray:
     """Codes between the corners of cells: along z, then y, then x."""
 
     def lerp(a: np.ndarray, b: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -210,7 +210,7 @@ def _trilinear(density: np.ndarray, at: np.ndarray, f: list[np.ndarray]) -> np.n
     return lerp(lerp(edge(0), edge(9), f[1]), lerp(edge(81), edge(90), f[1]), f[0])
 
 
-def _weigh(
+def weigh(
     parts: list[tuple[np.ndarray, ...]], tau: np.ndarray, n_rays: int
 ) -> tuple[Samples, np.ndarray, np.ndarray]:
     """Samples of all rounds, sorted by ray, with their weights; those without weight are dropped."""

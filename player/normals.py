@@ -3,16 +3,16 @@
 Letters: samples x_i with weights w_i as in `player.march`; sigma, the density. A pixel's normal is `N =
 normalise(- sum w_i grad log sigma(x_i))`: it points where density falls. The logarithm of the density is
 linear in the interpolated code (`player.density`), so that the gradient is that of the trilinear code in the
-sample's cell. It is summed before it is normalised: where the code is flat, inside a solid, there is no
-direction, and none is added.
+sample's cell; in contracted space it is pulled back to the model frame. It is summed before it is normalised:
+where the code is flat, inside a solid, there is no direction, and none is added.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from player.box import enter_box
-from player.march import collect_samples
+from player.contracted_rays import ContractedRays
+from player.marches import sampled_rays
 from player.sparse_grid import SparseGrid
 
 
@@ -33,10 +33,10 @@ def composited_normals(
     Returns:
         normals: [n, 3] float32, of unit length; 0 where no sample has weight or the gradients cancel.
     """
-    entries = enter_box(grid, rays_o, rays_d)
-    samples, _, _ = collect_samples(grid, entries, bounds)
-    g = entries.point[:, samples.ray] + samples.s * entries.direction[:, samples.ray]
-    slopes = code_gradient(grid, g) * grid.cells_per_unit[:, None]
+    places, samples, _ = sampled_rays(grid, rays_o, rays_d, bounds)
+    slopes = code_gradient(grid, places.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
+    if isinstance(places, ContractedRays):
+        slopes = places.pulled_back(slopes, samples.ray, samples.s)
     weights = samples.weights.astype(np.float64)
     normals = np.stack([-np.bincount(samples.ray, weights * slope, len(rays_o)) for slope in slopes], axis=-1)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)

@@ -107,7 +107,7 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else n_threads
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
-        self.march, self._module = choose_march(march)
+        self.march, self._module = choose_march(march, asset.manifest.contracted)
         self._write_pixels, self._directions = write_pixels, None
         if self.march == "numba":
             from player import pixels_compiled
@@ -203,7 +203,8 @@ class Renderer:
     ) -> None:
         """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
         index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
+        within = None if self._grid.contracted else bounds
+        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, within)
         if frame.features is not None:
             frame.features[index[result.hits]] = result.features
         if normals is not None:
@@ -265,6 +266,10 @@ class _View(NamedTuple):
 
     @classmethod
     def of(cls, grid: SparseGrid, camera: Camera) -> _View:
+        if grid.contracted:  # all of space: every pixel may meet something, from the camera on
+            shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
+            every = np.arange(shape[0] * shape[1])
+            return cls(camera, 0.0, every, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32))
         near, far = block_bounds(grid, camera)
         seen = far >= near
         size = grid.resolution / grid.cells_per_unit.astype(np.float64)
@@ -332,19 +337,20 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def choose_march(name: March) -> tuple[str, ModuleType]:
+def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
+    """Name and module of a march through a box, or through contracted space."""
     if name != "numpy":
-        from player import march_compiled
+        from player import contracted_march_compiled, march_compiled
 
         if march_compiled.available():
-            return "numba", march_compiled
+            return "numba", contracted_march_compiled if contracted else march_compiled
         if name == "numba":
             raise MissingExtraError(
                 "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
             )
-    from player import march
+    from player import contracted_march, march
 
-    return "numpy", march
+    return "numpy", contracted_march if contracted else march
 
 
 def import_ahead() -> None:

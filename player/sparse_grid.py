@@ -43,7 +43,7 @@ class SparseGrid:
     cells_per_unit: np.ndarray
     """[3] float32: grid coordinate = (x - aabb_min) * cells_per_unit, 0..R."""
     step: np.float32
-    """Distance between lattice samples in model units."""
+    """Distance between lattice samples in model units; dphi of `player.contracted_rays` if contracted."""
     density_low: np.float32
     density_slope: np.float32
     slot_coords: np.ndarray
@@ -55,6 +55,8 @@ class SparseGrid:
     base: np.ndarray
     ranks: np.ndarray
     features: np.ndarray
+    contracted: bool = False
+    """Whether the box is all of space, contracted."""
 
     @property
     def n_channels(self) -> int:
@@ -74,6 +76,7 @@ def build_grid(
     aabb: np.ndarray,
     step: float,
     density_range: tuple[float, float],
+    contracted: bool = False,
 ) -> SparseGrid:
     """Arrange the arrays of an asset for marching.
 
@@ -81,8 +84,9 @@ def build_grid(
         arrays: `brick_coords`, `brick_masks`, `density`, `features` as on disk, already checked.
         resolution: R, cells per axis.
         aabb: [2, 3] the box, model frame.
-        step: distance between lattice samples, model units.
+        step: distance between lattice samples, model units; dphi if contracted.
         density_range: log sigma at codes 0 and 255.
+        contracted: whether the box is all of space, contracted.
 
     >>> from player.bricks import pack_vertices
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((5, 5, 5))))
@@ -119,6 +123,7 @@ def build_grid(
         base=base,
         ranks=ranks,
         features=np.ascontiguousarray(features, np.int8),
+        contracted=contracted,
     )
 
 

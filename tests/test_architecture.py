@@ -34,7 +34,11 @@ LAZY = {
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
 TOP_LEVEL_EXCEPTIONS = {
-    *(("player/march_compiled.py", "numba"), ("player/eight_rows.py", "numba"), ("player/dense_tiles.py", "numba")),
+    *(
+        ("player/march_compiled.py", "numba"),
+        ("player/eight_rows.py", "numba"),
+        ("player/dense_tiles.py", "numba"),
+    ),
     ("vfr_bake/options.py", "tyro"),
 }
 

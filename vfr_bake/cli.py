@@ -221,7 +221,7 @@ def _bake(options: Any) -> int:
     from vfr_bake.training.model_file import load_model
 
     model = load_model(options.model)
-    check_bakeable(model)
+    check_bakeable(model, options.config)
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
     print(

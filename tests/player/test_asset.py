@@ -264,6 +264,23 @@ def test_versions(asset: Asset) -> None:
             parse_manifest(json.dumps(document | {"version": version}).encode(), "m.json")
 
 
+def test_a_manifest_of_the_minor_before_is_one_of_a_box(asset: Asset) -> None:
+    document = json.loads(manifest_bytes(asset.manifest)) | {"version": [2, 0]}
+    with pytest.raises(FormatError, match="contracted: expected no such key in version"):
+        parse_manifest(json.dumps(document).encode(), "m.json")
+    del document["contracted"]
+    older = parse_manifest(json.dumps(document).encode(), "m.json")
+    assert older == replace(asset.manifest, version=(2, 0)) and not older.contracted
+    assert parse_manifest(manifest_bytes(older), "m.json") == older
+
+
+def test_contracted_space_has_one_box(asset: Asset) -> None:
+    space = ((-2, -2, -2), (2, 2, 2))
+    assert replace(asset.manifest, contracted=True, aabb=space).contracted
+    with pytest.raises(FormatError, match=r"aabb: expected .* where contracted"):
+        replace(asset.manifest, contracted=True)
+
+
 @pytest.mark.parametrize("text", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_nan_and_infinity_are_refused_both_ways(text: str, asset: Asset) -> None:
     data = manifest_bytes(asset.manifest).replace(b"30.5", text.encode())
@@ -292,8 +309,8 @@ def test_golden_manifest() -> None:
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
-        '"density_range":[0.0,1.0],"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
-        '"provenance":{},"resolution":6,"step":0.5,"version":[2,0],"view_size":[4,3],'
+        '"contracted":false,"density_range":[0.0,1.0],"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
+        '"provenance":{},"resolution":6,"step":0.5,"version":[2,1],"view_size":[4,3],'
         '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'
     )
 

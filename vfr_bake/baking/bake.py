@@ -30,6 +30,7 @@ from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
 from vfr_bake.baking.culling import CULLED_SHARE, cull, whole
 from vfr_bake.baking.estimate import make_plan
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
@@ -83,18 +84,19 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     model shows, or misses `max_loss_db`, `max_mb` or `target_ms`; then nothing is written.
     """
     check_target(folder, force)
-    check_bakeable(model)
+    check_bakeable(model, config)
     work = _Bake(model, config, report)
     return work.run(folder, force)
 
 
-def check_bakeable(model: Model) -> None:
+def check_bakeable(model: Model, config: BakeConfig) -> None:
     """Raises ConfigError for a field that an asset cannot hold."""
-    _ = model.occupancy  # says so if the scene is unbounded
-    config = model.field.config
+    field = model.field.config
     for name, needed in (("compositing", "features"), ("activation", "gelu")):
-        if getattr(config, name) != needed:
-            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(config, name)}")
+        if getattr(field, name) != needed:
+            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(field, name)}")
+    if field.unbounded and config.no_cull:
+        raise ConfigError("--no-cull: expected the model of an object, got that of an unbounded scene")
 
 
 class _Bake:
@@ -117,6 +119,8 @@ class _Bake:
             size = self.choice.mesh_resolution or layout.resolution
             mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
         mesh_bytes = ply_bytes(mesh)
+        if layout.contracted:
+            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         stored, taught = self._store(layout, len(mesh_bytes))
         if self.config.target_ms is not None:
             with self._part("pace"):
@@ -149,17 +153,11 @@ class _Bake:
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> tuple[np.ndarray, Layout]:
-        model, choice, resolution = self.model, self.choice, self.plan.resolution
         with self._part("visibility"):
-            if self.config.no_cull:
-                cells = whole(model, resolution)
-            else:
-                progress, most_db = self._progress("visibility"), CULLED_SHARE * choice.target_loss_db
-                cells = cull(model, resolution, self.held_out, self.config.weight_floor, most_db, progress)
-                self.left_out["cells"] = cells.report()
-        visible = cells.visible
-        layout = make_layout(visible, float(model.occupancy.step))
-        n_vertices, most = len(layout.vertices), self.plan.most_vertices
+            unbounded = self.model.field.config.unbounded
+            visible, step = self._weighty_cells() if unbounded else self._visible_cells()
+        layout = make_layout(visible, step, unbounded)
+        n_vertices, most, resolution = len(layout.vertices), self.plan.most_vertices, self.plan.resolution
         if n_vertices > most:
             raise TrainingError(
                 f"bake: vertices: expected at most {most:,}, which fit into {self.config.max_memory:g} GB of "
@@ -167,6 +165,23 @@ class _Bake:
                 "--resolution, raise --weight-floor, or allow more by --max-memory"
             )
         return visible, layout
+
+    def _weighty_cells(self) -> tuple[np.ndarray, float]:
+        """Cells and march step of an unbounded scene."""
+        resolution, floor = self.plan.resolution, self.config.weight_floor or WEIGHT_FLOOR
+        visible = weighty_cells(self.model, resolution, floor, self._progress("visibility"))
+        self.left_out["cells"] = f"{1 - visible.mean():.1%} of contracted space: no view gives them {floor:g}"
+        return visible, lattice_step(resolution)
+
+    def _visible_cells(self) -> tuple[np.ndarray, float]:
+        """The same of an object."""
+        model, step = self.model, float(self.model.occupancy.step)
+        if self.config.no_cull:
+            return whole(model, self.plan.resolution).visible, step
+        progress, most_db = self._progress("visibility"), CULLED_SHARE * self.choice.target_loss_db
+        cells = cull(model, self.plan.resolution, self.held_out, self.config.weight_floor, most_db, progress)
+        self.left_out["cells"] = cells.report()
+        return cells.visible, step
 
     def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
@@ -328,6 +343,8 @@ class _Bake:
             generator=f"vfr-bake {__version__}",
             resolution=layout.resolution,
             step=layout.step,
+            aabb=layout.aabb,
+            contracted=layout.contracted,
             density_range=layout.density_range,
             n_channels=n_channels,
             view_size=(camera.width, camera.height),
@@ -374,7 +391,7 @@ class _Bake:
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         with Renderer(asset) as renderer:
             for camera in views_between(self.model, N_PICTURES, seed=3):
-                full = render_image(self.model.field, self.model.occupancy, camera, self.model.background)
+                full = render_image(self.model.field, self.model.sampler, camera, self.model.background)
                 world: Camera = camera.transformed(self.model.world_from_model)
                 yield camera.name, full, renderer.render(world).rgb
 

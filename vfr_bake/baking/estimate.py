@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.errors import ConfigError
+from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
+from vfr_bake.baking.contracted import VERTEX_SHARE, rays_of_contracted_views
 from vfr_bake.baking.culling import FLOORS
 from vfr_bake.baking.refinement import BATCH
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
@@ -54,16 +56,14 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """
     choice, field = config.choice(), model.field.config
-    cell = float(np.median(pixel_footprints(model)))
-    resolution = config.resolution or round(2 * choice.cells_per_pixel / cell)
-    resolution = int(np.clip(resolution, 8, field.max_resolution))
-    n_floors = 0 if config.no_cull else len(FLOORS) if config.weight_floor is None else 1
-    cells = (n_floors + 4) * resolution**3
+    resolution = _resolution(model, config)
+    cells = _marks_bytes(model, config) * resolution**3
     vertex_bytes = 4 * field.n_channels + 13 * min(choice.n_channels, field.n_channels) + 60
-    n_vertices = STORED_SHARE * float(np.count_nonzero(occupied_cells(model, resolution)))
+    n_vertices = _vertices(model, resolution)
     allowed = config.max_memory * 1e9
     left = allowed - PROGRAM_BYTES - n_vertices * vertex_bytes
-    n_rays = int(np.clip(left / RAY_BYTES, FEWEST_RAYS, N_RAYS))
+    most_rays = UNBOUNDED_RAYS if field.unbounded else N_RAYS
+    n_rays = int(np.clip(left / RAY_BYTES, FEWEST_RAYS, most_rays))
     room = allowed - PROGRAM_BYTES - n_rays * RAY_BYTES
     if room <= 0 or PROGRAM_BYTES + cells > allowed:
         least = (PROGRAM_BYTES + max(cells, FEWEST_RAYS * RAY_BYTES)) / 1e9
@@ -75,6 +75,31 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     return Plan(resolution, n_rays, int(room / vertex_bytes), int(min(peak, allowed)))
 
 
+def _resolution(model: Model, config: BakeConfig) -> int:
+    choice, field = config.choice(), model.field.config
+    if config.resolution:
+        resolution = config.resolution
+    elif field.unbounded:
+        room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
+        resolution = min(choice.contracted_resolution, int(np.cbrt(room / _marks_bytes(model, config))))
+    else:
+        resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
+    return int(np.clip(resolution, 8, field.max_resolution))
+
+
+def _marks_bytes(model: Model, config: BakeConfig) -> int:
+    """For each cell, while it is decided which are stored."""
+    n_floors = len(FLOORS) if config.weight_floor is None and not model.field.config.unbounded else 1
+    return 4 + (0 if config.no_cull else n_floors)
+
+
+def _vertices(model: Model, resolution: int) -> float:
+    """How many vertices will be stored, roughly."""
+    if model.field.config.unbounded:
+        return VERTEX_SHARE * resolution**3
+    return STORED_SHARE * float(np.count_nonzero(occupied_cells(model, resolution)))
+
+
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     """How long the bake will take, from how long some of the model's own rays take here."""
     choice, camera = config.choice(), model.model_cameras()[0]
@@ -84,11 +109,14 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     times = []
     for _ in range(2):  # the first compiles
         begin = time.perf_counter()
-        model.occupancy.composited_features(model.field, rays_o, rays_d)
+        model.sampler.composited_features(model.field, rays_o, rays_d)
         times.append(time.perf_counter() - begin)
-    finer = max(model.occupancy.step * plan.resolution / 2, 1.0)
-    work = 0.0 if config.no_cull else finer * rays_of_views(model, plan.resolution)
-    work += plan.n_rays + VERTEX_COST * float(np.count_nonzero(occupied_cells(model, plan.resolution)))
+    work = plan.n_rays + VERTEX_COST * _vertices(model, plan.resolution)
+    if model.field.config.unbounded:
+        work += rays_of_contracted_views(model, plan.resolution)
+    elif not config.no_cull:
+        finer = max(model.occupancy.step * plan.resolution / 2, 1.0)
+        work += finer * rays_of_views(model, plan.resolution)
     n_rounds = 3 if choice.head_width else 2
     work += n_rounds * choice.refine_steps * BATCH * STEP_COST
     return times[-1] * work / N_TIMED

@@ -19,6 +19,9 @@ VERTEX_CHUNK = 1 << 18
 """Vertices evaluated at once: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
 """Optical depths of one march step at codes 0 and 255: from invisible to opaque, in steps of 5.9 %."""
+FAR = 30.0
+"""In contracted space a step has different lengths, from dphi on: codes begin at what is invisible even so
+many model units away, where a step is as long as its square."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,24 @@ class Layout:
     resolution: int
     step: float
     density_range: tuple[float, float]
+    contracted: bool = False
+
+    @property
+    def aabb(self) -> tuple[tuple[float, ...], ...]:
+        """The grid's box: that of an object, or of contracted space."""
+        edge = 2.0 if self.contracted else 1.0
+        return (-edge,) * 3, (edge,) * 3
+
+    def unit_points(self, rows: slice) -> np.ndarray:
+        """[n, 3] float32: where the vertices in `rows` are looked up in the unit cube of the field. Corners
+        of cells that stick out of contracted space, where the field has learnt nothing, take what is at its
+        border."""
+        points = self.vertices[rows] / self.resolution
+        if self.contracted:
+            centred = points - 0.5
+            norm = np.linalg.norm(centred, axis=-1, keepdims=True)
+            points = np.where(norm > 0.5, centred * (0.5 / np.maximum(norm, 0.5)) + 0.5, points)
+        return points.astype(np.float32)
 
     def arrays(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
         """The asset's arrays, from codes that need not be whole: [n_vertices], [n_vertices, n_channels]."""
@@ -44,9 +65,10 @@ class Layout:
         return build_grid(
             (a.brick_coords, a.brick_masks, a.density, a.features),
             self.resolution,
-            np.array([[-1.0] * 3, [1.0] * 3]),
+            np.array(self.aabb),
             self.step,
             self.density_range,
+            self.contracted,
         )
 
     def float_grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
@@ -55,12 +77,14 @@ class Layout:
         return replace(self.grid(density, empty), features=features)
 
 
-def make_layout(visible: np.ndarray, step: float) -> Layout:
+def make_layout(visible: np.ndarray, step: float, contracted: bool = False) -> Layout:
     """Layout of the corners of the cells `visible` [n, n, n] bool, for march steps of `step`."""
     vertices = corner_vertices(visible)
     coords, masks, order = pack_vertices(vertices)
-    density_range = (float(np.log(FAINTEST / step)), float(np.log(DENSEST / step)))
-    return Layout(coords, masks, vertices[order].astype(np.int16), len(visible), step, density_range)
+    longest = step * FAR**2 if contracted else step
+    density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
+    whole = vertices[order].astype(np.int16)
+    return Layout(coords, masks, whole, len(visible), step, density_range, contracted)
 
 
 def evaluate_vertices(
@@ -72,7 +96,7 @@ def evaluate_vertices(
     density = np.empty(n, np.float32)
     for start in range(0, n, VERTEX_CHUNK):
         rows = slice(start, start + VERTEX_CHUNK)
-        points = (layout.vertices[rows] / layout.resolution).astype(np.float32)
+        points = layout.unit_points(rows)
         features[rows] = model.field.features(points)
         density[rows] = encode_density(model.field.log_densities(points), layout.density_range)
         progress(min(start + VERTEX_CHUNK, n), n)

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.box import Entries, enter_box
 from player.cameras import Camera
+from player.contracted_rays import ContractedRays
 from player.errors import TrainingError
-from player.few_samples import MIN_TOTAL, Samples, equal_mass_bins, heaviest
-from player.march import MIN_OPACITY, collect_samples
+from player.few_samples import MIN_TOTAL, Places, Samples, equal_mass_bins, heaviest
+from player.march import MIN_OPACITY
+from player.marches import sampled_rays
 from player.sparse_grid import ABSENT, SparseGrid
 from vfr_bake.kernels.stored_features import compose, corner_rows
 from vfr_bake.rendering.render import head_colours
@@ -41,6 +42,8 @@ class Lessons:
     """[n_fetches, 8] float32 of the corners, 1 in all."""
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
+    lengths: np.ndarray
+    """[n_fetches] float32 way that a sample stands for, model units."""
     dirs: np.ndarray
     """[n, 3] float32 unit view directions."""
     opacity: np.ndarray
@@ -93,7 +96,7 @@ def teach(
     for done, camera in enumerate(cameras):
         rays_o, rays_d = camera.rays()
         some = random.choice(len(rays_o), min(len(rays_o), max(n_rays // len(cameras), 1)), replace=False)
-        features, opacity, _ = model.occupancy.composited_features(model.field, rays_o[some], rays_d[some])
+        features, opacity, _ = model.sampler.composited_features(model.field, rays_o[some], rays_d[some])
         met = np.flatnonzero(opacity > 0)
         some, features, opacity = some[met], features[met], opacity[met]
         colours = head_colours(model.field, features, rays_d[some]) * opacity[:, None]
@@ -128,10 +131,9 @@ def player_fetches(
     them.
 
     Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8],
-    shares [n_fetches, 8], weights [n_fetches]).
+    shares [n_fetches, 8], weights [n_fetches], lengths [n_fetches]).
     """
-    entries = enter_box(grid, rays_o, rays_d)
-    samples, tau, _ = collect_samples(grid, entries, None)
+    entries, samples, tau = sampled_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)
@@ -158,13 +160,15 @@ def player_fetches(
     shares /= np.where(stored, total, 1)[:, None]
     weights = np.where(stored, weights, np.float32(0)).astype(np.float32)
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    return hits, opacity[hits], (counts, rows, shares, weights)
+    contracted = isinstance(entries, ContractedRays)
+    lengths = entries.lengths(ray, s) if contracted else np.full(len(ray), grid.step)
+    return hits, opacity[hits], (counts, rows, shares, weights, lengths)
 
 
 def _corners(
-    grid: SparseGrid, entries: Entries, ray: np.ndarray, s: np.ndarray
+    grid: SparseGrid, entries: Places, ray: np.ndarray, s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    points = entries.point[:, ray] + s * entries.direction[:, ray]
+    points = entries.at(ray, s)
     rows, shares = np.empty((len(ray), 8), np.int32), np.empty((len(ray), 8), np.float32)
     corner_rows(
         np.ascontiguousarray(points, np.float32), grid.resolution, grid.n_per_axis, grid.bricks, grid.base,

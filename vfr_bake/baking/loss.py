@@ -15,7 +15,7 @@ import numpy as np
 
 from player.errors import TrainingError
 from player.march import MIN_OPACITY
-from player.march_compiled import march
+from player.render import choose_march
 from player.sparse_grid import SparseGrid
 from vfr_bake.baking.views import views_between
 from vfr_bake.rendering.render import head_colours
@@ -59,7 +59,7 @@ class HeldOut:
             rays.append((rays_o[some], rays_d[some]))
         self.rays_o, self.rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         self.background = model.background
-        features, opacity, _ = model.occupancy.composited_features(model.field, self.rays_o, self.rays_d)
+        features, opacity, _ = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
         self._hits = np.flatnonzero(opacity > 0)
         self._features, self._opacity = features[self._hits], opacity[self._hits, None]
         self._field = model.field
@@ -106,6 +106,7 @@ class HeldOut:
 
     def shown(self, grid: SparseGrid, head: Head, n_samples: int) -> tuple[np.ndarray, np.ndarray]:
         """Colours [n, 3] over the background as played, and the samples taken of each ray that hits."""
+        march = choose_march("numba", grid.contracted)[1].march
         played = march(grid, self.rays_o, self.rays_d, n_samples)
         rgb = (1 - played.opacity[:, None]) * self.background
         hits = played.hits

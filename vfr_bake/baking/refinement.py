@@ -78,7 +78,7 @@ def refine(
         some = random.integers(0, len(lessons), BATCH)
         if grid is not None:
             weigh(
-                some, *where, density, grid.density_low, grid.density_slope, grid.step, MAX_TAU,
+                some, *where, density, grid.density_low, grid.density_slope, lessons.lengths, MAX_TAU,
                 lessons.weights, lessons.opacity,
             )  # fmt: skip
         composed = torch.from_numpy(lessons.composed(features, some)).requires_grad_(code_rate > 0)
@@ -90,7 +90,7 @@ def refine(
             assert composed.grad is not None and opacity.grad is not None
             descend_density(
                 some, *where, lessons.weights, lessons.opacity, features, composed.grad.numpy(),
-                opacity.grad.numpy(), grid.density_low, grid.density_slope, grid.step,
+                opacity.grad.numpy(), grid.density_low, grid.density_slope, lessons.lengths,
                 np.float32(DENSITY_RATE) * falling, density, steep_density,
             )  # fmt: skip
         if composed.grad is not None:

@@ -3,10 +3,10 @@
 Letters: lesson i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
 weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
 x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
-of a ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) step, T_j = exp(-sum_{i<j}
-delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as the integer
-nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the latent as
-if there were no rounding (straight through).
+of a ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) lengths[j], T_j =
+exp(-sum_{i<j} delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as
+the integer nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the
+latent as if there were no rounding (straight through).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, stee
 
 
 @njit(parallel=True, cache=True)
-def weigh(lessons, starts, rows, shares, latent, low, slope, step, opaque, weights, opacity):
+def weigh(lessons, starts, rows, shares, latent, low, slope, lengths, opaque, weights, opacity):
     """Weights of the fetches of `lessons`, and their opacity, from the latent density codes [n_vertices];
     both in place. Behind the optical depth `opaque` nothing weighs."""
     for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
@@ -81,7 +81,7 @@ def weigh(lessons, starts, rows, shares, latent, low, slope, step, opaque, weigh
                 code = np.float32(0)
                 for corner in range(8):
                     code += shares[j, corner] * np.rint(latent[rows[j, corner]])
-                delta = np.exp(low + slope * code) * step
+                delta = np.exp(low + slope * code) * lengths[j]
                 weights[j] = -np.exp(-tau) * np.expm1(-delta)
                 tau += delta
             opacity[lesson] = -np.expm1(-tau)
@@ -89,8 +89,8 @@ def weigh(lessons, starts, rows, shares, latent, low, slope, step, opaque, weigh
 
 @njit(cache=True)
 def descend_density(
-    lessons, starts, rows, shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope, step,
-    rate, latent, steepness,
+    lessons, starts, rows, shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope,
+    lengths, rate, latent, steepness,
 ):  # fmt: skip
     """One step of Adagrad on the latent density codes [n_vertices], in place, kept within 0..255.
 
@@ -124,7 +124,7 @@ def descend_density(
             code = np.float32(0)
             for corner in range(8):
                 code += shares[first + j, corner] * np.rint(latent[rows[first + j, corner]])
-            delta = np.exp(low + slope * code) * step
+            delta = np.exp(low + slope * code) * lengths[first + j]
             behind -= weight * along[j]
             trans -= weight
             slant = (trans * along[j] - behind + left * gradient_of_opacity[i]) * delta * slope

@@ -141,7 +141,7 @@ def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lesso
     shares = np.zeros((n, 8), np.float32)
     shares[:, 3] = 1
     ones = np.ones(n, np.float32)
-    return Lessons(np.arange(n + 1), rows, shares, ones, dirs, ones.copy(), wanted, ones)
+    return Lessons(np.arange(n + 1), rows, shares, ones, ones, dirs, ones.copy(), wanted, ones)
 
 
 def test_refinement_brings_the_head_back_to_its_teacher() -> None:
@@ -181,12 +181,13 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path
     grid = Asset.open(tmp_path / "asset").grid
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_samples)
-    hits, opacity, (counts, rows, shares, weights) = player_fetches(grid, rays_o, rays_d, n_samples)
+    hits, opacity, (counts, rows, shares, weights, lengths) = player_fetches(grid, rays_o, rays_d, n_samples)
     assert np.array_equal(hits, played.hits) and len(hits) > 100
     np.testing.assert_array_equal(opacity, played.opacity[hits])
     lessons = lessons_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
     starts = np.concatenate([[0], np.cumsum(counts)])
     lessons = replace(lessons, starts=starts, rows=rows, shares=shares, weights=weights)
+    assert (lengths == grid.step).all()
     composed = lessons.composed(grid.features.astype(np.float32))
     # float32 sums of up to 127 in another order
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
@@ -202,14 +203,15 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     starts = np.arange(0, n * k + 1, k)
     density = random.integers(100, 200, n_vertices).astype(np.float32)
     values = random.integers(-90, 90, (n_vertices, 3)).astype(np.float32)
-    low, slope, step = np.float32(-7), np.float32(0.05), np.float32(0.05)
+    low, slope = np.float32(-7), np.float32(0.05)
+    lengths = random.uniform(0.02, 0.1, n * k).astype(np.float32)
     weights, opacity = np.zeros(n * k, np.float32), np.zeros(n, np.float32)
-    weigh(np.arange(n), starts, rows, shares, density, low, slope, step, np.float32(1e9), weights, opacity)
+    weigh(np.arange(n), starts, rows, shares, density, low, slope, lengths, np.float32(1e9), weights, opacity)
     gx, ga = random.normal(size=(n, 3)).astype(np.float32), random.normal(size=n).astype(np.float32)
 
     latent = torch.tensor(density, dtype=torch.float64, requires_grad=True)
     code = (latent[rows.astype(int)] * torch.from_numpy(shares).double()).sum(dim=1)
-    delta = (torch.exp(float(low) + float(slope) * code) * float(step)).reshape(n, k)
+    delta = (torch.exp(float(low) + float(slope) * code) * torch.from_numpy(lengths)).reshape(n, k)
     before = torch.cumsum(delta, dim=1) - delta
     w = torch.exp(-before) * -torch.expm1(-delta)
     np.testing.assert_allclose(weights.reshape(n, k), w.detach().numpy(), atol=1e-6)
@@ -227,7 +229,7 @@ def test_density_gradient_is_that_of_the_composite() -> None:
         steepness = np.full(n_vertices, 1e30, np.float32)
         descend_density(
             np.array([lesson]), starts, rows, shares, weights, opacity, values, gx[lesson : lesson + 1],
-            ga[lesson : lesson + 1], low, slope, step, np.float32(1e13), fresh, steepness,
+            ga[lesson : lesson + 1], low, slope, lengths, np.float32(1e13), fresh, steepness,
         )  # fmt: skip
         moved += (density - fresh) * 100
     wanted = latent.grad.numpy()

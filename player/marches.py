@@ -1,0 +1,34 @@
+"""Samples along rays through either kind of grid: the box of an object, or all of space, contracted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from player import contracted_march, march
+from player.box import Entries, enter_box
+from player.contracted_rays import ContractedRays, enter_space
+from player.few_samples import Samples
+from player.sparse_grid import SparseGrid
+
+
+def sampled_rays(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[Entries | ContractedRays, Samples, np.ndarray]:
+    """Rays in grid coordinates, all their samples with weight, and tau [n] of each; by the numpy marches.
+
+    Args:
+        grid: the sparse grid.
+        rays_o: [n, 3] float32 origins, model frame.
+        rays_d: [n, 3] float32 unit directions, model frame.
+        bounds: optional [n] float32 `near` and `far` in a box, as for `player.march.march`.
+    """
+    if grid.contracted:
+        rays = enter_space(grid, rays_o, rays_d)
+        samples, tau, _ = contracted_march.collect_samples(grid, rays)
+        return rays, samples, tau
+    entries = enter_box(grid, rays_o, rays_d)
+    samples, tau, _ = march.collect_samples(grid, entries, bounds)
+    return entries, samples, tau

@@ -1,0 +1,151 @@
+"""The bake of an unbounded scene: which cells, and whole on a small one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from exporters.export import export_asset
+from exporters.ply import read_ply
+from player import contracted_march_compiled
+from player.asset import Asset
+from player.contraction import contract
+from player.render import render
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.contracted import lattice_step, weighty_cells
+from vfr_bake.baking.grids import make_layout
+from vfr_bake.baking.lessons import Lessons, Taught, collect_lessons
+from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
+from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.scene import build_scene
+from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
+from vfr_bake.rendering.render import render_image
+from vfr_bake.training.metrics import psnr
+from vfr_bake.training.model_file import Model
+from vfr_bake.training.trainer import Trainer
+
+
+def quiet(*_: object) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    scene = build_scene(demo_capture(size=48, n_train=16, n_test=2), "unbounded")
+    field = FieldOptions(n_levels=6, max_resolution=128, log2_table_size=14, head_width=32)
+    config = TrainConfig(device="cpu", field=field, steps=300, pilot_steps=60, batch_rays=128)
+    trainer = Trainer(scene, config)
+    for _ in trainer.run():
+        pass
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
+    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, False, {}, {})
+
+
+@pytest.fixture(scope="module")
+def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bake") / "asset"
+    settings = BakeConfig(
+        resolution=96, mesh_resolution=24, refine_steps=60, head_width=0, check_views=1, n_channels=10
+    )
+    bake(model, folder, settings, quiet)
+    return folder
+
+
+def test_cells_are_where_intervals_weigh() -> None:
+    """Two rays along x from the middle: one with a short heavy interval inside and a thin one, one with a
+    long interval from 2 to 500, whose cells share its weight."""
+    rays_o = np.zeros((2, 3), np.float32)
+    rays_d = np.float32([[1, 0, 0], [-1, 0, 0]])
+    t_mid, deltas = np.float32([0.55, 0.8, 251]), np.float32([0.01, 0.01, 498])
+    weights, starts, counts = np.float32([0.5, 0.001, 0.9]), np.array([0, 2]), np.array([2, 1])
+
+    def marked(floor: float) -> list[int]:
+        visible = np.zeros((32, 32, 32), np.uint8)
+        mark_weighty_cells(rays_o, rays_d, t_mid, deltas, weights, starts, counts, np.float32(floor), visible)
+        assert set(np.argwhere(visible)[:, 1]) <= {16}, "y and z stay in the middle"
+        return sorted(np.argwhere(visible)[:, 0].tolist())
+
+    # 0.55 is in cell (0.55 + 2) * 8; contracted, -2 to -500 is -1.5 to -1.998: cells 4 to 0
+    assert marked(0.05) == [0, 1, 2, 3, 20]
+    assert marked(0.0005) == [0, 1, 2, 3, 20, 22]
+    assert marked(0.95) == []
+
+
+def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
+    cells = weighty_cells(model, 64, 0.01, quiet)
+    assert 0.0005 < cells.mean() < 0.2
+    few = weighty_cells(model, 64, 0.3, quiet)
+    assert few.sum() < cells.sum()
+    camera = model.model_cameras()[0].c2w[:3, 3]
+    x, y, z = ((contract(camera) + 2) * 16).astype(int)
+    assert not cells[x, y, z], "a camera stands in empty space"
+
+
+def test_the_asset_plays_what_the_model_shows(model: Model, folder: Path) -> None:
+    asset = Asset.open(folder, verify=True)
+    assert asset.manifest.contracted and asset.manifest.step == pytest.approx(lattice_step(96))
+    camera = model.model_cameras()[2]
+    wanted = render_image(model.field, model.sampler, camera, model.background)
+    frame = render(asset, model.cameras[2])
+    assert psnr(frame.rgb, wanted) > 24
+    _, opacity, depth = model.sampler.composited_features(model.field, *camera.rays())
+    solid = (opacity.reshape(48, 48) > 0.99) & (depth.reshape(48, 48) < 3)
+    assert solid.sum() > 100
+    found = frame.depth[solid] / asset.scale
+    assert np.median(np.abs(found / depth.reshape(48, 48)[solid] - 1)) < 0.03
+    assert np.linalg.norm(frame.normals[solid], axis=-1) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("k", [0, 4])
+def test_a_lesson_composes_what_the_player_composes(model: Model, folder: Path, k: int) -> None:
+    grid = Asset.open(folder).grid
+    rays_o, rays_d = model.model_cameras()[3].rays()
+    played = contracted_march_compiled.march(grid, rays_o, rays_d, k)
+    nothing = np.zeros((len(rays_o), 3), np.float32)
+    taught = Taught(rays_o, rays_d, nothing, nothing, nothing[:, 0])
+    lessons: Lessons = collect_lessons(taught, grid, k)
+    assert len(lessons) == len(played.hits) > 1000
+    composed = lessons.composed(grid.features.astype(np.float32))
+    np.testing.assert_allclose(composed, played.features, rtol=0, atol=5e-3)
+    np.testing.assert_allclose(lessons.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
+    if k == 0:  # the ways of the samples are what makes their weights
+        code = (lessons.shares * _codes(folder)[lessons.rows]).sum(axis=1)
+        optical = np.exp(grid.density_low + grid.density_slope * code) * lessons.lengths
+        first = lessons.starts[:-1]
+        np.testing.assert_allclose(-np.expm1(-optical[first]), lessons.weights[first], rtol=1e-3, atol=1e-6)
+
+
+def _codes(folder: Path) -> np.ndarray:
+    return np.asarray(Asset.open(folder).arrays.density, np.float32)
+
+
+def test_vertices_outside_contracted_space_take_its_border() -> None:
+    layout = make_layout(np.ones((8, 8, 8), bool), 0.01, contracted=True)
+    points = layout.unit_points(slice(None)) * 4 - 2
+    assert np.linalg.norm(points, axis=-1).max() < 2 + 1e-5
+    inside = np.linalg.norm(layout.vertices / 2.0 - 2, axis=-1) <= 2
+    np.testing.assert_allclose(points[inside], layout.vertices[inside] / 2.0 - 2, atol=1e-6)
+
+
+def test_exports_hold_the_inner_region_in_world_units(model: Model, folder: Path, tmp_path: Path) -> None:
+    asset = Asset.open(folder)
+    centre = model.world_from_model[:3, 3]
+    mesh = read_ply(folder / "mesh.ply")
+    assert len(mesh.faces) > 50
+    for name in ("a.ply", "a.npz", "a.vdb"):
+        facts = export_asset(folder, tmp_path / name)
+        low, high = np.array(facts["bounds"])
+        assert (np.abs(np.stack([low, high]) - centre) <= asset.scale * 1.001).all(), name
+    again = export_asset(folder, tmp_path / "b.ply", _options(method="density"))
+    assert again["faces"] > 50
+    assert (np.abs(np.array(again["bounds"]) - centre) <= asset.scale * 1.001).all()
+    densities = np.load(tmp_path / "a.npz")
+    assert len(densities["density"]) < len(asset.arrays.density), "the surroundings are left out"
+
+
+def _options(**settings: object) -> object:
+    from exporters.formats import ExportOptions
+
+    return ExportOptions(**settings)  # type: ignore[arg-type]
