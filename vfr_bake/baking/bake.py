@@ -56,8 +56,8 @@ N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
 NEW_HEAD_RATE = 3e-3
 """Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
-DIRECTION_LOSS_DB = 0.02
-"""A small head leaves the direction out where that is expected to lose no more."""
+DIRECTION_SHARE = 0.1
+"""Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PLAYS_NOTHING = 6.0
@@ -316,7 +316,7 @@ class _Bake:
         """A small head that has not learned yet; without directions where the colours do not need them."""
         choice, n_bands = self.choice, min(self.choice.head_bands, own.sh_degree)
         lost = self.held_out.direction_loss()
-        if lost < DIRECTION_LOSS_DB:
+        if lost < DIRECTION_SHARE * choice.target_loss_db:
             n_bands = 1
             self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
         elif n_bands < own.sh_degree:

@@ -305,7 +305,8 @@ def test_a_budget_takes_the_channels_that_fit(model: Model, tmp_path: Path) -> N
     # Room for about half of the features, beside what is kept for the head.
     limit = (sum(sizes.values()) - sizes["features.codes"] / 2 + SMALL_FILES) / 1e6
     result = bake(model, tmp_path / "half", BakeConfig(max_mb=limit, **small), quiet)
-    assert 4 <= Asset.open(tmp_path / "half").manifest.n_channels <= 9
+    # The first channels take the most bytes.
+    assert 2 <= Asset.open(tmp_path / "half").manifest.n_channels <= 7
     assert result.n_bytes / 1e6 <= limit
 
 
@@ -345,8 +346,9 @@ def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
 def test_the_grid_is_as_fine_as_the_pictures_and_never_finer_than_the_field(
     model: Model, tmp_path: Path
 ) -> None:
-    cell_of_a_pixel = 2 * 1.25 / float(np.median(pixel_footprints(model)))
-    assert 40 < cell_of_a_pixel < 96, "balanced: 1.25 cells a pixel"
+    per_pixel = PRESETS["balanced"].cells_per_pixel
+    cell_of_a_pixel = 2 * per_pixel / float(np.median(pixel_footprints(model)))
+    assert 40 < cell_of_a_pixel < 96
     bake(model, tmp_path / "a", BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1), quiet)
     assert Asset.open(tmp_path / "a").manifest.resolution == round(cell_of_a_pixel)
     finest = BakeConfig(resolution=500, mesh_resolution=16, refine_steps=0, check_views=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from player.asset import Asset
@@ -13,7 +14,7 @@ from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.trainer import Trainer
 
-MAX_MB = 1.0
+MAX_MB = 0.6
 
 
 def quiet(*_: object) -> None:
@@ -21,16 +22,18 @@ def quiet(*_: object) -> None:
 
 
 def trained(kind: str) -> Model:
-    scene = analytic_scene(kind, size=48, n_train=20)
-    field = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
+    scene = analytic_scene(kind, size=40, n_train=16)
+    field = FieldOptions(
+        n_levels=6, max_resolution=48, log2_table_size=13, head_width=24, density_width=16, sh_degree=3
+    )
     config = TrainConfig(
-        device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=32
+        device="cpu", field=field, steps=400, pilot_steps=60, batch_samples=4096, occupancy_resolution=32
     )
     trainer = Trainer(scene, config)
-    for _ in trainer.run():
-        pass
+    losses = [step.loss for step in trainer.run()]
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})
+    figures = {"training_psnr": float(-10 * np.log10(np.mean(losses[-50:])))}
+    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, figures)
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +42,13 @@ def chosen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     found = {}
     for kind in ("matte", "glossy", "fog"):
         folder = tmp_path_factory.mktemp(kind) / "asset"
-        settings = BakeConfig(refine_steps=150, mesh_resolution=24, check_views=2, max_mb=MAX_MB)
+        settings = BakeConfig(
+            preset="fast", resolution=48, refine_steps=150, mesh_resolution=24, check_views=2, max_mb=MAX_MB
+        )
         bake(trained(kind), folder, settings, quiet)
         found[kind] = json.loads((folder / "report.json").read_text())
         found[kind]["manifest"] = Asset.open(folder, verify=True).manifest
+        print(kind, found[kind]["left_out"], found[kind]["lookups"], found[kind]["stages"][-1])
     return found
 
 

