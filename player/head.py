@@ -26,7 +26,8 @@ class Head:
     wastes none.
     """
 
-    def __init__(self, path: Path, n_channels: int) -> None:
+    def __init__(self, path: Path, n_channels: int, compiled: bool = False) -> None:
+        """Open the head; with `compiled`, numba runs the graph where it can (`player.head_compiled`)."""
         import onnxruntime as ort
         from onnxruntime.capi import onnxruntime_pybind11_state as state  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -54,6 +55,12 @@ class Head:
         _check_ports(path, "input", session.get_inputs(), {"features": n_channels, "dirs": 3})
         _check_ports(path, "output", session.get_outputs(), {"rgb": 3})
         self._session = session
+        self._run = self._by_onnxruntime
+        if compiled:
+            from player.head_compiled import compile_head
+            from player.onnx_graph import read_graph
+
+            self._run = compile_head(read_graph(data), n_channels) or self._by_onnxruntime
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         """Colours of n pixels.
@@ -71,20 +78,23 @@ class Head:
         rgb = np.empty((len(features), 3), np.float32)
         for start in range(0, len(features), CHUNK):
             part = slice(start, start + CHUNK)
-            rgb[part] = self._run(features[part], dirs[part])
+            rgb[part] = self._checked(self._run(features[part], dirs[part]), len(features[part]))
         return rgb
 
-    def _run(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+    def _by_onnxruntime(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         try:
             out = np.asarray(self._session.run(["rgb"], {"features": features, "dirs": dirs})[0])
         except self._failures as error:
             raise FormatError(
                 f"{self._path}: expected a head that runs, got: {_first_line(error)}"
             ) from error
-        if out.shape != (len(features), 3) or not np.isfinite(out).all():
+        return out
+
+    def _checked(self, out: np.ndarray, n: int) -> np.ndarray:
+        if out.shape != (n, 3) or not np.isfinite(out).all():
             raise FormatError(
-                f"{self._path}: rgb: expected {len(features)} finite colours, got "
-                f"{'NaN or infinity' if out.shape == (len(features), 3) else list(out.shape)}"
+                f"{self._path}: rgb: expected {n} finite colours, got "
+                f"{'NaN or infinity' if out.shape == (n, 3) else list(out.shape)}"
             )
         return out
 

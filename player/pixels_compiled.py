@@ -1,6 +1,6 @@
 """What surrounds the march, compiled by numba: pixels of blocks to rays, and what was found into the frame.
 
-Each function has its readable twin in `player.render`, which gives the same to float32 rounding. In numpy
+Each function has its readable twin in `player.pixels`, which gives the same to float32 rounding. In numpy
 they took a tenth of a frame.
 """
 
@@ -33,7 +33,7 @@ def write_pixels(
     behind: tuple[float, float, float] | None,
     depth_from: tuple[float, float],
 ) -> None:
-    """As `player.render.write_pixels`."""
+    """As `player.pixels.write_pixels`."""
     start, scale = depth_from
     colour = (0.0, 0.0, 0.0) if behind is None else behind
     _write(

@@ -34,11 +34,7 @@ LAZY = {
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
 TOP_LEVEL_EXCEPTIONS = {
-    *(
-        ("player/march_compiled.py", "numba"),
-        ("player/eight_rows.py", "numba"),
-        ("player/dense_tiles.py", "numba"),
-    ),
+    *((f"player/{name}.py", "numba") for name in ("march_compiled", "eight_rows", "dense_tiles")),
     ("vfr_bake/options.py", "tyro"),
 }
 

@@ -42,7 +42,7 @@ def serve(arguments: argparse.Namespace) -> None:
     port = free_port(host, arguments.port)
     with Renderer(asset, arguments.threads, arguments.march) as renderer:
         with redirect_stdout(io.StringIO()):  # its banner: ours is the one line that scripts read
-            server = viser.ViserServer(host=host, port=port, label=_title(asset), verbose=False)
+            server = local_server(viser)(host=host, port=port, label=_title(asset), verbose=False)
         try:
             windows = open_windows(server, renderer, arguments.samples, arguments.background)
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
@@ -118,6 +118,17 @@ def _viser(files: str) -> Any:
             f"or render files: {files}"
         ) from error
     return viser
+
+
+def local_server(viser: Any) -> type:
+    """viser's server, but deaf to a client that asks for a way in from the internet (share.viser.studio): to
+    hide the button does not keep a client from asking."""
+
+    class LocalServer(viser.ViserServer):
+        def request_share_url(self, verbose: bool = True) -> None:
+            return None
+
+    return LocalServer
 
 
 def _title(asset: Asset) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player import pixels_compiled
+from player import pixels, pixels_compiled
 from player import render as render_module
 from player.asset import Asset
 from player.bounds import BLOCK, block_bounds
@@ -211,7 +211,7 @@ def test_compiled_pixels_are_numpys(behind: tuple[float, float, float] | None, h
     counts, none = np.arange(5, dtype=np.int32), np.zeros((len(hits), 4), np.float32)
     result = MarchResult(opacity, depth.astype(np.float32), counts, np.array(hits, np.int64), none)
     frames = []
-    for write in (render_module.write_pixels, pixels_compiled.write_pixels):
+    for write in (pixels.write_pixels, pixels_compiled.write_pixels):
         frame = (*(np.full(shape, 7, np.float32) for shape in ((6, 3), 6, 6)), np.full(6, 7, np.int32))
         write(frame, np.array([5, 0, 3, 1, 2]), result, rgb.astype(np.float32), behind, (0.5, 2.0))
         frames.append(frame)

@@ -26,7 +26,7 @@ from player.render import Renderer
 from player.transforms import read_cameras
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.pace import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, Pace, fitted
-from player.viewer.server import free_port
+from player.viewer.server import free_port, local_server
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SECONDS = 120.0
@@ -62,6 +62,25 @@ def test_one_hiccup_halves_the_picture_at_most() -> None:
 
 def test_the_sharp_picture_is_there_within_a_second() -> None:
     assert SHARP_SECONDS + 0.15 < 1 and fitted(1, 1, 0.0) == (1, 1) and fitted(3000, 2, 600) == (949, 1)
+
+
+# --- who gets in ---
+
+
+def test_a_client_cannot_open_a_way_in_from_the_internet(monkeypatch: pytest.MonkeyPatch) -> None:
+    import viser
+    from viser import _messages, _viser
+
+    asked = []
+    monkeypatch.setattr(_viser, "ViserTunnel", lambda *address: asked.append(address))
+    server = local_server(viser)(host="127.0.0.1", port=free_port("127.0.0.1", None), verbose=False)
+    try:
+        for handler in server._websock_server._incoming_handlers[_messages.ShareUrlRequest]:
+            handler(0, _messages.ShareUrlRequest())
+        server._thread_executor.shutdown(wait=True)
+    finally:
+        server.stop()
+    assert not asked
 
 
 # --- layers ---
