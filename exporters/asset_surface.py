@@ -2,8 +2,9 @@
 
 Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
 (`player.density`); v, the size of a voxel; dt, the step of the march. The default level is the density that
-is half opaque over a voxel or a step, whichever is longer, sigma = ln 2 / max(v, dt): what the player draws
-as solid. Only live cells are cut, those whose eight corners are stored: what no training view has seen is
+is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields are
+soft at their surface, and of the levels tried this one has the player's outlines and lies on known geometry
+in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what no training view has seen is
 neither empty nor full, and no surface is made up there. The mesh is open where they end.
 
 Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
@@ -80,8 +81,8 @@ def voxel_size(grid: SparseGrid) -> float:
 
 
 def half_opaque(grid: SparseGrid) -> float:
-    """The density, in 1/model unit, that is half opaque over a voxel or a step, whichever is longer."""
-    return math.log(2) / max(voxel_size(grid), float(grid.step))
+    """The density, in 1/model unit, that is half opaque over two voxels or two steps, whichever are longer."""
+    return math.log(2) / (2 * max(voxel_size(grid), float(grid.step)))
 
 
 def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float) -> np.ndarray:
