@@ -13,7 +13,6 @@ from player.errors import DataError, MissingExtraError
 from tests.exporters.test_training_views import BLACK, HAS_OPEN3D, all_around, camera, sphere_view
 
 
-
 def test_a_ball_again() -> None:
     if not HAS_OPEN3D:
         return
