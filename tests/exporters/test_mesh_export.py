@@ -78,8 +78,8 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
     suffix: str, cube_asset: Asset, tmp_path: Path
 ) -> None:
     """The same surface twice, with colours at its corners and in a picture: at the corners they agree, but
-    for the directions: a corner fits what all cameras see, a texel is the mean of four, of a head whose colours
-    turn with them by up to 60 levels."""
+    for the directions: a corner fits what all cameras see, a texel is the mean of four, of a head whose
+    colours turn with them by up to 60 levels."""
     target = tmp_path / f"a.{suffix}"
     asked = shlex.split("--level 20 --faces 1500 --texture 256")
     assert cli.main([str(cube_asset.folder), str(target), *asked]) == 0
