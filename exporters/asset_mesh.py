@@ -5,22 +5,28 @@ training camera sees is taken away.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from exporters.asset_surface import extract_asset_surface, voxel_size
+from exporters.colour_fit import fit_colours
 from exporters.formats import Method
 from exporters.mesh import TriangleMesh, take_faces
+from exporters.mesh_rays import MeshRays
 from exporters.surface import remove_small_components
 from exporters.surface_colour import surface_colours
 from exporters.training_views import FULL_PIXELS, TOLERANCE, DepthView, depth_views, seen_vertices
 from player.asset import Asset
-from player.errors import DataError
+from player.errors import DataError, MissingExtraError
 
 FLOATER_FRACTION = 1e-4
 """Connected parts with a smaller share of the faces are floaters and go."""
+
+FIT_TOLERANCE = 3.0
+"""Voxels between a pixel's depth and the mesh at which the pixel's colour still counts for it."""
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
@@ -46,8 +52,13 @@ class Scene:
 
     @cached_property
     def views(self) -> list[DepthView]:
-        """What the training cameras see, small: enough to tell what is hidden."""
+        """What the training cameras see."""
         return depth_views(self.asset, progress=lambda done, of: self.report("views", done, of))
+
+    @property
+    def voxel(self) -> float:
+        """Edge of the asset's voxels, world units."""
+        return voxel_size(self.asset.grid) * self.asset.scale
 
     def coloured(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`exporters.surface_colour.surface_colours` of this asset."""
@@ -55,15 +66,12 @@ class Scene:
             self.asset, points, normals, self.views, lambda done, of: self.report("colours", done, of)
         )
 
-    def surface(
-        self, method: Method, level: float | None, coloured: bool = True
-    ) -> tuple[TriangleMesh, Removed]:
-        """The surface made again, and what was removed of it.
+    def surface(self, method: Method, level: float | None) -> tuple[TriangleMesh, Removed]:
+        """The surface made again, white, and what was removed of it.
 
         Args:
             method: "density", marching cubes on the asset's density; "tsdf", depth pictures fused.
             level: density of the surface in 1/model unit, for "density".
-            coloured: else it is white.
 
         Raises:
             ConfigError: a level outside the data.
@@ -71,13 +79,12 @@ class Scene:
             MissingExtraError: a package is not installed.
         """
         matrix = self.asset.world_from_model
-        voxel = voxel_size(self.asset.grid) * self.asset.scale
         if method == "tsdf":
             from exporters.tsdf import fuse_depth
 
             full = depth_views(self.asset, FULL_PIXELS, lambda done, of: self.report("views", done, of))
             vertices, faces, normals = fuse_depth(
-                full, voxel, lambda done, of: self.report("fusion", done, of)
+                full, self.voxel, lambda done, of: self.report("fusion", done, of)
             )
         else:
             vertices, faces, normals = extract_asset_surface(
@@ -86,34 +93,58 @@ class Scene:
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
             normals = normals @ matrix[:3, :3].T / self.asset.scale
         mesh = TriangleMesh(vertices, faces, normals, np.full((len(vertices), 4), 255, np.uint8))
-        mesh, removed = cleaned(mesh, self.views, TOLERANCE * voxel)
-        if not coloured:
-            return mesh, removed
-        rgb, known = self.coloured(mesh.vertices, mesh.normals)
+        return cleaned(mesh, self.views, TOLERANCE * self.voxel)
+
+    def painted(self, mesh: TriangleMesh) -> TriangleMesh:
+        """A mesh on the surface with the colours that fit the training views best (`exporters.colour_fit`);
+        where they see nothing, and where Open3D is not to be had, the head's own."""
+        try:
+            rgb, known = fit_colours(
+                mesh,
+                self.views,
+                FIT_TOLERANCE * self.voxel,
+                lambda done, of: self.report("colours", done, of),
+            )
+        except MissingExtraError:
+            rgb, known = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices), bool)
+        rest = np.flatnonzero(~known)
+        rgb[rest], known[rest] = self.coloured(mesh.vertices[rest], mesh.normals[rest])
         colours = mesh.colours.copy()
         colours[:, :3] = np.rint(np.clip(rgb, 0, 1) * 255)
         if not known.all():  # beside the volume: what the corners around it are
             colours = _from_around(colours, known, mesh.faces)
-        return replace(mesh, colours=colours), removed
+        return replace(mesh, colours=colours)
 
 
 def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tuple[TriangleMesh, Removed]:
     """A mesh (world frame) without the faces that no view sees and without floaters, and what went.
 
-    A face is seen if a corner of it, or of a face that shares a corner, is: holes of one face would be made
-    by noise alone. `tolerance`: see `exporters.training_views.seen_vertices`.
+    A face is seen if a corner of it is: by a view that has nothing before it (`tolerance`: see
+    `exporters.training_views.seen_vertices`), or because a pixel hits a face there. The second keeps what
+    fills a hole, from whichever side it is seen; it needs Open3D, and where that is not to be had, it goes.
 
     Raises DataError: no face is seen.
     """
     seen = seen_vertices(views, mesh.vertices, mesh.normals, tolerance)
-    grown = np.zeros(len(mesh.vertices), bool)
-    grown[mesh.faces[seen[mesh.faces].any(axis=1)]] = True
-    keep = np.all(grown[mesh.faces], axis=-1)
+    with suppress(MissingExtraError):
+        seen |= _hit_vertices(mesh, views)
+    keep = seen[mesh.faces].any(axis=1)
     if not keep.any():
         raise DataError(f"surface: expected some of {len(keep)} faces in a training camera's view, got none")
     part = mesh if keep.all() else take_faces(mesh, keep)
     whole, n_floaters = remove_small_components(part, FLOATER_FRACTION)
     return whole, Removed(int((~keep).sum()), n_floaters, len(part.faces) - len(whole.faces))
+
+
+def _hit_vertices(mesh: TriangleMesh, views: list[DepthView]) -> np.ndarray:
+    """[n_vertices] bool: corners of the faces that pixels of the views hit."""
+    rays = MeshRays(mesh)
+    hit = np.zeros(len(mesh.faces), bool)
+    for view in views:
+        hit[rays.seen_by(view.camera).faces] = True
+    seen = np.zeros(len(mesh.vertices), bool)
+    seen[mesh.faces[hit]] = True
+    return seen
 
 
 def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> np.ndarray:

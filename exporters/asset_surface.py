@@ -2,9 +2,11 @@
 
 Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
 (`player.density`); v, the size of a voxel; dt, the step of the march. The default level is the density that
-is half opaque over a voxel or a step, whichever is longer, sigma = ln 2 / max(v, dt): what the player draws
-as solid. Only live cells are cut, those whose eight corners are stored: what no training view has seen is
-neither empty nor full, and no surface is made up there. The mesh is open where they end.
+is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields are
+soft at their surface, and of the levels tried this one has the player's outlines and lies on known geometry
+in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what no
+training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where they
+end.
 
 Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
 not by the box. A corner of the mesh lies on an edge of the grid, and the edge's number is what joins it
@@ -80,8 +82,8 @@ def voxel_size(grid: SparseGrid) -> float:
 
 
 def half_opaque(grid: SparseGrid) -> float:
-    """The density, in 1/model unit, that is half opaque over a voxel or a step, whichever is longer."""
-    return math.log(2) / max(voxel_size(grid), float(grid.step))
+    """The density, in 1/model unit, that is half opaque over two voxels or steps, whichever are longer."""
+    return math.log(2) / (2 * max(voxel_size(grid), float(grid.step)))
 
 
 def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float) -> np.ndarray:
@@ -148,7 +150,7 @@ def _code_level(grid: SparseGrid, level: float | None) -> float:
     if not (math.isfinite(level) and least < level < most):
         raise ConfigError(
             f"--level: expected a density between {least:.4g} and {most:.4g}, the range of the asset "
-            f"(without it {half_opaque(grid):.4g}, half opaque), got {level:g}"
+            f"(without it {half_opaque(grid):.4g}), got {level:g}"
         )
     return (math.log(level) - low) / slope
 

@@ -171,8 +171,9 @@ def _cloud(
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     from exporters.points import sample_points
 
-    mesh, facts = world_mesh(Scene(asset, report), options)
-    return sample_points(mesh, n_points), facts
+    scene = Scene(asset, report)
+    mesh, facts = world_mesh(scene, options)
+    return sample_points(scene.painted(mesh) if "method" in facts else mesh, n_points), facts
 
 
 def _in_frame(mesh: TriangleMesh, asset: Asset, options: ExportOptions, name: str) -> TriangleMesh:

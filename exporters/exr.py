@@ -163,7 +163,7 @@ def check_channels(path: Path, expected: dict[str, np.ndarray], got: dict[str, n
             )
         wrong = (array != other) & ~(np.isnan(array) & np.isnan(other))
         if wrong.any():
-            difference = np.abs(array.astype(np.float64) - other)[wrong]
+            difference = np.abs(array[wrong].astype(np.float64) - other[wrong])
             row, column = np.argwhere(wrong)[
                 int(np.nanargmax(np.where(np.isnan(difference), -1, difference)))
             ]

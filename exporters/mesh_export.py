@@ -1,7 +1,7 @@
 """A mesh file, or a few of them, out of an asset: surface, crop, fewer faces, texture, frame, bytes.
 
 Order: the surface as baked or made again, crop (world units), fewer faces, then for each level of detail the
-picture, the frame and the bytes. Everything is made and read back in memory, before any name appears.
+colours, the frame and the bytes. Everything is made and read back in memory, before any name appears.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ def export_mesh(
     for number, paths in enumerate(mesh_paths(target, options, name)):
         if number:
             mesh = _simplified(mesh, max(1, len(mesh.faces) // 2), report)
-        files = _files(scene, mesh, paths, options, name, matrix)
+        is_white = "method" in facts and options.texture is None and name != "stl"
+        files = _files(scene, scene.painted(mesh) if is_white else mesh, paths, options, name, matrix)
         written |= files
         levels.append(
             {"file": str(paths[0]), "faces": len(mesh.faces), "bytes": sum(map(len, files.values()))}
@@ -80,7 +81,7 @@ def export_mesh(
 
 def world_mesh(scene: Scene, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh in the world's frame, cropped, and what to say about it: as baked, unless `method` or `level`
-    asks for it to be made again: then without colours if a texture brings them."""
+    asks for it to be made again: then it is white, and what is said has a `method`."""
     from exporters.ply import read_ply
 
     box = None
@@ -93,7 +94,7 @@ def world_mesh(scene: Scene, options: ExportOptions) -> tuple[TriangleMesh, dict
         mesh = read_ply(scene.asset.path("mesh.ply"))
     else:
         method = options.method or "density"
-        mesh, removed = scene.surface(method, options.level, coloured=options.texture is None)
+        mesh, removed = scene.surface(method, options.level)
         facts |= {
             "method": method,
             "unseen_faces_removed": removed.unseen,

@@ -18,7 +18,7 @@ from exporters.points import parse_points
 from exporters.stl import parse_stl
 from exporters.texture import Texture
 from exporters.usd import parse_usd
-from exporters.vdb import parse_vdb
+from exporters.vdb import VdbGrid, colour_voxels, parse_vdb
 from exporters.volume import Volume
 from player.errors import ParityError
 
@@ -114,18 +114,15 @@ def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
 def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> None:
     """Raises ParityError if `data`, the content of a `suffix` (.vdb, .npz) file, holds another volume: every
     vertex, density, colour and the matrix are compared, exactly but for linear colours in float32."""
-    colours = volume.colours
+    colours, light = volume.colours, None
     if suffix == ".npz":
         got = parse_npz(data, where)
         index, density, matrix, found = got.index, got.density[:, None], got.matrix, got.colours
     else:
         grids = parse_vdb(data, where)
         index, density, matrix = grids["density"]
-        found = grids["color"].values if "color" in grids else None
-        colours = None if colours is None else linear_from_srgb(colours / 255)
-        if found is not None:
-            _check_rows(where, "color: vertices", index, grids["color"].index, 0.0)
-            _check_rows(where, "color: matrix", matrix, grids["color"].matrix, 0.0)
+        light = grids.get("color")
+        found = None if light is None else light.values
     order, rows = _sorted(volume.index), _sorted(index)
     _check_rows(where, "matrix", volume.matrix, matrix, 0.0)
     _check_rows(where, "vertices", volume.index[order], index[rows], 0.0)
@@ -133,7 +130,18 @@ def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> 
     if (colours is None) != (found is None):
         raise ParityError(f"{where}: colours: expected {'some' if found is None else 'none'}, got the other")
     if colours is not None and found is not None:
-        _check_rows(where, "colours", colours[order], found[rows], 6e-8)
+        if light is not None:
+            _check_colour_grid(where, volume, colours, light)
+        else:
+            _check_rows(where, "colours", colours[order], found[rows], 0.0)
+
+
+def _check_colour_grid(where: str, volume: Volume, colours: np.ndarray, got: VdbGrid) -> None:
+    index, linear = colour_voxels(volume.index, colours)
+    rows = _sorted(got.index)
+    _check_rows(where, "color: matrix", volume.matrix, got.matrix, 0.0)
+    _check_rows(where, "color: vertices", index, got.index[rows], 0.0)
+    _check_rows(where, "colours", linear, got.values[rows], 6e-8)
 
 
 def _sorted(index: np.ndarray) -> np.ndarray:

@@ -20,8 +20,8 @@ from player.transforms import read_cameras
 
 MAX_VIEWS = 100
 """Views that are played, spread over all of the training cameras."""
-SMALL_PIXELS = 40_000
-"""Pixels of a played view at most, where it only has to tell what is hidden."""
+SMALL_PIXELS = 90_000
+"""Pixels of a played view at most, where it tells what is seen and in which colour."""
 FULL_PIXELS = 1 << 18
 """Pixels of a played view at most, where its depth becomes a surface."""
 SOLID = 0.5
@@ -41,12 +41,14 @@ class DepthView:
     """World frame, at the size of the picture."""
     distance: np.ndarray
     """[height, width] float32, along the ray, world units; infinite where the opacity is below SOLID."""
+    rgb: np.ndarray
+    """[height, width, 3] uint8 sRGB, straight: not mixed with what is behind."""
 
 
 def depth_views(
     asset: Asset, max_pixels: int = SMALL_PIXELS, progress: Progress | None = None
 ) -> list[DepthView]:
-    """The training cameras' pictures of depth, at most MAX_VIEWS of `max_pixels` each.
+    """The training cameras' pictures, at most MAX_VIEWS of `max_pixels` each.
 
     Raises FormatError if the asset's cameras are damaged.
     """
@@ -57,9 +59,9 @@ def depth_views(
     with Renderer(asset) as renderer:
         for done, index in enumerate(chosen):
             camera = _small(cameras[index], max_pixels)
-            frame = renderer.render(camera)
+            frame = renderer.render(camera, background="transparent")
             distance = np.where(frame.opacity >= SOLID, frame.depth, np.float32(np.inf))
-            views.append(DepthView(camera, distance.astype(np.float32)))
+            views.append(DepthView(camera, distance.astype(np.float32), frame.to_uint8()[..., :3].copy()))
             if progress is not None:
                 progress(done + 1, len(chosen))
     return views

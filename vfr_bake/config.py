@@ -294,7 +294,7 @@ class BakeConfig:
     """Steps of each round in which head and stored values are adapted to each other, the full model being the
     teacher; 0: none."""
     mesh_resolution: int | None = None
-    """Voxels along each side of the box for the mesh; 0 leaves the mesh at the grid's own resolution."""
+    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
     max_loss_db: float | None = None
     """Fail, and write nothing, if the written files are expected to lose more than this against
     photographs."""

@@ -4,9 +4,11 @@
     python tests/benchmarks/bench_surface.py views ASSET transforms_test.json [--pictures DIR] [--views 10]
 
 `demo`: mean and 95th percentile of the distance to the true surface, both ways (the true one is sampled where
-rays of training cameras end), in voxels, and the mean angle between normals.
-`views`: silhouette IoU with the volume, PSNR of the mesh's picture and of the volume's, both against the
-photographs. `colours`: which direction, or mean of directions, gives a place the nearest colour.
+rays of training cameras end), in the asset's voxels, and the mean angle between normals; before, where along
+the true normals the asset's density reaches some levels: what no mesh of it can better.
+`views`: silhouette IoU with the volume, PSNR of the mesh's picture (2 x 2 rays a pixel) and of the volume's,
+both against the photographs. `colours`: which direction, or mean of directions, gives a place the nearest
+colour.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,8 @@ from PIL import Image
 
 from exporters import surface_colour
 from exporters.asset_mesh import Scene
-from exporters.asset_surface import voxel_size
+from exporters.asset_surface import code_and_slope, voxel_size
+from exporters.formats import Method
 from exporters.mesh import TriangleMesh
 from exporters.ply import read_ply
 from player.asset import Asset
@@ -30,18 +34,34 @@ from player.cameras import Camera
 from player.render import Renderer
 from player.transforms import read_cameras
 
+SHARP = 2
+"""Rays a pixel along each side, in pictures of a mesh: photographs have no jagged edges either."""
+LEVELS = (10.0, 20.0, 30.0, 40.0, 60.0, 100.0)
 
-def meshes(asset: Asset, methods: list[str]):
-    """Name, mesh, seconds."""
+
+def meshes(asset: Asset, methods: list[str]) -> Iterator[tuple[str, TriangleMesh, float]]:
+    """Name, mesh, seconds of the processor."""
     scene = Scene(asset, lambda stage, done, of: None)
     for method in methods:
-        start = time.perf_counter()
+        start = time.process_time()
         if method == "baked":
             mesh = read_ply(asset.path("mesh.ply"))
         else:
-            mesh, removed = scene.surface(method, None)  # type: ignore[arg-type]
+            mesh, removed = scene.surface(again(method), None)
+            mesh = scene.painted(mesh)
             print(f"{method}: {removed}")
-        yield method, mesh, time.perf_counter() - start
+        yield method, mesh, time.process_time() - start
+
+
+def again(method: str) -> Method:
+    """The way to make a surface that has this name."""
+    return "tsdf" if method == "tsdf" else "density"
+
+
+def cameras_of(asset: Asset, path: Path | None) -> list[Camera]:
+    """Those of a file, or the training cameras."""
+    width, height = asset.manifest.view_size
+    return read_cameras(path or asset.path("cameras.json"), (width, height))
 
 
 def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -72,35 +92,64 @@ def caster(mesh: TriangleMesh) -> open3d.t.geometry.RaycastingScene:
     return _CASTERS[id(mesh)]
 
 
+def true_normals(points: np.ndarray) -> np.ndarray:
+    from vfr_bake.data.demo import signed_distance
+
+    steps = 1e-4 * np.eye(3)
+    slopes = np.stack([signed_distance(points + e) - signed_distance(points - e) for e in steps], axis=-1)
+    return slopes / np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
+
+
+def true_surface(camera: Camera) -> np.ndarray:
+    """[n, 3] where a camera's rays end, world frame."""
+    from vfr_bake.data.demo import trace
+
+    _, distance = trace(camera)
+    rays_o, rays_d = camera.rays()
+    seen = np.isfinite(distance.reshape(-1))
+    return rays_o[seen] + rays_d[seen] * distance.reshape(-1)[seen][:, None].astype(np.float64)
+
+
+def bench_levels(asset: Asset, points: np.ndarray) -> None:
+    """How far before the true surface the density reaches a level, coming from outside."""
+    grid, voxel = asset.grid, voxel_size(asset.grid) * asset.scale
+    normals, inverse = true_normals(points), np.linalg.inv(asset.world_from_model)
+    along = np.arange(8, -8.01, -0.1)
+    sigmas = np.zeros((len(points), len(along)))
+    for column, ahead in enumerate(along):
+        there = (points + normals * ahead * voxel) @ inverse[:3, :3].T + inverse[:3, 3]
+        codes, _, known = code_and_slope(grid, (there - grid.aabb_min) * grid.cells_per_unit)
+        sigmas[:, column] = np.where(known, np.exp(grid.density_low + grid.density_slope * codes), 0)
+    for level in LEVELS:
+        found = (sigmas > level).any(axis=1)
+        apart = along[(sigmas > level).argmax(axis=1)][found]
+        print(
+            f"level {level:5g}: found at {found.mean():.1%}, mean distance {np.abs(apart).mean():.2f} voxel, "
+            f"median before the surface {np.median(apart):+.2f}"
+        )
+
+
 def bench_demo(asset: Asset, methods: list[str]) -> None:
-    from vfr_bake.data.demo import signed_distance, trace
+    from vfr_bake.data.demo import signed_distance
 
     voxel = voxel_size(asset.grid) * asset.scale
-    cameras = read_cameras(asset.path("cameras.json"), asset.manifest.view_size)[::8]  # type: ignore[arg-type]
+    cameras = cameras_of(asset, None)[::8]
+    truths = [true_surface(camera) for camera in cameras]
+    bench_levels(asset, np.concatenate([truth[::20] for truth in truths]))
     for name, mesh, seconds in meshes(asset, methods):
         sample = mesh.vertices[:: max(1, len(mesh.vertices) // 100_000)].astype(np.float64)
         to_truth = np.abs(signed_distance(sample)) / voxel
         back, angles = [], []
-        for camera in cameras:
-            _, distance = trace(camera)
-            rays_o, rays_d = camera.rays()
-            seen = np.isfinite(distance.reshape(-1))
-            truth = rays_o[seen] + rays_d[seen] * distance.reshape(-1)[seen][:, None]
+        for camera, truth in zip(cameras, truths, strict=True):
             points = open3d.core.Tensor(truth.astype(np.float32))
             back.append(caster(mesh).compute_distance(points).numpy() / voxel)
             _, places, normals, _ = cast(mesh, camera)
             near = np.abs(signed_distance(places)) < 2 * voxel
-            step = 1e-4
-            slopes = np.stack(
-                [signed_distance(places + e) - signed_distance(places - e) for e in step * np.eye(3)],
-                axis=-1,
-            )
-            slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
-            cosines = (slopes * normals).sum(-1)[near]
+            cosines = (true_normals(places) * normals).sum(-1)[near]
             angles.append(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
         from_truth, angle = np.concatenate(back), np.concatenate(angles)
         print(
-            f"{name:8} {len(mesh.faces):9,} faces, {seconds:.1f} s: to truth {to_truth.mean():.2f} voxel "
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:.1f} CPU s: to truth {to_truth.mean():.2f} voxel "
             f"(95 %: {np.percentile(to_truth, 95):.2f}), truth to mesh {from_truth.mean():.2f} "
             f"(95 %: {np.percentile(from_truth, 95):.2f}), normals {angle.mean():.1f} degrees "
             f"(median {np.median(angle):.1f})",
@@ -116,11 +165,9 @@ def bench_views(asset: Asset, methods: list[str], cameras: list[Camera], photogr
         both = either = 0
         scores: dict[str, list[float]] = {"mesh": [], "volume": [], "mesh against volume": []}
         for camera, frame, photo in zip(cameras, frames, photos, strict=True):
-            hit, _, _, colours = cast(mesh, camera)
+            hit, picture = pictured(mesh, camera, np.array(asset.manifest.background))
             solid = frame.opacity.reshape(-1) > 0.5
             both, either = both + (hit & solid).sum(), either + (hit | solid).sum()
-            picture = np.tile(np.array(asset.manifest.background), (len(hit), 1))
-            picture[hit] = colours
             played = frame.rgb.reshape(-1, 3)
             scores["mesh against volume"].append(psnr(picture, played))
             if photo is not None:
@@ -128,15 +175,25 @@ def bench_views(asset: Asset, methods: list[str], cameras: list[Camera], photogr
                 scores["volume"].append(psnr(played, photo))
         figures = ", ".join(f"{key} {np.mean(value):.2f} dB" for key, value in scores.items() if value)
         print(
-            f"{name:8} {len(mesh.faces):9,} faces, {seconds:5.1f} s: IoU {both / either:.4f}, {figures}",
+            f"{name:8} {len(mesh.faces):9,} faces, {seconds:5.1f} CPU s: IoU {both / either:.4f}, {figures}",
             flush=True,
         )
+
+
+def pictured(mesh: TriangleMesh, camera: Camera, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels the mesh covers by half or more [n] bool, and the picture [n, 3], 0..1."""
+    hit, _, _, colours = cast(mesh, camera.resized(camera.width * SHARP, camera.height * SHARP))
+    picture = np.tile(background, (len(hit), 1))
+    picture[hit] = colours
+    blocks = (camera.height, SHARP, camera.width, SHARP)
+    covered = hit.reshape(blocks).mean(axis=(1, 3)).reshape(-1) >= 0.5
+    return covered, picture.reshape(*blocks, 3).mean(axis=(1, 3)).reshape(-1, 3)
 
 
 def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
     """Colours at what test cameras see, by how many directions are averaged, against the volume's picture."""
     scene = Scene(asset, lambda stage, done, of: None)
-    mesh, _ = scene.surface(method, None)  # type: ignore[arg-type]
+    mesh, _ = scene.surface(again(method), None)
     places, normals, truth = [], [], []
     with Renderer(asset) as renderer:
         for camera in cameras:
@@ -183,7 +240,7 @@ def main() -> int:
     if arguments.what == "demo":
         bench_demo(asset, methods)
         return 0
-    every = read_cameras(arguments.cameras or asset.path("cameras.json"), asset.manifest.view_size)  # type: ignore[arg-type]
+    every = cameras_of(asset, arguments.cameras)
     chosen = [every[i] for i in np.linspace(0, len(every) - 1, arguments.views).round().astype(int)]
     if arguments.what == "colours":
         bench_colours(asset, methods[0], chosen)

@@ -25,7 +25,7 @@ from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS, CUBE_HIGH, CUBE_L
 from tests.exporters.solids import ball, offset_of, write_solid
 
 
-@pytest.mark.parametrize("factor", [None, 0.5, 2.5])
+@pytest.mark.parametrize("factor", [None, 2.0, 5.0])
 def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor: float | None) -> None:
     grid, voxel = ball_asset.grid, 2 / 72
     level = half_opaque(grid) * (factor or 1)

@@ -77,7 +77,9 @@ def test_levels_of_detail(cube_asset: Asset, tmp_path: Path, capsys: pytest.Capt
 def test_a_texture_has_the_vertex_colours_of_the_surface(
     suffix: str, cube_asset: Asset, tmp_path: Path
 ) -> None:
-    """The same surface twice, with colours at its corners and in a picture: at the corners they agree."""
+    """The same surface twice, with colours at its corners and in a picture: at the corners they agree, but
+    for the directions: a corner fits what all cameras see, a texel is the mean of four, of a head whose
+    colours turn with them by up to 60 levels."""
     target = tmp_path / f"a.{suffix}"
     asked = shlex.split("--level 20 --faces 1500 --texture 256")
     assert cli.main([str(cube_asset.folder), str(target), *asked]) == 0
@@ -90,7 +92,7 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
     nearest = np.array([np.abs(plain.vertices - place).sum(-1).argmin() for place in places])
     got = np.asarray(read.visual.to_color().vertex_colors)[:, :3].astype(int)
     apart = np.abs(got - plain.colours[nearest, :3])
-    assert np.median(apart) <= 3 and np.percentile(apart, 95) <= 12
+    assert np.median(apart) <= 6 and np.percentile(apart, 95) <= 25
     before = {name: (tmp_path / name).read_bytes() for name in names}
     assert cli.main([str(cube_asset.folder), str(target), *asked, "--force"]) == 0
     assert before == {name: (tmp_path / name).read_bytes() for name in names}

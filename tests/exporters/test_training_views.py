@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import platform
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from exporters.asset_mesh import Removed, Scene, cleaned
-from exporters.mesh import TriangleMesh
+from exporters.mesh import TriangleMesh, take_faces
 from exporters.training_views import DepthView, cosines_in_view, depth_views, seen_vertices
 from player.asset import Asset
 from player.cameras import Camera
@@ -18,7 +20,9 @@ from tests.exporters.meshes import sphere
 from tests.exporters.solids import WORLD_FROM_MODEL
 from tests.player.conftest import look_at
 
+HAS_OPEN3D = sys.platform != "linux" or platform.machine() == "x86_64"
 UP = np.array([[0.0, 0.0, 1.0]])
+BLACK = np.zeros((64, 64, 3), np.uint8)
 
 
 def camera(eye: tuple[float, float, float], size: int = 64) -> Camera:
@@ -32,7 +36,7 @@ def sphere_view(eye: tuple[float, float, float], radius: float) -> DepthView:
     along = -(rays_o * rays_d).sum(-1)
     square = radius**2 - (rays_o**2).sum(-1) + along**2
     distance = np.where(square > 0, along - np.sqrt(np.maximum(square, 0)), np.inf)
-    return DepthView(seen_by, distance.reshape(64, 64).astype(np.float32))
+    return DepthView(seen_by, distance.reshape(64, 64).astype(np.float32), BLACK)
 
 
 def all_around(radius: float) -> list[DepthView]:
@@ -41,14 +45,14 @@ def all_around(radius: float) -> list[DepthView]:
 
 
 def test_before_behind_beside_and_turned_away() -> None:
-    view = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), 5.0, np.float32))
+    view = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), 5.0, np.float32), BLACK)
     points = np.array([[0, 0, 0], [0, 0, 1], [0, 0, -0.05], [0, 0, -0.2], [9, 0, 0], [0, 0, 9.0]])
     cosines = cosines_in_view(view, points, np.tile(UP, (6, 1)), 0.1)
     np.testing.assert_allclose(cosines, [1, 1, 1, 0, 0, 0], rtol=0, atol=1e-5)
     assert not cosines_in_view(view, points, np.tile(-UP, (6, 1)), 0.1)[:5].any()
     slanted = np.tile(np.array([[0.6, 0.0, 0.8]]), (1, 1))
     np.testing.assert_allclose(cosines_in_view(view, points[:1], slanted, 0.1), [0.8], atol=1e-3)
-    nothing = DepthView(view.camera, np.full((64, 64), np.inf, np.float32))
+    nothing = DepthView(view.camera, np.full((64, 64), np.inf, np.float32), BLACK)
     assert cosines_in_view(nothing, points[3:4], UP, 0.0)[0] == pytest.approx(1)
     assert len(cosines_in_view(view, points[:0], UP[:0], 0.1)) == 0
 
@@ -77,7 +81,8 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
 def test_what_is_hidden_and_what_floats_goes() -> None:
     outer = sphere(120)
     inner = replace(sphere(30), vertices=sphere(30).vertices * 0.8)
-    wall = replace(sphere(30), normals=-sphere(30).normals)  # as near as the outer one, but looking inwards
+    # as near as the outer one, but looking inwards
+    wall = replace(sphere(30), vertices=sphere(30).vertices * 0.99, normals=-sphere(30).normals)
     tiny = np.array([[1.5, 0, 0], [1.5, 0.01, 0], [1.5, 0, 0.01]])
     out = np.tile([1.0, 0, 0], (3, 1))
     floater = TriangleMesh(tiny, np.array([[0, 1, 2]], np.int32), out, np.full((3, 4), 255, np.uint8))
@@ -86,7 +91,19 @@ def test_what_is_hidden_and_what_floats_goes() -> None:
     assert removed == Removed(len(inner.faces) + len(wall.faces), 1, 1)
     assert len(kept.faces) == len(outer.faces) and np.array_equal(kept.vertices, outer.vertices)
     with pytest.raises(DataError, match=r"expected some of \d+ faces in a training camera's view, got none"):
-        cleaned(inner, all_around(1.0), 0.02)
+        cleaned(replace(inner, vertices=inner.vertices + 100), all_around(1.0), 0.02)
+
+
+def test_what_fills_a_hole_stays() -> None:
+    if not HAS_OPEN3D:
+        return
+    whole, inner = sphere(60), replace(sphere(60), vertices=sphere(60).vertices * 0.9)
+    outer = take_faces(whole, whole.vertices[whole.faces, 0].max(axis=1) < 0.97)
+    kept, removed = cleaned(joined(outer, inner), all_around(1.0), 0.02)
+    assert np.array_equal(kept.vertices[: len(outer.vertices)], outer.vertices)
+    filling = kept.vertices[len(outer.vertices) :]
+    assert 20 < len(filling) < 200 and filling[:, 0].min() > 0.7
+    assert removed.unseen > 0.9 * len(inner.faces)
 
 
 def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
@@ -114,5 +131,6 @@ def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:
         # depth comes from the nearest pixel, as wide as a voxel here: steps, and thin faces at their edges
         assert cosines.min() > 0.99 if method == "density" else cosines.mean() > 0.9
         assert removed.unseen < 0.02 * len(mesh.faces)
-        assert mesh.colours[:, :3].std(axis=0).min() > 5
+        assert (mesh.colours == 255).all()
+        assert scene.painted(mesh).colours[:, :3].std(axis=0).min() > 5
     assert set(stages) == {"views", "surface", "colours", "fusion"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import sys
 
 import numpy as np
@@ -11,9 +10,7 @@ import pytest
 from exporters.training_views import DepthView
 from exporters.tsdf import fuse_depth, reliable_depth
 from player.errors import DataError, MissingExtraError
-from tests.exporters.test_training_views import all_around, camera, sphere_view
-
-HAS_OPEN3D = sys.platform != "linux" or platform.machine() == "x86_64"
+from tests.exporters.test_training_views import BLACK, HAS_OPEN3D, all_around, camera, sphere_view
 
 
 def test_a_ball_again() -> None:
@@ -46,7 +43,7 @@ def test_depth_along_the_axis_and_jumps() -> None:
     step[:, 4:] = 3.0
     step[0, 0] = np.inf
     seen_by = camera((0.0, 0.001, 5.0), 8)
-    near = reliable_depth(DepthView(seen_by, step), 0.3)
+    near = reliable_depth(DepthView(seen_by, step, BLACK), 0.3)
     assert not near[:, 3:5].any() and (near[1:, :3] > 0).all() and (near[:, 5:] > 0).all() and near[0, 0] == 0
     assert (near[0, 1:3] > 0).all()  # beside nothing is no jump
 
@@ -54,7 +51,7 @@ def test_depth_along_the_axis_and_jumps() -> None:
 def test_nothing_in_view(monkeypatch: pytest.MonkeyPatch) -> None:
     if not HAS_OPEN3D:
         return
-    nothing = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), np.inf, np.float32))
+    nothing = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), np.inf, np.float32), BLACK)
     with pytest.raises(DataError, match="expected a surface in the training cameras' views, got none"):
         fuse_depth([nothing], 0.06)
     monkeypatch.setitem(sys.modules, "open3d", None)

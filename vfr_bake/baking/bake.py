@@ -11,14 +11,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from exporters.asset_mesh import Removed
 from exporters.int8_head import activation_ranges
+from exporters.mesh import TriangleMesh
 from exporters.onnx_head import HeadWeights, head_onnx
 from exporters.ply import ply_bytes
-from player.asset import Asset, write_asset
+from player.asset import Asset, GridArrays, write_asset
 from player.cameras import Camera
 from player.errors import ConfigError, TrainingError
 from player.files import check_target
@@ -37,7 +40,7 @@ from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
 from vfr_bake.baking.loss import HeldOut, Stage
-from vfr_bake.baking.mesh import bake_mesh
+from vfr_bake.baking.mesh import bake_mesh, mesh_size
 from vfr_bake.baking.pace import LOOKUPS, frame_ms, keep_to_time, measured_in_memory
 from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
@@ -114,23 +117,21 @@ class _Bake:
             self.held_out = HeldOut(model, config.check_views)
 
     def run(self, folder: Path, force: bool) -> BakeResult:
-        visible, layout = self._cells()
-        with self._part("mesh"):
-            size = self.choice.mesh_resolution or layout.resolution
-            mesh, n_floaters = bake_mesh(self.model, visible, size, self._progress("mesh"))
-        mesh_bytes = ply_bytes(mesh)
-        if layout.contracted:
-            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
-        stored, taught = self._store(layout, len(mesh_bytes))
+        layout = self._cells()
+        stored, taught = self._store(layout)
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
         stored = self._refine(stored, layout, taught)
         head = self._head(stored, layout, taught)
+        arrays = layout.arrays(stored.density, stored.features)
+        mesh, removed = self._mesh(layout, arrays, head)
+        if layout.contracted:
+            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         figures = {
             "n_vertices": len(layout.vertices),
             "mesh_faces": len(mesh.faces),
-            "mesh_floaters_removed": n_floaters,
+            "mesh_floaters_removed": removed.floaters,
             "stages": self.held_out.table(),
         }
         result: dict[str, Any] = {}
@@ -141,10 +142,9 @@ class _Bake:
             return {"report.json": made.json(), "report.html": made.html()}
 
         with self._part("writing and checking"):
-            arrays = layout.arrays(stored.density, stored.features)
             manifest = self._manifest(layout, arrays.features.shape[1], figures)
             cameras = write_cameras(self.model.cameras)
-            write_asset(folder, manifest, arrays, head, mesh_bytes, cameras, force, finish)
+            write_asset(folder, manifest, arrays, head, ply_bytes(mesh), cameras, force, finish)
         last: Stage = result["last"]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
@@ -152,7 +152,7 @@ class _Bake:
         seconds = sum(self.seconds.values())
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
-    def _cells(self) -> tuple[np.ndarray, Layout]:
+    def _cells(self) -> Layout:
         with self._part("visibility"):
             unbounded = self.model.field.config.unbounded
             visible, step = self._weighty_cells() if unbounded else self._visible_cells()
@@ -164,7 +164,7 @@ class _Bake:
                 f"memory, got {n_vertices:,} of {(resolution + 1) ** 3:,}: is the model a fog? Lower "
                 "--resolution, raise --weight-floor, or allow more by --max-memory"
             )
-        return visible, layout
+        return layout
 
     def _weighty_cells(self) -> tuple[np.ndarray, float]:
         """Cells and march step of an unbounded scene."""
@@ -183,11 +183,17 @@ class _Bake:
         self.left_out["cells"] = cells.report()
         return cells.visible, step
 
-    def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
-        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
+    def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
+        """The mesh of what is about to be written, played from a folder of its own."""
+        manifest = self._manifest(layout, arrays.features.shape[1], {})
+        size = self.choice.mesh_resolution or layout.resolution
+        with self._part("mesh"), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            cameras = write_cameras(self.model.cameras)
+            write_asset(Path(folder) / "asset", manifest, arrays, head, b"", cameras)
+            return bake_mesh(Asset.open(Path(folder) / "asset"), size, self._report)
 
-        `mesh_size` is what the mesh takes of the budget, bytes.
-        """
+    def _store(self, layout: Layout) -> tuple[Stored, Taught]:
+        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
@@ -201,7 +207,7 @@ class _Bake:
             features = features @ projection.matrix.T.astype(np.float32)
             step = code_step(features, choice.code_levels)
             features /= np.float32(step)
-            n_fit = self._channels_that_fit(layout, density, features, mesh_size)
+            n_fit = self._channels_that_fit(layout, density, features)
             features = np.ascontiguousarray(features[:, :n_fit])
             first = model.field.head.first_weights().astype(np.float64) @ projection.back[:, :n_fit]
             head = fold_head(model.field.head, first * step)
@@ -230,14 +236,13 @@ class _Bake:
                 return projection
         return project(sensitivity, taught.features, most)
 
-    def _channels_that_fit(
-        self, layout: Layout, density: np.ndarray, features: np.ndarray, mesh_size: int
-    ) -> int:
+    def _channels_that_fit(self, layout: Layout, density: np.ndarray, features: np.ndarray) -> int:
         """How many of the channels, the most important of which come first, fit into the budget."""
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
-        rest = mesh_size + arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
+        rest = mesh_size(layout.grid(density, features), self.choice.mesh_resolution or layout.resolution)
+        rest += arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
         rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
         if not self.choice.head_width:
             rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
