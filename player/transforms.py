@@ -219,7 +219,7 @@ def _focal(
                 raise FormatError(
                     f"{where}: camera_angle_{axis}: expected radians between 0 and pi, got {angle}"
                 )
-            return float(0.5 * n_pixels / np.tan(0.5 * angle))
+            return float(0.5 * n_pixels / max(np.tan(0.5 * angle), 1e-300))  # an angle of 1e-308 is none
     return None
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
+from player.json_files import brief
 from vfr_bake.baking.presets import PRESETS, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
@@ -103,10 +104,10 @@ def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
     """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
     names and wrong kinds."""
     defaults = asdict(FieldConfig())
-    _check(set(values) == set(defaults), where, f"the settings {sorted(defaults)}", sorted(values))
+    _check(set(values) == set(defaults), where, f"the settings {sorted(defaults)}", brief([*values]))
     for name, value in values.items():
         kind = type(defaults[name])
-        _check(type(value) is kind, f"{where}: {name}", f"a value of type {kind.__name__}", value)
+        _check(type(value) is kind, f"{where}: {name}", f"a value of type {kind.__name__}", brief(value))
     return FieldConfig(**values)
 
 

@@ -185,6 +185,7 @@ def _model_target(work: Path) -> Target:
     cameras = read_cameras(_written(work / "cameras.json", cameras_bytes()))
     field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
     save_model(path, Model(field, OccupancyGrid(8, 0.2, seed=0), np.eye(4), cameras, False, {}, {}))
+    load_model(path)  # compiles, or reads what was compiled before
     whole = path.read_bytes()
     content = torch.load(path, weights_only=True)
     tensors = (torch.zeros(0), torch.full((3, 3), torch.nan), torch.zeros(1, dtype=torch.uint8),

@@ -60,17 +60,18 @@ class Command:
     """Raises unless the output is whole."""
 
 
-def commands(work: Path) -> list[Command]:
-    """All of them on small scenes; trains the model that is baked."""
+def commands(work: Path, names: list[str]) -> list[Command]:
+    """Those of `names`, on small scenes; trains the model that is baked."""
     asset = write_shells(work / "shells")
-    data = _data(work / "data")
-    model = work / "base.pt"
-    if forked(lambda: train_main([str(data), str(model), *SMALL])) != 0:
+    data, model = work / "data", work / "base.pt"
+    if {"train", "bake"} & set(names):
+        _write_data(data)
+    if "bake" in names and forked(lambda: train_main([str(data), str(model), *SMALL])) != 0:
         raise SystemExit("vfr-train failed")
     frames = work / "frames"
     play = [str(asset), "--orbit", "12", "--size", "160x120", "--threads", "1", "--output", str(frames)]
     new_model, new_asset, mesh = work / "new.pt", work / "baked", work / "mesh.ply"
-    return [
+    every = [
         Command(
             "train", train_main, [str(data), str(new_model), *SMALL], new_model, ["--resume"], load_model
         ),
@@ -78,6 +79,7 @@ def commands(work: Path) -> list[Command]:
         Command("play", play_main, play, frames, ["--resume"], _whole_pictures),
         Command("export", export_main, [str(asset), str(mesh), "--method", "density"], mesh, [], read_ply),
     ]
+    return [command for command in every if command.name in names]
 
 
 def _whole_asset(folder: Path) -> None:
@@ -92,7 +94,7 @@ def _whole_pictures(folder: Path) -> None:
             picture.load()
 
 
-def _data(folder: Path) -> Path:
+def _write_data(folder: Path) -> None:
     """The built-in scene, 16 pixels wide, as a NeRF-synthetic folder."""
     from dataclasses import replace
 
@@ -107,7 +109,6 @@ def _data(folder: Path) -> Path:
             Image.fromarray(image).save(folder / split / f"r_{index}.png")
         cameras = [replace(c, name=f"./{split}/r_{index}") for index, c in enumerate(views.cameras)]
         (folder / f"transforms_{split}.json").write_bytes(write_cameras(cameras))
-    return folder
 
 
 def start(work: Callable[[], int]) -> int:
@@ -279,11 +280,11 @@ def main() -> int:
     parser.add_argument("--limits", type=int, nargs="*", default=[100, 2000], help="bytes a file, full disk")
     parser.add_argument("--disks", nargs="*", default=[], help="sizes of a tmpfs, for example 8k 64k")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--commands", nargs="*", help="of train, bake, play, export")
+    parser.add_argument("--commands", nargs="*", default=["train", "bake", "play", "export"])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="vfr-kill-") as folder:
         work = Path(folder)
-        every = [c for c in commands(work) if not options.commands or c.name in options.commands]
+        every = commands(work, options.commands)
         result = kill_runs(every, options.runs, options.seed)
         result["failures"] += both_at_once(every, options.twice)
         result["failures"] += full_disk(every, options.limits)

@@ -19,8 +19,9 @@ BYTES_A_FACE = 27
 
 
 def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMesh, Removed]:
-    """The mesh in the WORLD frame, and what was removed of it; of an unbounded scene, that of its inner region.
-    An even fog, which has no surface, has an empty mesh.
+    """The mesh in the WORLD frame, and what was removed of it.
+
+    Of an unbounded scene it is that of the inner region; an even fog, which has no surface, has an empty one.
 
     Args:
         asset: complete but for its mesh; it is played.

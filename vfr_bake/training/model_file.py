@@ -20,6 +20,7 @@ from torch import nn
 
 from player.cameras import Camera
 from player.errors import ConfigError, FormatError, VersionError
+from player.json_files import brief
 from player.transforms import parse_transforms, transforms_cameras, write_cameras
 from vfr_bake.config import field_config_from
 from vfr_bake.field.field import VfrField
@@ -101,10 +102,13 @@ def load_model(path: Path) -> Model:
     _restore(field, content["state"], f"{path}: state")
     restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
     sampler = restore_sampler(content["sampler"], f"{path}: sampler")
-    world_from_model = content["world_from_model"].double().numpy()
+    matrix = content["world_from_model"]
+    if not matrix.is_floating_point() or matrix.layout is not torch.strided:
+        raise FormatError(f"{path}: world_from_model: expected a plain tensor of floats, got {matrix.dtype}")
+    world_from_model = matrix.double().numpy()
     if world_from_model.shape != (4, 4) or not np.isfinite(world_from_model).all():
         raise FormatError(
-            f"{path}: world_from_model: expected 4 x 4 finite numbers, got {world_from_model.tolist()}"
+            f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(world_from_model.tolist())}"
         )
     where = f"{path}: cameras"
     return Model(
@@ -124,7 +128,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise FormatError(f"{path}: not a model file written by vfr-train: expected format {FORMAT!r}")
     version = content.get("version")
     if not (isinstance(version, list) and len(version) == 2 and all(isinstance(v, int) for v in version)):
-        raise FormatError(f"{path}: version: expected two integers, got {version}")
+        raise FormatError(f"{path}: version: expected two integers, got {brief(version)}")
     if version[0] != VERSION[0]:
         raise VersionError(
             f"{path}: version: expected {VERSION[0]}.x, got {version[0]}.{version[1]}: "

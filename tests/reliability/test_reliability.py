@@ -1,0 +1,38 @@
+"""A bounded part of the long scripts: broken inputs, killed commands, one output for two, full disks."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+
+
+def run(module: str, *arguments: str) -> dict[str, Any]:
+    """In a process of its own: what is fuzzed may crash, and forks want a process without threads."""
+    command = [sys.executable, "-m", module, *arguments]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
+    assert done.stdout, done.stderr[-2000:]
+    return json.loads(done.stdout)
+
+
+def test_broken_inputs_are_refused_or_read() -> None:
+    result = run("tests.reliability.fuzz", "--inputs", "330", "--seed", "7")
+    assert result["failures"] == []
+    assert len(result["targets"]) == 11
+    for counts in result["targets"].values():
+        assert counts["inputs"] == counts["refused"] + counts["read"] == 30
+        assert counts["refused"] > 5, "inputs that break nothing test nothing"
+
+
+def test_what_is_killed_leaves_the_old_or_the_new() -> None:
+    result = run(
+        *("tests.reliability.kill", "--commands", "play", "export", "--runs", "8", "--twice", "2"),
+        *("--limits", "300"),
+    )
+    assert result["failures"] == []
+    assert sum(counts["runs"] for counts in result["killed"].values()) == 8
+    assert sum(counts["killed"] for counts in result["killed"].values()) >= 3
