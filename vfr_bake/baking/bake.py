@@ -30,8 +30,8 @@ from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.cells import find_cells
 from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
-from vfr_bake.baking.contracted import lattice_step, weighty_cells
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
@@ -41,7 +41,6 @@ from vfr_bake.baking.projection import Projection, code_scales, head_sensitivity
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
 from vfr_bake.baking.report import BakeReport
 from vfr_bake.baking.views import views_between
-from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
@@ -64,6 +63,8 @@ LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
 """Lookups per ray that are tried."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
+PICTURE_PIXELS = 160_000
+"""Of each of them at most: the full model takes a second for 10,000 pixels of an unbounded scene."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 
@@ -153,9 +154,11 @@ class _Bake:
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> tuple[np.ndarray, Layout]:
-        model, unbounded = self.model, self.model.field.config.unbounded
+        model = self.model
         with self._part("visibility"):
-            visible, step = self._weighty_cells() if unbounded else self._visible_cells()
+            visible, step, culled = find_cells(model, self.config, self._progress("visibility"))
+        if culled:
+            self.left_out["cells"] = culled
         n_cells, most = int(visible.sum()), MOST_FLOATS // model.field.config.n_channels
         if n_cells > most:
             raise TrainingError(
@@ -163,35 +166,7 @@ class _Bake:
                 f"{n_cells:,} of {visible.size:,}: is the model a fog? Lower --resolution, or raise "
                 "--weight-floor"
             )
-        return visible, make_layout(visible, step, unbounded)
-
-    def _weighty_cells(self) -> tuple[np.ndarray, float]:
-        """Cells and march step of an unbounded scene."""
-        resolution, floor = (
-            self.config.resolution or self.choice.contracted_resolution,
-            self.choice.weight_floor,
-        )
-        resolution = min(resolution, self.model.field.config.max_resolution)
-        visible = weighty_cells(self.model, resolution, floor, self._progress("visibility"))
-        self.left_out["cells"] = f"{1 - visible.mean():.1%} of contracted space: no view gives them {floor:g}"
-        return visible, lattice_step(resolution)
-
-    def _visible_cells(self) -> tuple[np.ndarray, float]:
-        """The same of an object."""
-        model, choice = self.model, self.choice
-        cell = float(np.median(pixel_footprints(model)))
-        resolution = self.config.resolution or round(2 * choice.cells_per_pixel / cell)
-        resolution = int(np.clip(resolution, 8, model.field.config.max_resolution))
-        held = occupied_cells(model, resolution)
-        if self.config.no_cull:
-            return held, float(model.occupancy.step)
-        visible = visible_cells(model, resolution, choice.weight_floor, self._progress("visibility"))
-        share = 1 - float(visible.sum()) / max(int(held.sum()), 1)
-        self.left_out["cells"] = (
-            f"{share:.0%} of the cells that the model may hold matter in: no view gives them a "
-            f"weight of {choice.weight_floor:g}; part of the loss after 'grid'"
-        )
-        return visible, float(model.occupancy.step)
+        return visible, make_layout(visible, step, model.field.config.unbounded)
 
     def _store(self, layout: Layout, mesh_size: int) -> tuple[Stored, Taught]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them.
@@ -385,7 +360,9 @@ class _Bake:
 
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         with Renderer(asset) as renderer:
-            for camera in views_between(self.model, N_PICTURES, seed=3):
+            for view in views_between(self.model, N_PICTURES, seed=3):
+                share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
+                camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
                 full = render_image(self.model.field, self.model.sampler, camera, self.model.background)
                 world: Camera = camera.transformed(self.model.world_from_model)
                 yield camera.name, full, renderer.render(world).rgb
