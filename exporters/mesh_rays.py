@@ -42,10 +42,11 @@ class MeshRays:
                 "the mesh: needs open3d: pip install 'vfr-bake[export]' (on a bare machine also "
                 "libusb-1.0-0, libgl1)"
             ) from error
-        self._tensor = open3d.core.Tensor
+        self._tensor = open3d.core.Tensor.from_numpy
         self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32)
+            self._tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
         )
 
     def seen_by(self, camera: Camera) -> Hits:

@@ -33,8 +33,7 @@ from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
-from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
-from vfr_bake.baking.culling import CULLED_SHARE, cull, whole
+from vfr_bake.baking.cells import find_cells
 from vfr_bake.baking.estimate import make_plan
 from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
@@ -63,6 +62,8 @@ DIRECTION_SHARE = 0.1
 """Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
 N_PICTURES = 2
 """Views shown side by side in the report."""
+PICTURE_PIXELS = 160_000
+"""Of each of them at most: the full model takes a second for 10,000 pixels of an unbounded scene."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 
@@ -153,11 +154,14 @@ class _Bake:
         return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> Layout:
+        model, resolution = self.model, self.plan.resolution
         with self._part("visibility"):
-            unbounded = self.model.field.config.unbounded
-            visible, step = self._weighty_cells() if unbounded else self._visible_cells()
-        layout = make_layout(visible, step, unbounded)
-        n_vertices, most, resolution = len(layout.vertices), self.plan.most_vertices, self.plan.resolution
+            progress = self._progress("visibility")
+            visible, step, left_out = find_cells(model, self.config, resolution, self.held_out, progress)
+        if left_out is not None:
+            self.left_out["cells"] = left_out
+        layout = make_layout(visible, step, model.field.config.unbounded)
+        n_vertices, most = len(layout.vertices), self.plan.most_vertices
         if n_vertices > most:
             raise TrainingError(
                 f"bake: vertices: expected at most {most:,}, which fit into {self.config.max_memory:g} GB of "
@@ -165,23 +169,6 @@ class _Bake:
                 "--resolution, raise --weight-floor, or allow more by --max-memory"
             )
         return layout
-
-    def _weighty_cells(self) -> tuple[np.ndarray, float]:
-        """Cells and march step of an unbounded scene."""
-        resolution, floor = self.plan.resolution, self.config.weight_floor or WEIGHT_FLOOR
-        visible = weighty_cells(self.model, resolution, floor, self._progress("visibility"))
-        self.left_out["cells"] = f"{1 - visible.mean():.1%} of contracted space: no view gives them {floor:g}"
-        return visible, lattice_step(resolution)
-
-    def _visible_cells(self) -> tuple[np.ndarray, float]:
-        """The same of an object."""
-        model, step = self.model, float(self.model.occupancy.step)
-        if self.config.no_cull:
-            return whole(model, self.plan.resolution).visible, step
-        progress, most_db = self._progress("visibility"), CULLED_SHARE * self.choice.target_loss_db
-        cells = cull(model, self.plan.resolution, self.held_out, self.config.weight_floor, most_db, progress)
-        self.left_out["cells"] = cells.report()
-        return cells.visible, step
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
         """The mesh of what is about to be written, played from a folder of its own."""
@@ -395,7 +382,9 @@ class _Bake:
 
     def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         with Renderer(asset) as renderer:
-            for camera in views_between(self.model, N_PICTURES, seed=3):
+            for view in views_between(self.model, N_PICTURES, seed=3):
+                share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
+                camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
                 full = render_image(self.model.field, self.model.sampler, camera, self.model.background)
                 world: Camera = camera.transformed(self.model.world_from_model)
                 yield camera.name, full, renderer.render(world).rgb

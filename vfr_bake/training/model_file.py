@@ -54,10 +54,7 @@ class Model:
     def occupancy(self) -> OccupancyGrid:
         """The occupancy grid of an object. Raises ConfigError for an unbounded scene, which has none."""
         if not isinstance(self.sampler, OccupancyGrid):
-            raise ConfigError(
-                "model: kind: expected an object, got an unbounded scene, which cannot be baked yet: "
-                "train with --kind object to bake what the cameras look at"
-            )
+            raise ConfigError("model: sampler: expected an object's occupancy grid, got a scene's proposals")
         return self.sampler
 
     @property

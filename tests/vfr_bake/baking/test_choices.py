@@ -48,7 +48,6 @@ def chosen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
         bake(trained(kind), folder, settings, quiet)
         found[kind] = json.loads((folder / "report.json").read_text())
         found[kind]["manifest"] = Asset.open(folder, verify=True).manifest
-        print(kind, found[kind]["left_out"], found[kind]["lookups"], found[kind]["stages"][-1])
     return found
 
 

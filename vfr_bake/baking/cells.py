@@ -1,0 +1,48 @@
+"""Which cells a bake stores, and how long the player's steps through them are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
+from vfr_bake.baking.culling import CULLED_SHARE, cull, whole
+from vfr_bake.baking.loss import HeldOut
+from vfr_bake.baking.visibility import Progress
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
+
+
+class StoredCells(NamedTuple):
+    """What is stored."""
+
+    visible: np.ndarray
+    """[n, n, n] bool."""
+    step: float
+    """Of the march: model units, of an unbounded scene dphi of `player.contracted_rays`."""
+    left_out: str | None
+    """What is not stored, in words."""
+
+
+def find_cells(
+    model: Model, config: BakeConfig, resolution: int, held_out: HeldOut, progress: Progress
+) -> StoredCells:
+    """The cells of an object's box, or of contracted space, that matter in some view.
+
+    Raises TrainingError when nothing is seen.
+    """
+    if model.field.config.unbounded:
+        floor = config.weight_floor or WEIGHT_FLOOR
+        visible = weighty_cells(model, resolution, floor, progress)
+        left_out = (
+            f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
+            f"{floor:g}; part of the loss after 'grid'"
+        )
+        return StoredCells(visible, lattice_step(resolution), left_out)
+    step = float(model.occupancy.step)
+    if config.no_cull:
+        return StoredCells(whole(model, resolution).visible, step, None)
+    most_db = CULLED_SHARE * config.choice().target_loss_db
+    cells = cull(model, resolution, held_out, config.weight_floor, most_db, progress)
+    return StoredCells(cells.visible, step, cells.report())
