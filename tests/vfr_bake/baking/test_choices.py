@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from player.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.loss import HeldOut
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.trainer import Trainer
 
 MAX_MB = 1.0
-ROUGH = {"test_psnr": 15.0}
-"""A model this far from its photographs need not keep what little 400 steps make up about directions."""
 
 
 def quiet(*_: object) -> None:
@@ -65,18 +60,3 @@ def test_fog_takes_more_lookups_than_a_surface(chosen: dict[str, dict]) -> None:
     channels = {kind: report["manifest"].n_channels for kind, report in chosen.items()}
     assert lookups["fog"] > lookups["matte"]
     assert len(set(zip(lookups.values(), channels.values(), strict=True))) == 3
-
-
-def test_directions_stay_only_where_colours_depend_on_them(models: dict[str, Model], tmp_path: Path) -> None:
-    lost = {
-        kind: HeldOut(replace(model, figures=ROUGH), 2).direction_loss() for kind, model in models.items()
-    }
-    assert lost["glossy"] > 5 * lost["matte"]
-    left_out = {}
-    for kind in ("matte", "glossy"):
-        settings = BakeConfig(
-            preset="fast", resolution=32, refine_steps=10, mesh_resolution=16, check_views=2
-        )
-        result = bake(replace(models[kind], figures=ROUGH), tmp_path / kind, settings, quiet)
-        left_out[kind] = result.figures["left_out"]["directions"]
-    assert left_out["matte"].startswith("all of them") and not left_out["glossy"].startswith("all")
