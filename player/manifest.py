@@ -159,7 +159,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     unknown = sorted(set(document) - known - {"format"})
     if unknown and version <= VERSION:
         raise FormatError(
-            f"{where}: {ascii(unknown[0])[1:81]}: expected no such key in version {list(version)}"
+            f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
     values = {}
     for key in known:

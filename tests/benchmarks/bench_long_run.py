@@ -46,8 +46,11 @@ def frames(folder: Path, n_frames: int) -> dict[str, object]:
 
 def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
     """Connect, read, vanish; the server's memory and whether it still answers."""
+    import viser
     from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
 
+    spoken = [Subprotocol(f"viser-v{viser.__version__}")]
     port = free_port("127.0.0.1", None)
     program = "import sys, player.cli as c; sys.exit(c.main())"
     command = [sys.executable, "-c", program, str(folder), "--port", str(port)]
@@ -57,7 +60,9 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
         for _ in range(n_rounds):
             some = []
             for _ in range(n_clients):
-                some.append(_patiently(lambda: connect(f"ws://127.0.0.1:{port}", max_size=None)))
+                some.append(
+                    _patiently(lambda: connect(f"ws://127.0.0.1:{port}", subprotocols=spoken, max_size=None))
+                )
             for client in some:
                 for _ in range(20):
                     try:
