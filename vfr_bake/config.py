@@ -222,7 +222,7 @@ class TrainConfig:
     """Objects: cells per axis of the occupancy grid."""
     distortion: float = 0.01
     """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
-    near_gradients: float = 1.0
+    near_gradients: float = 2.0
     """Scenes: what is nearer to a camera than this learns more slowly, by the square of its distance, so that
     no fog settles before the cameras; model units, in which the farthest camera is at 1; 0: all learn
     alike."""
