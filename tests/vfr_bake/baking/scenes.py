@@ -77,8 +77,9 @@ def picture(kind: str, camera: Camera) -> np.ndarray:
 
 def analytic_scene(kind: str, size: int, n_train: int) -> Scene:
     """One of "matte", "glossy" and "fog", in the model frame."""
-    views = [
-        PosedImages(cameras, [picture(kind, camera) for camera in cameras])
-        for cameras in (demo_cameras(size, n_train), demo_cameras(size, 2, phase=0.5, prefix="./test/r_"))
-    ]
-    return build_scene(Capture(kind, *views))
+
+    def views(cameras: list[Camera]) -> PosedImages:
+        return PosedImages(cameras, [picture(kind, camera) for camera in cameras])
+
+    test = demo_cameras(size, 2, phase=0.5, prefix="./test/r_")
+    return build_scene(Capture(kind, views(demo_cameras(size, n_train)), views(test)))
