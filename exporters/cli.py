@@ -131,7 +131,12 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--method", choices=("density", "tsdf"), help="make the surface again: marching cubes, or fused depth"
     )
-    add("--level", type=float, metavar="X", help="density of the surface, 1/model unit (half opaque over two steps)")
+    add(
+        "--level",
+        type=float,
+        metavar="X",
+        help="density of the surface, 1/model unit (half opaque over two steps)",
+    )
     add("--texture", type=int, metavar="N", help="obj, glb: colours in a picture of N x N (needs xatlas)")
     add("--time-limit", type=float, metavar="S", help="seconds that laying out a texture may take (300)")
     add("--points", type=int, metavar="N", help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})")
