@@ -128,7 +128,7 @@ def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tup
     seen = seen_vertices(views, mesh.vertices, mesh.normals, tolerance)
     with suppress(MissingExtraError):
         seen |= _hit_vertices(mesh, views)
-    keep = np.asarray(np.any(seen[mesh.faces], axis=1))
+    keep: np.ndarray = np.asarray(seen[mesh.faces].any(axis=1))
     if not keep.any():
         raise DataError(f"surface: expected some of {len(keep)} faces in a training camera's view, got none")
     part = mesh if keep.all() else take_faces(mesh, keep)

@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         "--level",
         type=float,
         metavar="X",
-        help="density of the surface, 1/model unit (half opaque over two steps)",
+        help="density of the surface, 1/model unit (half opaque: two steps)",
     )
     add("--texture", type=int, metavar="N", help="obj, glb: colours in a picture of N x N (needs xatlas)")
     add("--time-limit", type=float, metavar="S", help="seconds that laying out a texture may take (300)")

@@ -6,7 +6,7 @@ that is hit, of sum 1.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,11 +42,10 @@ class MeshRays:
                 "the mesh: needs open3d: pip install 'vfr-bake[export]' (on a bare machine also "
                 "libusb-1.0-0, libgl1)"
             ) from error
-        self._tensor = open3d.core.Tensor.from_numpy
-        self._scene = open3d.t.geometry.RaycastingScene()
+        self._tensor: Any = open3d.core.Tensor  # Open3D's stubs know less than its code
+        self._scene: Any = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            self._tensor(np.ascontiguousarray(mesh.vertices, np.float32)),
-            self._tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+            np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32)
         )
 
     def seen_by(self, camera: Camera) -> Hits:

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d
@@ -68,7 +69,7 @@ def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np
     """Which pixels hit [n] bool, and of those place, normal and sRGB colour (0..1) on the mesh."""
     rays_o, rays_d = camera.rays()
     rays = np.concatenate([rays_o, rays_d], axis=1).astype(np.float32)
-    answer = caster(mesh).cast_rays(open3d.core.Tensor(rays))
+    answer = caster(mesh).cast_rays(TENSOR(rays))
     t = answer["t_hit"].numpy()
     hit = np.isfinite(t)
     u, v = answer["primitive_uvs"].numpy()[hit].T
@@ -80,13 +81,14 @@ def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np
     return hit, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True), colours
 
 
-_CASTERS: dict[int, open3d.t.geometry.RaycastingScene] = {}
+TENSOR: Any = open3d.core.Tensor  # Open3D's stubs know less than its code
+_CASTERS: dict[int, Any] = {}
 
 
-def caster(mesh: TriangleMesh) -> open3d.t.geometry.RaycastingScene:
+def caster(mesh: TriangleMesh) -> Any:
     if id(mesh) not in _CASTERS:
         _CASTERS.clear()
-        scene = open3d.t.geometry.RaycastingScene()
+        scene: Any = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
         _CASTERS[id(mesh)] = scene
     return _CASTERS[id(mesh)]
@@ -141,7 +143,7 @@ def bench_demo(asset: Asset, methods: list[str]) -> None:
         to_truth = np.abs(signed_distance(sample)) / voxel
         back, angles = [], []
         for camera, truth in zip(cameras, truths, strict=True):
-            points = open3d.core.Tensor(truth.astype(np.float32))
+            points = TENSOR(truth.astype(np.float32))
             back.append(caster(mesh).compute_distance(points).numpy() / voxel)
             _, places, normals, _ = cast(mesh, camera)
             near = np.abs(signed_distance(places)) < 2 * voxel
@@ -202,7 +204,8 @@ def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
             solid = frame.opacity.reshape(-1)[hit] > 0.99
             near = np.abs(np.linalg.norm(at - camera.c2w[:3, 3], axis=-1) - frame.depth.reshape(-1)[hit])
             kept = np.flatnonzero(solid & (near < 4 * voxel_size(asset.grid) * asset.scale))[::5]
-            places.append(at[kept]), normals.append(normal[kept])
+            places.append(at[kept])
+            normals.append(normal[kept])
             truth.append(frame.rgb.reshape(-1, 3)[hit][kept])
     at, normal, expected = map(np.concatenate, (places, normals, truth))
     for count in (0, 1, 2, 4, 8, 16):
@@ -223,7 +226,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("what", choices=("demo", "views", "colours"))
     parser.add_argument("asset", type=Path)
     parser.add_argument(
