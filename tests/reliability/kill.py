@@ -177,7 +177,7 @@ def kill_runs(every: list[Command], n_runs: int, seed: int) -> dict[str, Any]:
         before = contents(command.target) if command.target.exists() else None
         force = ["--force"] if over_old else []
         child = start(lambda c=command, f=force: c.run([*c.arguments, *f]))
-        code = end(child, float(random.uniform(0, 1.1 * usual[command.name])))
+        code = end(child, float(random.uniform(0, 0.8 * usual[command.name])))
         counts["runs"] += 1
         counts["killed"] += code == -signal.SIGKILL
         where = f"run {index}, {command.name}, over {'the old' if over_old else 'nothing'}, code {code}"

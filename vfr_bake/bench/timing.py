@@ -5,8 +5,8 @@ In a round each asset and size is visited once, in an order of its own; a visit 
 in an order of its own too, after a frame that is not counted. Times are those of whole frames.
 
 March and lookups are one loop, which has no seams to time. Of the same view the lookups alone differ with k:
-the slope b of the march's time against the fetches, fitted over all rounds with the mean of each visit taken
-out, makes `lookups = b x fetches`, and the march is what remains.
+the slope b of the march's time against the fetches, fitted within each visit, the median of all visits, makes
+`lookups = b x fetches`, and the march is what remains. Medians, so that a pause decides nothing.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ class Times:
     round's view and the machine's state in it, which all settings share, are divided out."""
     frames: int
     march: float
-    """Mean a frame, without the lookups."""
+    """Median of a frame, without the lookups."""
     lookups: float | None
-    """Mean a frame; None where only one k was played, so that march and lookups cannot be told apart: they
-    are in `march` then."""
+    """Median of a frame; None where only one k was played, so that march and lookups cannot be told apart:
+    they are in `march` then."""
     head: float
     rest: float
 
@@ -100,14 +100,14 @@ def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
     >>> lookup_slope([{1: {"fetches": 10, "march_ms": 7.0}, 2: {"fetches": 20, "march_ms": 9.0}}])
     0.2
     """
-    above = below = 0.0
+    slopes = []
     for answers in rounds:
         fetches = np.array([a["fetches"] for a in answers.values()], np.float64)
         march = np.array([a["march_ms"] for a in answers.values()], np.float64)
         fetches -= fetches.mean()
-        above += float(fetches @ (march - march.mean()))
-        below += float(fetches @ fetches)
-    return None if below == 0 else max(above / below, 0.0)
+        if fetches.any():
+            slopes.append(float(fetches @ march / (fetches @ fetches)))
+    return max(float(np.median(slopes)), 0.0) if slopes else None
 
 
 def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
@@ -115,7 +115,7 @@ def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Seque
         np.array([answer[key] for answer in answers], np.float64)
         for key in ("ms", "march_ms", "head_ms", "fetches")
     )
-    lookups = None if slope is None else min(slope * float(fetches.mean()), float(march.mean()))
+    lookups = None if slope is None else min(slope * float(np.median(fetches)), float(np.median(march)))
     low, high = np.percentile(ms, [25, 75])
     return Times(
         median=float(np.median(ms)),
@@ -123,8 +123,8 @@ def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Seque
         quartiles=(float(low), float(high)),
         uncertainty=notch(ms, shared),
         frames=len(ms),
-        march=float(march.mean()) - (lookups or 0.0),
+        march=float(np.median(march)) - (lookups or 0.0),
         lookups=lookups,
-        head=float(head.mean()),
-        rest=float((ms - march - head).mean()),
+        head=float(np.median(head)),
+        rest=float(np.median(ms - march - head)),
     )
