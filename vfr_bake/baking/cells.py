@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vfr_bake.baking.contracted import lattice_step, weighty_cells
+from vfr_bake.baking.contracted import BLOCK, lattice_step, weighty_cells
 from vfr_bake.baking.visibility import Progress, occupied_cells, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -31,6 +31,7 @@ def find_cells(model: Model, config: BakeConfig, progress: Progress) -> Cells:
     choice = config.choice()
     if model.field.config.unbounded:
         resolution = min(config.resolution or choice.contracted_resolution, model.field.config.max_resolution)
+        resolution -= resolution % BLOCK
         visible = weighty_cells(model, resolution, choice.weight_floor, progress)
         culled = (
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "

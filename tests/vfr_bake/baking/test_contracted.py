@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from vfr_bake.baking.contracted import lattice_step, weighty_cells
 from vfr_bake.baking.grids import make_layout
 from vfr_bake.baking.lessons import Lessons, Taught, collect_lessons
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
+from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
 from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
@@ -26,14 +28,25 @@ from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.trainer import Trainer
 
+OPAQUE = np.array([0, 0, 0, 255], np.uint8)
+
 
 def quiet(*_: object) -> None:
     """No progress."""
 
 
-@pytest.fixture(scope="module")
-def model() -> Model:
-    scene = build_scene(demo_capture(size=48, n_train=16, n_test=2), "unbounded")
+def photographs(views: PosedImages) -> PosedImages:
+    """The views before a blue wall without end, as a camera would have them: no pixel shows nothing."""
+    wall = np.array([60, 90, 160, 255])
+    share = [image[..., 3:] / 255 for image in views.images]
+    mixed = [image * a + wall * (1 - a) for image, a in zip(views.images, share, strict=True)]
+    return PosedImages(views.cameras, [image.round().astype(np.uint8) | OPAQUE for image in mixed])
+
+
+def trained() -> Model:
+    capture = demo_capture(size=48, n_train=16, n_test=2)
+    capture = replace(capture, train=photographs(capture.train), test=photographs(capture.test))
+    scene = build_scene(capture, "unbounded")
     field = FieldOptions(n_levels=6, max_resolution=128, log2_table_size=14, head_width=32)
     config = TrainConfig(device="cpu", field=field, steps=300, pilot_steps=60, batch_rays=128)
     trainer = Trainer(scene, config)
@@ -41,6 +54,11 @@ def model() -> Model:
         pass
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
     return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, False, {}, {})
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return trained()
 
 
 @pytest.fixture(scope="module")
