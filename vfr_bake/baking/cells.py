@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vfr_bake.baking.contracted import BLOCK, lattice_step, weighty_cells
+from vfr_bake.baking.contracted import BLOCK, FLOOR_SHARE, lattice_step, weighty_cells
 from vfr_bake.baking.visibility import Progress, occupied_cells, pixel_footprints, visible_cells
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -32,10 +32,11 @@ def find_cells(model: Model, config: BakeConfig, progress: Progress) -> Cells:
     if model.field.config.unbounded:
         resolution = min(config.resolution or choice.contracted_resolution, model.field.config.max_resolution)
         resolution -= resolution % BLOCK
-        visible = weighty_cells(model, resolution, choice.weight_floor, progress)
+        floor = config.weight_floor or choice.weight_floor * FLOOR_SHARE
+        visible = weighty_cells(model, resolution, floor, progress)
         culled = (
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
-            f"{choice.weight_floor:g}; part of the loss after 'grid'"
+            f"{floor:g}; part of the loss after 'grid'"
         )
         return Cells(visible, lattice_step(resolution), culled)
     cell = float(np.median(pixel_footprints(model)))

@@ -25,6 +25,10 @@ HITS = 6
 BLOCK = 2
 """Cells along each edge of a block. Blocks are found whole: the model's proposals take their time, 4,000 rays
 a second of one core, and so a quarter of the rays is enough. Surfaces are some cells thick anyway."""
+FLOOR_SHARE = 0.3
+"""Of the preset's weight floor: every ray ends in matter here, which lies in more and thinner layers. Fox at
+512 cells gains 0.25 dB with 0.003 instead of 0.01, for 43 % more vertices; a small built-in scene 14 dB with
+0.001."""
 FASTEST_CELLS = 1.5
 """Cells between two samples of a ray where it is fastest in contracted space; where it is slowest two fifths
 of it."""

@@ -65,7 +65,14 @@ def model() -> Model:
 def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bake") / "asset"
     settings = BakeConfig(
-        resolution=96, mesh_resolution=24, refine_steps=60, head_width=0, check_views=1, n_channels=10
+        resolution=64,
+        mesh_resolution=24,
+        refine_steps=20,
+        head_width=0,
+        check_views=1,
+        n_channels=10,
+        n_samples=8,
+        weight_floor=0.001,
     )
     bake(model, folder, settings, quiet)
     return folder
@@ -103,7 +110,7 @@ def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
 
 def test_the_asset_plays_what_the_model_shows(model: Model, folder: Path) -> None:
     asset = Asset.open(folder, verify=True)
-    assert asset.manifest.contracted and asset.manifest.step == pytest.approx(lattice_step(96))
+    assert asset.manifest.contracted and asset.manifest.step == pytest.approx(lattice_step(64))
     camera = model.model_cameras()[2]
     wanted = render_image(model.field, model.sampler, camera, model.background)
     frame = render(asset, model.cameras[2])
