@@ -13,7 +13,7 @@ import numpy as np
 
 from player.errors import ConfigError
 from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
-from vfr_bake.baking.contracted import VERTEX_SHARE, rays_of_contracted_views
+from vfr_bake.baking.contracted import BLOCK, VERTEX_SHARE, rays_of_contracted_views
 from vfr_bake.baking.culling import FLOORS
 from vfr_bake.baking.refinement import BATCH
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
@@ -84,7 +84,8 @@ def _resolution(model: Model, config: BakeConfig) -> int:
         resolution = min(choice.contracted_resolution, int(np.cbrt(room / _marks_bytes(model, config))))
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
-    return int(np.clip(resolution, 8, field.max_resolution))
+    resolution = int(np.clip(resolution, 8, field.max_resolution))
+    return resolution - resolution % BLOCK if field.unbounded else resolution
 
 
 def _marks_bytes(model: Model, config: BakeConfig) -> int:
