@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.errors import ConfigError
-from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
 from vfr_bake.baking.contracted import BLOCK, VERTEX_SHARE, rays_of_contracted_views
+from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
 from vfr_bake.baking.culling import FLOORS
 from vfr_bake.baking.refinement import BATCH
 from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
