@@ -11,7 +11,7 @@ import pytest
 
 from exporters.cli import main as export
 from player.cli import main as play
-from vfr_bake.cli import bake_main, eval_main, train_main
+from vfr_bake.cli import bake_main, bench_main, eval_main, train_main
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {
     "vfr-bake": (bake_main, ["--mesh-resolution", "32", "--check-views", "1", "--refine-steps", "50"]),
     "vfr-eval": (eval_main, []),
     "vfr-play": (play, ["--size", "24x24"]),
+    "vfr-bench": (bench_main, ["--views", "1", "--frames", "2", "--sizes", "24x24", "--samples", "1", "5"]),
     "vfr-export": (export, []),
 }
 

@@ -33,7 +33,7 @@ def fog(model: Model, logit: float) -> Model:
         field.density.out.weight.fill_(0)
         field.density.out.bias.fill_(logit)
     sampler = type(model.occupancy)(16, model.occupancy.step, seed=0)
-    sampler.restore(np.ones((16,) * 3, bool))
+    sampler.set_occupied(np.ones((16,) * 3, bool))
     return Model(field, sampler, model.world_from_model, model.cameras, True, {}, {})
 
 

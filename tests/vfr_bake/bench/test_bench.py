@@ -49,7 +49,7 @@ def model(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     asset = Asset.open(shells_folder)
     field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
     grid = OccupancyGrid(8, step=0.2, seed=0)
-    grid.restore(np.ones((8, 8, 8), bool))
+    grid.set_occupied(np.ones((8, 8, 8), bool))
     cameras = read_cameras(asset.path("cameras.json"))
     path = tmp_path_factory.mktemp("model") / "model.pt"
     save_model(path, Model(field, grid, asset.world_from_model, cameras, False, {}, {}))
