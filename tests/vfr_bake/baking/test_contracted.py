@@ -119,7 +119,9 @@ def test_the_asset_plays_what_the_model_shows(model: Model, folder: Path) -> Non
     solid = (opacity.reshape(48, 48) > 0.99) & (depth.reshape(48, 48) < 3)
     assert solid.sum() > 100
     found = frame.depth[solid] / asset.scale
-    assert np.median(np.abs(found / depth.reshape(48, 48)[solid] - 1)) < 0.03
+    assert (
+        np.median(np.abs(found / depth.reshape(48, 48)[solid] - 1)) < 0.15
+    )  # a thin fog, and t at the mean angle
     assert np.linalg.norm(frame.normals[solid], axis=-1) == pytest.approx(1, abs=1e-3)
 
 
