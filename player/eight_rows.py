@@ -1,4 +1,4 @@
-"""Eight rows of 8-bit codes added up at once: codes are unpacked in registers, LANES channels at a time.
+"""Eight rows of features added up at once: 8-bit codes are unpacked in registers, LANES channels at a time.
 
 A loop over ten channels of eight rows is not vectorised by the compiler, which cannot know that the sum lies
 elsewhere than the rows, and ten is less than what one register holds. Compiled code alone imports this.
@@ -22,6 +22,7 @@ _FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 
 
 def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any, first: Any) -> Any:
+    stored, align = (_CODES, 1) if features.dtype == types.int8 else (_FLOATS, 4)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
@@ -33,11 +34,12 @@ def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any,
 
         terms = []
         for i in range(8):
-            codes = builder.load(address(0, builder.extract_value(arguments[1], i), _CODES), align=1)
+            loaded = builder.load(address(0, builder.extract_value(arguments[1], i), stored), align=align)
+            values = builder.sitofp(loaded, _FLOATS) if stored is _CODES else loaded
             share = builder.extract_value(arguments[2], i)
             one = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), share, ir.IntType(32)(0))
             every = builder.shuffle_vector(one, ir.Constant(_FLOATS, ir.Undefined), _FIRST_LANE)
-            terms.append(builder.fmul(builder.sitofp(codes, _FLOATS), every))
+            terms.append(builder.fmul(values, every))
         while len(terms) > 1:
             terms = [builder.fadd(a, b) for a, b in zip(terms[::2], terms[1::2], strict=True)]
         place = address(3, arguments[4], _FLOATS)
@@ -49,9 +51,9 @@ def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any,
 
 
 add_rows: Any = intrinsic(_add_rows)
-"""add_rows(features [n, n_channels] int8, rows (8 int64), shares (8 float32), out [m, width] float32, row,
-first): add the weighted rows to `out[row]`, LANES channels from `first` on.
+"""add_rows(features [n, n_channels] int8 or float32, rows (8 int64), shares (8 float32), out [m, width]
+float32, row, first): add the weighted rows to `out[row]`, LANES channels from `first` on.
 
-LANES codes are read and LANES sums written whatever n_channels: both have to be there. Sums beyond n_channels
-are of no meaning.
+LANES values are read and LANES sums written whatever n_channels: both have to be there. Sums beyond
+n_channels are of no meaning.
 """

@@ -46,7 +46,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.28, contracted_resolution=768, n_channels=14, channel_loss_db=0.25, n_samples=8,
+        cells_per_pixel=1.28, contracted_resolution=832, n_channels=14, channel_loss_db=0.25, n_samples=8,
         sample_loss_db=0.05, code_levels=50, head_width=64, head_layers=3, head_bands=4, head_bits=32,
         refine_steps=2000, mesh_resolution=112, target_loss_db=0.4,
     ),
