@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from player.errors import DataError, MissingExtraError, VfrError
 from player.files import check_target, write_bytes
+from vfr_bake.bars import Bar, Bars
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 EVAL_VIEWS = {False: 10, True: 3}
 """Test views rendered at the end by whether the scene is unbounded, where no number is asked for."""
-SECONDS_BETWEEN_LINES = 30.0
-"""Where stderr is no terminal, progress is a line this often instead of a bar."""
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
@@ -89,7 +88,7 @@ def _train(options: Any) -> int:
     config = options.config
     processes = Processes.from_environment()
     data = processes.in_turn(lambda: _with_cameras(options.data))
-    with _Bar("reading pictures", processes.first) as bar:
+    with Bar("reading pictures", processes.first) as bar:
         scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
     trainer = Trainer(scene, config, processes)
     checkpoint = checkpoint_path(options.model)
@@ -118,7 +117,7 @@ def _with_cameras(data: str) -> str:
 
     if not needs_cameras(data):
         return data
-    with _Bars() as bars:
+    with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count)
     print(f"vfr-train: {report.summary()}", file=sys.stderr)
     return str(report.folder)
@@ -131,7 +130,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
     last = None
     interrupted = False
     saved = time.monotonic()
-    with _Bar("training", trainer.processes.first) as bar:
+    with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
         try:
             for last in trainer.run():
@@ -191,7 +190,7 @@ def _test_figures(trainer: Trainer, scene: Scene, n_views: int) -> dict[str, Any
 
     scores = []
     n_views = min(n_views, len(scene.test.cameras))
-    with _Bar("test views") as bar:
+    with Bar("test views") as bar:
         for score in evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), n_views):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
@@ -229,7 +228,7 @@ def _bake(options: Any) -> int:
         f"{plan.resolution} cells per axis, {plan.n_rays:,} rays to learn from",
         file=sys.stderr,
     )
-    with _Bars() as bars:
+    with Bars() as bars:
         result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6
     figures = {
@@ -262,7 +261,7 @@ def _eval(options: Any) -> int:
 
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model)
-    with _Bar("reading pictures") as bar:
+    with Bar("reading pictures") as bar:
         scene = load_scene(options.data, bar.count, downscale=model.train.get("downscale", 1))
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
@@ -271,7 +270,7 @@ def _eval(options: Any) -> int:
     views = type(scene.test)([c.transformed(to_model) for c in cameras], scene.test.images)
     names = frame_names(views.cameras)
     scores = []
-    with _Bar("test views") as bar:
+    with Bar("test views") as bar:
         for view in render_views(model.field, model.sampler, views, model.background):
             if options.pictures is not None:
                 picture = comparison(view.photograph, view.rgb)
@@ -307,7 +306,7 @@ def _bench(options: Any) -> int:
         if target is not None and str(target) != "-":
             check_target(target, options.force)
     lpips = None if options.lpips is None else Lpips(options.lpips)
-    with _Bars() as bars:
+    with Bars() as bars:
         trade = measure_trade(plan, lpips, bars.count)
     if options.html is not None:
         write_bytes(options.html, trade_page(trade))
@@ -337,68 +336,3 @@ def _result(target: Path | None, figures: dict[str, Any], sentence: str) -> None
     if target is not None:
         write_bytes(target, text.encode())
     print(sentence)
-
-
-class _Bars:
-    """One bar after the other, by what is being done."""
-
-    def __init__(self) -> None:
-        self._bars: dict[str, _Bar] = {}
-
-    def __enter__(self) -> _Bars:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for bar in self._bars.values():
-            bar.close()
-
-    def count(self, what: str, done: int, of: int) -> None:
-        bar = self._bars.setdefault(what, _Bar(what))
-        bar.count(done, of)
-        if done >= of:
-            bar.close()
-
-
-class _Bar:
-    """A tqdm bar on stderr where that is a terminal, else a line now and then."""
-
-    def __init__(self, title: str, shown: bool = True) -> None:
-        self._title = title
-        self._shown = shown
-        self._bar: Any = None
-        self._last_line = time.monotonic()
-        self._begin = self._last_line
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def count(self, done: int, of: int) -> None:
-        self._show(done / of if of else 1.0, f"{done}/{of}")
-
-    def share(self, share: float, text: str) -> None:
-        self._show(share, text)
-
-    def _show(self, share: float, text: str) -> None:
-        if not self._shown:
-            return
-        if not sys.stderr.isatty():
-            if time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
-                self._last_line = time.monotonic()
-                left = (self._last_line - self._begin) * (1 - share) / max(share, 1e-9)
-                print(f"{self._title}: {share:.0%}, {left:.0f} s left, {text}", file=sys.stderr, flush=True)
-            return
-        if self._bar is None:
-            from tqdm import tqdm
-
-            layout = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}  {postfix}"
-            self._bar = tqdm(total=1.0, desc=self._title, bar_format=layout, file=sys.stderr)
-        self._bar.set_postfix_str(text, refresh=False)
-        self._bar.update(share - self._bar.n)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None

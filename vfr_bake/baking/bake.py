@@ -22,13 +22,11 @@ from exporters.mesh import TriangleMesh
 from exporters.onnx_head import HeadWeights, head_onnx
 from exporters.ply import ply_bytes
 from player.asset import Asset, GridArrays, write_asset
-from player.cameras import Camera
 from player.errors import ConfigError, TrainingError
 from player.files import check_target
 from player.head import Head
 from player.manifest import Manifest
 from player.packing import pack_codes
-from player.render import Renderer
 from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
@@ -44,10 +42,9 @@ from vfr_bake.baking.pace import LOOKUPS, frame_ms, keep_to_time, measured_in_me
 from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
-from vfr_bake.baking.report import BakeReport
+from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.views import views_between
 from vfr_bake.config import BakeConfig
-from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
@@ -60,10 +57,6 @@ NEW_HEAD_RATE = 3e-3
 """Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
 DIRECTION_SHARE = 0.1
 """Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
-N_PICTURES = 2
-"""Views shown side by side in the report."""
-PICTURE_PIXELS = 160_000
-"""Of each of them at most: the full model takes a second for 10,000 pixels of an unbounded scene."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 
@@ -377,17 +370,8 @@ class _Bake:
         asked = asdict(self.config) | asdict(self.choice)
         return BakeReport(
             f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(), n_bytes,
-            self.seconds, self.left_out, self.lookups, missed, list(self._pictures(asset)),
+            self.seconds, self.left_out, self.lookups, missed, list(side_by_side(self.model, asset)),
         )  # fmt: skip
-
-    def _pictures(self, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        with Renderer(asset) as renderer:
-            for view in views_between(self.model, N_PICTURES, seed=3):
-                share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
-                camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
-                full = render_image(self.model.field, self.model.sampler, camera, self.model.background)
-                world: Camera = camera.transformed(self.model.world_from_model)
-                yield camera.name, full, renderer.render(world).rgb
 
     def _progress(self, name: str) -> Callable[[int, int], object]:
         return lambda done, of: self._report(name, done, of)

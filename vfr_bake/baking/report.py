@@ -7,15 +7,25 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
 import numpy as np
 
+from player.asset import Asset
 from player.images import png_bytes
+from player.render import Renderer
+from vfr_bake.baking.views import views_between
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.comparison import BRIGHTEST_ERROR, comparison
+from vfr_bake.training.model_file import Model
 
+N_PICTURES = 2
+"""Views shown side by side in the report."""
+PICTURE_PIXELS = 160_000
+"""Of each of them at most: the full model takes a second for 10,000 pixels of an unbounded scene."""
 BAR_WIDTH = 420
 """Pixels of the longest bar of a plot."""
 STYLE = """
@@ -146,3 +156,13 @@ def _table(values: dict[str, str]) -> str:
 def _picture(name: str, full: np.ndarray, played: np.ndarray) -> str:
     data = base64.b64encode(png_bytes(comparison(full, played))).decode()
     return f'<p>{escape(name)}<br><img alt="{escape(name)}" src="data:image/png;base64,{data}"></p>'
+
+
+def side_by_side(model: Model, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, the model's picture and the asset's [height, width, 3] of some views between the cameras."""
+    with Renderer(asset) as renderer:
+        for view in views_between(model, N_PICTURES, seed=3):
+            share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
+            camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
+            full = render_image(model.field, model.sampler, camera, model.background)
+            yield camera.name, full, renderer.render(camera.transformed(model.world_from_model)).rgb
