@@ -43,7 +43,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=4.0, contracted_resolution=1024, n_channels=22, channel_loss_db=0.03, n_samples=16,
         sample_loss_db=0.005, code_levels=127, head_width=0, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=1000, mesh_resolution=128, target_loss_db=0.05,
+        refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.34, contracted_resolution=832, n_channels=14, channel_loss_db=0.25, n_samples=8,
