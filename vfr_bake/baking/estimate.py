@@ -32,8 +32,9 @@ STORED_SHARE = 1.0
 """Vertices for each cell that may hold matter: culling takes away what corners add."""
 N_TIMED = 8192
 """Rays that tell how fast the model answers."""
-STEP_COST, VERTEX_COST = 2.5, 0.12
-"""Of a lesson in a step of refinement, and of a vertex, in rays of the model."""
+STEP_COST, VERTEX_COST = {False: 2.5, True: 0.2}, 0.12
+"""Of a lesson in a step of refinement, by whether the scene is unbounded (whose model takes its time for a
+ray), and of a vertex, in rays of the model."""
 
 
 @dataclass(frozen=True)
@@ -119,5 +120,5 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         finer = max(model.occupancy.step * plan.resolution / 2, 1.0)
         work += finer * rays_of_views(model, plan.resolution)
     n_rounds = 3 if choice.head_width else 2
-    work += n_rounds * choice.refine_steps * BATCH * STEP_COST
+    work += n_rounds * choice.refine_steps * BATCH * STEP_COST[model.field.config.unbounded]
     return times[-1] * work / N_TIMED

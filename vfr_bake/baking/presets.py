@@ -46,9 +46,9 @@ PRESETS: dict[Preset, BakeChoice] = {
         refine_steps=500, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.34, contracted_resolution=832, n_channels=14, channel_loss_db=0.25, n_samples=8,
+        cells_per_pixel=1.28, contracted_resolution=832, n_channels=14, channel_loss_db=0.25, n_samples=8,
         sample_loss_db=0.05, code_levels=50, head_width=64, head_layers=3, head_bands=4, head_bits=32,
-        refine_steps=3000, mesh_resolution=80, target_loss_db=0.4,
+        refine_steps=2000, mesh_resolution=96, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.0, contracted_resolution=512, n_channels=10, channel_loss_db=0.8, n_samples=4,
