@@ -18,7 +18,14 @@ from exporters.mesh import TriangleMesh, take_faces
 from exporters.mesh_rays import MeshRays
 from exporters.surface import remove_small_components
 from exporters.surface_colour import surface_colours
-from exporters.training_views import FULL_PIXELS, TOLERANCE, DepthView, depth_views, seen_vertices
+from exporters.training_views import (
+    FULL_PIXELS,
+    SMALL_PIXELS,
+    TOLERANCE,
+    DepthView,
+    depth_views,
+    seen_vertices,
+)
 from player.asset import Asset
 from player.errors import DataError, MissingExtraError
 
@@ -46,14 +53,16 @@ class Removed:
 class Scene:
     """An asset whose training cameras are played once, when somebody first asks what they see."""
 
-    def __init__(self, asset: Asset, report: Report) -> None:
+    def __init__(self, asset: Asset, report: Report, max_pixels: int = SMALL_PIXELS) -> None:
         self.asset = asset
         self.report = report
+        self.max_pixels = max_pixels
+        """Of each view."""
 
     @cached_property
     def views(self) -> list[DepthView]:
         """What the training cameras see."""
-        return depth_views(self.asset, progress=lambda done, of: self.report("views", done, of))
+        return depth_views(self.asset, self.max_pixels, lambda done, of: self.report("views", done, of))
 
     @property
     def voxel(self) -> float:

@@ -6,13 +6,13 @@ that is hit, of sum 1.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from exporters.mesh import TriangleMesh
+from exporters.open3d_package import require_open3d
 from player.cameras import Camera
-from player.errors import MissingExtraError
 
 
 class Hits(NamedTuple):
@@ -35,15 +35,9 @@ class MeshRays:
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        try:
-            import open3d
-        except (ImportError, OSError) as error:  # OSError: installed, but a library of the system is missing
-            raise MissingExtraError(
-                "the mesh: needs open3d: pip install 'vfr-bake[export]' (on a bare machine also "
-                "libusb-1.0-0, libgl1)"
-            ) from error
-        self._tensor: Any = open3d.core.Tensor  # Open3D's stubs know less than its code
-        self._scene: Any = open3d.t.geometry.RaycastingScene()
+        open3d = require_open3d("the mesh")
+        self._tensor = open3d.core.Tensor
+        self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32)
         )

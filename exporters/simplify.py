@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from exporters.mesh import TriangleMesh
+from exporters.open3d_package import require_open3d
 from player.errors import ConfigError, DataError, MissingExtraError
 
 
@@ -36,13 +37,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
         raise ConfigError(f"--faces: expected 1 or more, got {n_faces}")
     if len(mesh.faces) <= n_faces:
         return mesh
-    try:
-        import open3d
-    except (ImportError, OSError) as error:  # OSError: installed, but a library of the system is missing
-        raise MissingExtraError(
-            "--faces: needs open3d: pip install 'vfr-bake[export]' (on a bare machine also libusb-1.0-0, "
-            f"libgl1): {_first_line(error)}"
-        ) from error
+    open3d = require_open3d("--faces")
     source = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.vertices, np.float64)),
         open3d.utility.Vector3iVector(np.ascontiguousarray(mesh.faces)),
@@ -89,7 +84,3 @@ def _unit(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
         length = np.linalg.norm(normals, axis=-1)
     known = length[:, None] > 0
     return np.where(known, normals / np.where(known, length[:, None], 1), [0.0, 0.0, 1.0])
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

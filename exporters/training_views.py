@@ -1,8 +1,7 @@
 """What the training cameras see of an asset: their pictures of depth, played, and which points are in view.
 
 Letters: t, the distance from a camera along a ray, world units; c, the cosine between a point's normal and
-    the
-direction to the camera. A point is seen where c > 0 and t is at most what the picture of depth has there,
+the direction to the camera. A point is seen where c > 0 and t is at most what the picture of depth has there,
 plus a tolerance; where the picture is less than half opaque nothing is in the way.
 """
 

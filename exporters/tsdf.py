@@ -8,12 +8,12 @@ out, and so are those beside a jump in depth, whose mean lies between two surfac
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
+from exporters.open3d_package import require_open3d
 from exporters.training_views import DepthView
-from player.errors import DataError, MissingExtraError
+from player.errors import DataError
 
 TRUNCATION = 3.0
 """Voxels on both sides of a surface that a depth is believed for."""
@@ -41,18 +41,10 @@ def fuse_depth(
         DataError: no view sees anything.
         MissingExtraError: Open3D is not installed.
     """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:  # OSError: installed, but a library of the system is missing
-        raise MissingExtraError(
-            "--method tsdf: needs open3d: pip install 'vfr-bake[export]' (on a bare machine also "
-            "libusb-1.0-0, libgl1)"
-        ) from error
-    core = open3d.core
-    one: Any = (1, 1)  # Open3D's stubs know less than its code
-    tensor: Any = core.Tensor
+    open3d = require_open3d("--method tsdf")
+    core, tensor = open3d.core, open3d.core.Tensor
     grid = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (core.float32, core.float32), one, voxel, 8, _BLOCKS, core.Device("CPU:0")
+        ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
     )
     for done, view in enumerate(views):
         camera = view.camera

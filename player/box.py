@@ -21,11 +21,21 @@ class Entries(NamedTuple):
     """[3, n] float32, entry point in cells."""
     direction: np.ndarray
     """[3, n] float32, cells per model unit."""
+    step: np.float32
+    """Model units between samples."""
 
     def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Grid coordinates [3, n_places] at `s` [n_places] behind the entries of the rays `ray`
         [n_places]."""
         return self.point[:, ray] + s * self.direction[:, ray]
+
+    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Model units [n_places] that samples stand for: a step, wherever they are."""
+        return np.full(len(ray), self.step)
+
+    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """`gradients` themselves: the box's axes are the model frame's."""
+        return gradients
 
 
 def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entries:
@@ -49,4 +59,4 @@ def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entri
         t_out[outside] = -np.inf
     with np.errstate(over="ignore", invalid="ignore"):  # of rays that miss; nobody asks where
         point = np.clip(point + t_in * direction, np.float32(0), size)
-    return Entries(t_in, t_out - t_in, point, direction)
+    return Entries(t_in, t_out - t_in, point, direction, grid.step)

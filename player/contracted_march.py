@@ -17,7 +17,7 @@ import numpy as np
 
 from player.contracted_rays import MAX_SPEED, SPARE, ContractedRays, enter_space, lattice
 from player.few_samples import Samples, fetch_features
-from player.march import MAX_TAU, MIN_OPACITY, SKIP_MARGIN, MarchResult, trilinear, weigh
+from player.march import MAX_TAU, MIN_OPACITY, SKIP_MARGIN, MarchResult, accumulate, trilinear, weigh
 from player.sparse_grid import SparseGrid
 
 CHUNK = SPARE
@@ -89,7 +89,7 @@ def _take_chunk(
     """CHUNK lattice samples of each ray: those in live cells, up to the one that passes MAX_TAU; `tau` is
     updated.
 
-    Returns of every sample taken its ray, s, optical depth, and tau before and after it.
+    Returns what `player.march.accumulate` does.
     """
     which = (i[:, None] + np.arange(CHUNK)).reshape(-1)
     owner = np.repeat(index, CHUNK)
@@ -100,18 +100,8 @@ def _take_chunk(
     at = np.flatnonzero(is_live & (s < rays.length[owner]))
     code = trilinear(grid.density, where[at], [f[at] for f in fractions])
     way = rays.ways(owner[at], cos[at], sin[at])
-    optical = np.zeros((len(index), CHUNK + 1), np.float32)
-    optical[:, 0] = tau[index]
-    row, column = np.divmod(at, CHUNK)
-    depth_of_sample = np.exp(grid.density_low + grid.density_slope * code) * way
-    optical[row, column + 1] = depth_of_sample
-    running = np.cumsum(optical, axis=1, dtype=np.float32)
-    before = running[row, column]
-    kept = before <= MAX_TAU
-    row, column, before, depth_of_sample = row[kept], column[kept], before[kept], depth_of_sample[kept]
-    after = running[row, column + 1]
-    tau[index[row]] = after  # in order, so that the last sample of each ray stays
-    return index[row], s[at[kept]], depth_of_sample, before, after
+    optical = np.exp(grid.density_low + grid.density_slope * code) * way
+    return accumulate(index, s.reshape(-1, CHUNK), at, optical, tau)
 
 
 def _cells(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:

@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
+from player.compiling import compiled, inlined
 from player.contracted_rays import MAX_SPEED, MIN_COS, SPARE, enter_space, lattice
+from player.grid_compiled import LANES, equal_mass, fetch, opacity_of, trilinear, weight_of
 from player.march import MAX_TAU, MIN_OPACITY, SKIP_MARGIN, MarchResult
-from player.march_compiled import _fetch, _jit, _opacity, _trilinear
 from player.sparse_grid import SparseGrid
 
 F32 = np.float32
@@ -38,17 +39,19 @@ def march(
         (rays.nearest, rays.along, rays.t_nearest, rays.width, rays.cos, rays.sin, rays.length),
         table,
         n_samples,
-        (np.empty(capacity, F32), np.empty(capacity, F32), np.empty(8, np.int64), np.empty(8, F32)),
+        (np.empty(capacity, F32), np.empty(capacity, F32), np.empty((2, max(n_samples, 1)), F32)),
+        (np.empty(8, np.int64), np.empty(8, F32)),
+        np.zeros((1, -(-grid.n_channels // LANES) * LANES), F32),
         (opacity, depth, counts, features, hits),
     )  # fmt: skip
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits])
 
 
-@_jit
-def _march_rays(settings, steps, lookup, stored, rays, table, k, scratch, out):
+@compiled
+def _march_rays(settings, steps, lookup, stored, rays, table, k, scratch, corners, composite, out):
     """Every ray: its samples into the scratch arrays, then its fetches into the next row of `features`."""
     nearest, along, t_nearest, width, cos0, sin0, length = rays
-    scratch_s, scratch_w, corner_rows, corner_shares = scratch
+    scratch_s, scratch_w, _ = scratch
     opacity, depth, counts, features, hits = out
     n_hits = 0
     for index in range(len(length)):
@@ -62,29 +65,29 @@ def _march_rays(settings, steps, lookup, stored, rays, table, k, scratch, out):
         counts[index] = taken
         if n == 0:
             continue
-        mass = F32(_opacity(tau))
+        mass = F32(opacity_of(tau))
         opacity[index] = mass
         mean = F32(moment / total)
         cos, sin = _turned(ray, F32(math.cos(mean)), F32(math.sin(mean)))
         depth[index] = t_nearest[index] + width[index] * sin / max(cos, MIN_COS)
         if mass > MIN_OPACITY:
-            _gather(
-                stored, settings, ray, scratch_s, scratch_w, n, total, mass, k, corner_rows, corner_shares,
-                features, n_hits,
-            )  # fmt: skip
+            composite[:] = F32(0.0)
+            _gather(stored, settings, ray, scratch, n, total, mass, k, corners, composite)
+            for c in range(features.shape[1]):
+                features[n_hits, c] = composite[0, c]
             hits[n_hits] = index
             n_hits += 1
     return n_hits
 
 
-@_jit
+@inlined
 def _turned(ray, cos_s, sin_s):
     """cos and sin of phi."""
     cos, sin = ray[6], ray[7]
     return cos * cos_s - sin * sin_s, sin * cos_s + cos * sin_s
 
 
-@_jit
+@inlined
 def _on_grid(ray, cos, sin, cells):
     """Grid coordinates of a place."""
     px, py, pz, ax, ay, az, _, _ = ray
@@ -99,7 +102,7 @@ def _on_grid(ray, cos, sin, cells):
     return vx * scale + middle, vy * scale + middle, vz * scale + middle
 
 
-@_jit
+@inlined
 def _collect(settings, steps, lookup, ray, width, length, table, scratch_s, scratch_w):
     """March one ray: s and weight of each sample that has weight into the scratch arrays.
 
@@ -134,22 +137,14 @@ def _collect(settings, steps, lookup, ray, width, length, table, scratch_s, scra
         lx, ly, lz = x & 7, y & 7, z & 7
         if (live[slot * 64 + lx * 8 + ly] >> lz) & 1 == 0:
             continue
-        code = _trilinear(density, slot * 729 + lx * 81 + ly * 9 + lz, gx - F32(x), gy - F32(y), gz - F32(z))
+        code = trilinear(density, slot * 729 + lx * 81 + ly * 9 + lz, gx - F32(x), gy - F32(y), gz - F32(z))
         a, b = cos * cos_half, sin * sin_half
         way = width * sin_step / (max(a + b, MIN_COS) * max(a - b, MIN_COS))
         optical = F32(math.exp(low + slope * code)) * way
         taken += 1
         tau += optical
         behind = F32(math.exp(-tau))
-        # alpha = -expm1(-optical), without its cost: a difference where it does not cancel, else four terms
-        if optical > F32(0.1):
-            weight = trans - behind
-        else:
-            weight = (
-                trans
-                * optical
-                * (F32(1) - optical * (F32(1 / 2) - optical * (F32(1 / 6) - optical * F32(1 / 24))))
-            )
+        weight = weight_of(optical, trans, behind)
         trans = behind
         if weight > F32(0.0):
             scratch_s[n] = s
@@ -162,53 +157,33 @@ def _collect(settings, steps, lookup, ray, width, length, table, scratch_s, scra
     return n, taken, tau, total, moment
 
 
-@_jit
+@inlined
 def _free(g, brick, reach):
     """Cells along one axis to the nearer border of the bricks within `reach` of `brick`."""
     return min(g - F32((brick - reach) * 8), F32((brick + reach + 1) * 8) - g)
 
 
-@_jit
-def _gather(stored, settings, ray, scratch_s, scratch_w, n, total, mass, k, rows, shares, out, row):
-    """Choose the fetches of one ray and add them up in `out[row]`: bins of equal mass, filled in one pass."""
+@inlined
+def _gather(stored, settings, ray, samples, n, total, mass, k, corners, out):
+    """Choose the fetches of one ray and add them up in `out`."""
+    scratch_s, scratch_w, places = samples
     if k == 0 or n <= k:
         for i in range(n):
-            _fetch_at(stored, settings, ray, scratch_s[i], scratch_w[i], rows, shares, out, row)
+            _fetch_at(stored, settings, ray, scratch_s[i], scratch_w[i], corners, out)
         return
-    share = total / k
+    equal_mass(scratch_s, scratch_w, n, total, k, places)
     weight = mass / F32(k)
-    i = 0
-    left = np.float64(scratch_w[0])
-    for _ in range(k):
-        need = share
-        moment = 0.0
-        heaviest = -1.0
-        heaviest_s = scratch_s[i]
-        while True:
-            part = min(left, need)
-            moment += part * scratch_s[i]
-            if part > heaviest:
-                heaviest = part
-                heaviest_s = scratch_s[i]
-            need -= part
-            left -= part
-            if left > 0.0 or i == n - 1:
-                break
-            i += 1
-            left = np.float64(scratch_w[i])
-            if need <= 0.0:
-                break
-        s = F32(moment / share)
-        if not _fetch_at(stored, settings, ray, s, weight, rows, shares, out, row):
-            _fetch_at(stored, settings, ray, heaviest_s, weight, rows, shares, out, row)
+    for i in range(k):
+        if not _fetch_at(stored, settings, ray, places[0, i], weight, corners, out):
+            _fetch_at(stored, settings, ray, places[1, i], weight, corners, out)
 
 
-@_jit
-def _fetch_at(stored, settings, ray, s, weight, rows, shares, out, row):
-    """Add `weight` times the features at s to `out[row]`; False, and nothing added, where too little is
+@inlined
+def _fetch_at(stored, settings, ray, s, weight, corners, out):
+    """Add `weight` times the features at s to `out`; False, and nothing added, where too little is
     stored."""
     resolution, n_per_axis, _, _, cells = settings
     cos, sin = _turned(ray, F32(math.cos(s)), F32(math.sin(s)))
     place = _on_grid(ray, cos, sin, cells)
     still = (F32(0), F32(0), F32(0))
-    return _fetch(stored, (resolution, n_per_axis), place, still, F32(0), weight, rows, shares, out, row)
+    return fetch(stored, (resolution, n_per_axis), place, still, F32(0), weight, corners, out)

@@ -21,7 +21,7 @@ _CODES = ir.VectorType(ir.IntType(8), LANES)
 _FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 
 
-def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any, first: Any) -> Any:
+def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, first: Any) -> Any:
     stored, align = (_CODES, 1) if features.dtype == types.int8 else (_FLOATS, 4)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -29,7 +29,7 @@ def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any,
         def address(index: int, at: Any, vector: ir.VectorType) -> Any:
             kind = signature.args[index]
             array = context.make_array(kind)(context, builder, arguments[index])
-            place = cgutils.get_item_pointer(context, builder, kind, array, [at, arguments[5]])
+            place = cgutils.get_item_pointer(context, builder, kind, array, [at, arguments[4]])
             return builder.bitcast(place, ir.PointerType(vector))
 
         terms = []
@@ -42,17 +42,17 @@ def _add_rows(_: Any, features: Any, rows: Any, shares: Any, out: Any, row: Any,
             terms.append(builder.fmul(values, every))
         while len(terms) > 1:
             terms = [builder.fadd(a, b) for a, b in zip(terms[::2], terms[1::2], strict=True)]
-        place = address(3, arguments[4], _FLOATS)
+        place = address(3, context.get_constant(types.int64, 0), _FLOATS)
         builder.store(builder.fadd(builder.load(place, align=4), terms[0]), place, align=4)
         return context.get_dummy_value()
 
     eight = types.UniTuple(types.int64, 8), types.UniTuple(types.float32, 8)
-    return types.void(features, *eight, out, types.int64, types.int64), generate
+    return types.void(features, *eight, out, types.int64), generate
 
 
 add_rows: Any = intrinsic(_add_rows)
-"""add_rows(features [n, n_channels] int8 or float32, rows (8 int64), shares (8 float32), out [m, width]
-float32, row, first): add the weighted rows to `out[row]`, LANES channels from `first` on.
+"""add_rows(features [n, n_channels] int8 or float32, rows (8 int64), shares (8 float32), out [1, width]
+float32, first): add the weighted rows to `out[0]`, LANES channels from `first` on.
 
 LANES values are read and LANES sums written whatever n_channels: both have to be there. Sums beyond
 n_channels are of no meaning.

@@ -33,6 +33,15 @@ class Places(Protocol):
         """Grid coordinates [3, n_places] at the places `s` [n_places] on the rays `ray` [n_places]."""
         ...
 
+    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Model units [n_places] that samples at these places stand for."""
+        ...
+
+    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Gradients [3, n_places] at these places with respect to the grid's axes (model units), as such with
+        respect to the model frame's."""
+        ...
+
 
 class Samples(NamedTuple):
     """Samples with weight, grouped by ray, in the order of the march."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from player.compiling import compiled
 from player.dense_tiles import (
     GELU,
     LANES,
@@ -23,7 +24,6 @@ from player.dense_tiles import (
     dense_tile,
     multiply_lanes,
 )
-from player.march_compiled import compiled
 from player.onnx_graph import Graph, Node
 
 BLOCK = 4 * ROWS

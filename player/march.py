@@ -158,7 +158,7 @@ def _take_chunk(grid: SparseGrid, state: list[np.ndarray], tau: np.ndarray) -> t
     """CHUNK lattice samples of each ray: those in live cells, up to the one that passes MAX_TAU; `tau` is
     updated.
 
-    Returns of every sample taken its ray, s, optical depth, and tau before and after it.
+    Returns what `accumulate` does.
     """
     rays, i, length, point, direction = state
     s = ((i[:, None] + np.arange(CHUNK, dtype=np.int32)) + np.float32(0.5)) * grid.step  # [n, CHUNK]
@@ -182,18 +182,35 @@ def _take_chunk(grid: SparseGrid, state: list[np.ndarray], tau: np.ndarray) -> t
     f = [g.reshape(-1)[at] - cell.reshape(-1)[at] for g, cell in fractions]
     where = known.reshape(-1)[at].astype(np.int64) * 729 + corner.reshape(-1)[at]
     code = trilinear(grid.density, where, [x.astype(np.float32) for x in f])
-    optical = np.zeros((len(rays), CHUNK + 1), np.float32)
-    optical[:, 0] = tau[rays]
-    row, column = np.divmod(at, CHUNK)
-    depth_of_sample = np.exp(grid.density_low + grid.density_slope * code) * grid.step
-    optical[row, column + 1] = depth_of_sample
-    running = np.cumsum(optical, axis=1, dtype=np.float32)
+    optical = np.exp(grid.density_low + grid.density_slope * code) * grid.step
+    return accumulate(rays, s, at, optical, tau)
+
+
+def accumulate(
+    rays: np.ndarray, s: np.ndarray, at: np.ndarray, optical: np.ndarray, tau: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Add the optical depths of a chunk's samples to `tau` [n_all], for each ray up to the one that passes
+    MAX_TAU.
+
+    Args:
+        rays: [n] the rays of the chunk, each once.
+        s: [n, chunk] float32 of their lattice samples.
+        at: [m] which of these count, as flat indices, ascending.
+        optical: [m] float32 their optical depths.
+        tau: updated.
+
+    Returns of every sample taken its ray, s, optical depth, and tau before it.
+    """
+    row, column = np.divmod(at, s.shape[1])
+    added = np.zeros((len(rays), s.shape[1] + 1), np.float32)
+    added[:, 0] = tau[rays]
+    added[row, column + 1] = optical
+    running = np.cumsum(added, axis=1, dtype=np.float32)
     before = running[row, column]
     kept = before <= MAX_TAU
-    row, column, before, depth_of_sample = row[kept], column[kept], before[kept], depth_of_sample[kept]
-    after = running[row, column + 1]
-    tau[rays[row]] = after  # in order, so that the last sample of each ray stays
-    return rays[row], s.reshape(-1)[at[kept]], depth_of_sample, before, after
+    row, column = row[kept], column[kept]
+    tau[rays[row]] = running[row, column + 1]  # in order, so that the last sample of each ray stays
+    return rays[row], s[row, column], optical[kept], before[kept]
 
 
 def trilinear(density: np.ndarray, at: np.ndarray, f: list[np.ndarray]) -> np.ndarray:
@@ -217,7 +234,7 @@ def weigh(
     if not parts:
         none = np.zeros(0, np.float32)
         return Samples(none.astype(np.int64), none, none), tau, np.zeros(n_rays, np.int32)
-    ray, s, optical, before, _ = (np.concatenate(column) for column in zip(*parts, strict=True))
+    ray, s, optical, before = (np.concatenate(column) for column in zip(*parts, strict=True))
     counts = np.bincount(ray, minlength=n_rays).astype(np.int32)
     small = ray.astype(np.uint16) if n_rays <= 1 << 16 else ray  # 16 bits are sorted by radix
     order = np.argsort(small, kind="stable")

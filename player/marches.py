@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from player import contracted_march, march
-from player.box import Entries, enter_box
-from player.contracted_rays import ContractedRays, enter_space
-from player.few_samples import Samples
+from player.box import enter_box
+from player.contracted_rays import enter_space
+from player.few_samples import Places, Samples
 from player.sparse_grid import SparseGrid
 
 
@@ -16,7 +16,7 @@ def sampled_rays(
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[Entries | ContractedRays, Samples, np.ndarray]:
+) -> tuple[Places, Samples, np.ndarray]:
     """Rays in grid coordinates, all their samples with weight, and tau [n] of each; by the numpy marches.
 
     Args:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.contracted_rays import ContractedRays
 from player.marches import sampled_rays
 from player.sparse_grid import SparseGrid
 
@@ -35,8 +34,7 @@ def composited_normals(
     """
     places, samples, _ = sampled_rays(grid, rays_o, rays_d, bounds)
     slopes = code_gradient(grid, places.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
-    if isinstance(places, ContractedRays):
-        slopes = places.pulled_back(slopes, samples.ray, samples.s)
+    slopes = places.pulled_back(slopes, samples.ray, samples.s)
     weights = samples.weights.astype(np.float64)
     normals = np.stack([-np.bincount(samples.ray, weights * slope, len(rays_o)) for slope in slopes], axis=-1)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)

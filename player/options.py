@@ -40,7 +40,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="FILE",
         help="those of a transforms.json, a nerfstudio camera_path.json or a COLMAP folder",
     )
-    views.add_argument("--orbit", type=_positive, metavar="N", help="a turn around the scene in N pictures")
+    views.add_argument("--orbit", type=positive, metavar="N", help="a turn around the scene in N pictures")
     views.add_argument(
         "--view", type=_number, metavar="N", help="training view N, from 0; -1 is the last one"
     )
@@ -48,7 +48,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     views.add_argument("--check", action="store_true", help="no view: compare every file with its checksum")
     _add_files(parser.add_argument_group("files"))
     add = parser.add_argument_group("pictures").add_argument
-    add("--size", type=_size, metavar="WxH", help="their size (the camera file's, else as trained)")
+    add("--size", type=size, metavar="WxH", help="their size (the camera file's, else as trained)")
     add(
         "--background",
         type=_background,
@@ -56,7 +56,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         help="white, black, transparent or R,G,B in 0..255",
     )
     add("--samples", type=_count, metavar="K", help="fetches a ray (the asset's own); 0: at every sample")
-    add("--threads", type=_positive, metavar="N", help="threads (one for each core)")
+    add("--threads", type=positive, metavar="N", help="threads (one for each core)")
     add("--march", choices=("auto", "numpy", "numba"), default="auto", help="implementation (numba if there)")
     add = parser.add_argument_group("viewer").add_argument
     add("--host", metavar="ADDRESS", help="address to serve at (127.0.0.1: this machine alone)")
@@ -119,7 +119,7 @@ def _whole(text: str, least: int, what: str) -> int:
     return value
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
     return _whole(text, 1, "a whole number from 1 on")
 
 
@@ -148,10 +148,10 @@ def _fps(text: str) -> float:
     return value
 
 
-def _size(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, int]:
     """Width and height.
 
-    >>> _size("800x600")
+    >>> size("800x600")
     (800, 600)
     """
     try:

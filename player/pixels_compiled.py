@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from player.cameras import Camera
+from player.compiling import compiled
 from player.march import MarchResult
-from player.march_compiled import compiled
 
 F32 = np.float32
 

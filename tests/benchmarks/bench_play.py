@@ -33,7 +33,7 @@ from player.asset import Asset
 from player.cameras import Camera, orbit
 from player.head import count_parameters
 from player.march import MIN_OPACITY
-from player.options import _positive, _size
+from player.options import positive, size
 from player.play import peak_rss_mb
 from player.render import Frame, Renderer, default_threads
 from player.transforms import read_cameras
@@ -191,9 +191,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("assets", type=Path, nargs="+")
     parser.add_argument("--cameras", type=Path, help="transforms.json; else an orbit")
-    parser.add_argument("--size", type=_size, default=(800, 800))
-    parser.add_argument("--frames", type=_positive, default=8)
-    parser.add_argument("--threads", type=_positive, default=default_threads())
+    parser.add_argument("--size", type=size, default=(800, 800))
+    parser.add_argument("--frames", type=positive, default=8)
+    parser.add_argument("--threads", type=positive, default=default_threads())
     parser.add_argument("--samples", type=int)
     parser.add_argument("--curves", action="store_true", help="time against pixels, threads and assets")
     arguments = parser.parse_args()

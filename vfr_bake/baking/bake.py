@@ -43,6 +43,7 @@ from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
 from vfr_bake.baking.report import BakeReport, side_by_side
+from vfr_bake.baking.unwritten import unwritten_asset
 from vfr_bake.baking.views import views_between
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -164,13 +165,13 @@ class _Bake:
         return layout
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
-        """The mesh of what is about to be written, played from a folder of its own."""
+        """The mesh of what is about to be written."""
         manifest = self._manifest(layout, arrays.features.shape[1], {})
         size = self.choice.mesh_resolution or layout.resolution
         with self._part("mesh"), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            cameras = write_cameras(self.model.cameras)
-            write_asset(Path(folder) / "asset", manifest, arrays, head, b"", cameras)
-            return bake_mesh(Asset.open(Path(folder) / "asset"), size, self._report)
+            files = {"head.onnx": head, "cameras.json": write_cameras(self.model.cameras)}
+            asset = unwritten_asset(Path(folder), manifest, arrays, files)
+            return bake_mesh(asset, size, self._report)
 
     def _store(self, layout: Layout) -> tuple[Stored, Taught]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""

@@ -47,6 +47,8 @@ class Plan:
     """Rays that are learned from."""
     most_vertices: int
     """More do not fit."""
+    n_vertices: float
+    """Vertices that are expected."""
     n_bytes: int
     """Peak of memory that is expected."""
 
@@ -73,7 +75,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
             f"{config.max_memory:g} GB: allow more, or lower --resolution"
         )
     peak = PROGRAM_BYTES + max(cells, n_vertices * vertex_bytes + n_rays * RAY_BYTES)
-    return Plan(resolution, n_rays, int(room / vertex_bytes), int(min(peak, allowed)))
+    return Plan(resolution, n_rays, int(room / vertex_bytes), n_vertices, int(min(peak, allowed)))
 
 
 def _resolution(model: Model, config: BakeConfig) -> int:
@@ -113,7 +115,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         begin = time.perf_counter()
         model.sampler.composited_features(model.field, rays_o, rays_d)
         times.append(time.perf_counter() - begin)
-    work = plan.n_rays + VERTEX_COST * _vertices(model, plan.resolution)
+    work = plan.n_rays + VERTEX_COST * plan.n_vertices
     if model.field.config.unbounded:
         work += rays_of_contracted_views(model, plan.resolution)
     elif not config.no_cull:

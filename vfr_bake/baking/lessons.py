@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.cameras import Camera
-from player.contracted_rays import ContractedRays
 from player.errors import TrainingError
 from player.few_samples import MIN_TOTAL, Places, Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
@@ -160,9 +159,7 @@ def player_fetches(
     shares /= np.where(stored, total, 1)[:, None]
     weights = np.where(stored, weights, np.float32(0)).astype(np.float32)
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    contracted = isinstance(entries, ContractedRays)
-    lengths = entries.lengths(ray, s) if contracted else np.full(len(ray), grid.step)
-    return hits, opacity[hits], (counts, rows, shares, weights, lengths)
+    return hits, opacity[hits], (counts, rows, shares, weights, entries.lengths(ray, s))
 
 
 def _corners(

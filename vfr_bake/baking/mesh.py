@@ -14,6 +14,8 @@ from player.asset import Asset
 from player.errors import ConfigError, DataError, MissingExtraError
 from player.sparse_grid import SparseGrid
 
+PIXELS = 22_500
+"""Of a view that is played for the mesh, at most: its faces are as large as several pixels of those."""
 BYTES_A_FACE = 27
 """Of a PLY: 13 of a face itself, and half a vertex of 28."""
 
@@ -30,7 +32,7 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
         report: called with (stage, done, of).
     """
     try:
-        scene = Scene(inner_region(asset), report)
+        scene = Scene(inner_region(asset), report, PIXELS)
         mesh, removed = scene.surface("density", None)
     except (ConfigError, DataError):  # nowhere as dense as a level, everywhere, or seen by nobody
         none = np.zeros((0, 3))

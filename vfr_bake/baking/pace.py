@@ -14,9 +14,10 @@ import numpy as np
 from player.asset import Asset, GridArrays
 from player.cameras import Camera
 from player.errors import TrainingError
-from player.manifest import FileEntry, Manifest
+from player.manifest import Manifest
 from player.render import Renderer
 from vfr_bake.baking.presets import BakeChoice
+from vfr_bake.baking.unwritten import unwritten_asset
 
 SIZE = 800
 """Pixels along each side of the frame that is measured."""
@@ -51,10 +52,7 @@ def measured_in_memory(
 
     def measure(width: int, n_samples: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
-            data = head(width)
-            (Path(folder) / "head.onnx").write_bytes(data)
-            entry = FileEntry(len(data), "0" * 64)
-            asset = Asset(Path(folder), replace(manifest, files={"head.onnx": entry}), arrays)
+            asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head(width)})
             return frame_ms(asset, camera, n_samples)
 
     return measure

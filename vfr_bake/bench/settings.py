@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from player.errors import ConfigError
+from player.options import size
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -20,16 +22,16 @@ class Plan:
     assets: Sequence[Path]
     """Folders of assets of one scene."""
     data: str
-    model: Path | None = None
-    views: int = 8
+    model: Path | None
+    views: int
     """Test views that are compared, spread evenly."""
-    sizes: Sequence[Size] = ()
+    sizes: Sequence[Size]
     """Of the timed frames, besides the photographs' own; none: half and twice of that."""
-    samples: Sequence[int] = (1, 2, 3, 4, 5, 8, 12, 16, 32, 0)
+    samples: Sequence[int]
     """Numbers of lookups a ray, 0 for every sample."""
-    frames: int = 20
+    frames: int
     """Timed frames of each setting and size."""
-    threads: int | None = None
+    threads: int | None
 
     def __post_init__(self) -> None:
         _check(len(self.assets) > 0, "assets", "at least one folder", "none")
@@ -44,20 +46,15 @@ class Plan:
 def plan_of(options: Any) -> Plan:
     """The plan of a command line (`vfr_bake.options.Bench`). Raises ConfigError."""
     given: dict[str, Any] = {name: getattr(options, name) for name in Plan.__dataclass_fields__}
-    given["sizes"] = [parse_size(text) for text in options.sizes]
+    given["sizes"] = [_size(text) for text in options.sizes]
     return Plan(**given)
 
 
-def parse_size(text: str) -> Size:
-    """Width and height. Raises ConfigError.
-
-    >>> parse_size("800x600")
-    (800, 600)
-    """
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise ConfigError(f"sizes: expected WIDTHxHEIGHT, from 1x1 on, got {text!r}")
-    return int(width), int(height)
+def _size(text: str) -> Size:
+    try:
+        return size(text)
+    except ArgumentTypeError as error:
+        raise ConfigError(f"sizes: {error}") from None
 
 
 def _check(fits: bool, name: str, expected: str, got: object) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from tests.vfr_bake.baking.training import trained
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.trainer import Trainer
 
 
 @pytest.fixture(scope="package")
@@ -17,8 +17,4 @@ def model() -> Model:
     config = TrainConfig(
         device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=48
     )
-    trainer = Trainer(scene, config)
-    for _ in trainer.run():
-        pass
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})
+    return trained(scene, config)

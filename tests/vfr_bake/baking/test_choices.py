@@ -8,10 +8,10 @@ import pytest
 
 from player.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene
+from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.trainer import Trainer
 
 MAX_MB = 1.0
 
@@ -20,22 +20,18 @@ def quiet(*_: object) -> None:
     """No progress."""
 
 
-def trained(kind: str) -> Model:
+def trained_scene(kind: str) -> Model:
     scene = analytic_scene(kind, size=48, n_train=20)
     field = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
     config = TrainConfig(
         device="cpu", field=field, steps=400, pilot_steps=100, batch_samples=8192, occupancy_resolution=32
     )
-    trainer = Trainer(scene, config)
-    for _ in trainer.run():
-        pass
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, True, {}, {})
+    return trained(scene, config)
 
 
 @pytest.fixture(scope="module")
 def models() -> dict[str, Model]:
-    return {kind: trained(kind) for kind in ("matte", "glossy", "fog")}
+    return {kind: trained_scene(kind) for kind in ("matte", "glossy", "fog")}
 
 
 @pytest.fixture(scope="module")

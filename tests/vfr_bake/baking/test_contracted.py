@@ -14,6 +14,7 @@ from player import contracted_march_compiled
 from player.asset import Asset
 from player.contraction import contract
 from player.render import render
+from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.contracted import lattice_step, weighty_cells
 from vfr_bake.baking.grids import make_layout
@@ -26,7 +27,6 @@ from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.trainer import Trainer
 
 OPAQUE = np.array([0, 0, 0, 255], np.uint8)
 
@@ -43,7 +43,8 @@ def photographs(views: PosedImages) -> PosedImages:
     return PosedImages(views.cameras, [image.round().astype(np.uint8) | OPAQUE for image in mixed])
 
 
-def trained() -> Model:
+@pytest.fixture(scope="module")
+def model() -> Model:
     capture = demo_capture(size=48, n_train=16, n_test=2)
     capture = replace(capture, train=photographs(capture.train), test=photographs(capture.test))
     scene = build_scene(capture, "unbounded")
@@ -52,16 +53,7 @@ def trained() -> Model:
     config = TrainConfig(
         device="cpu", field=field, steps=300, pilot_steps=60, batch_rays=128, near_gradients=0.0
     )
-    trainer = Trainer(scene, config)
-    for _ in trainer.run():
-        pass
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, False, {}, {})
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    return trained()
+    return trained(scene, config)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,17 @@
+"""A model of a scene, without a file in between."""
+
+from __future__ import annotations
+
+from vfr_bake.config import TrainConfig
+from vfr_bake.data.scene import Scene
+from vfr_bake.training.model_file import Model
+from vfr_bake.training.trainer import Trainer
+
+
+def trained(scene: Scene, config: TrainConfig) -> Model:
+    """What `vfr-train` would have written."""
+    trainer = Trainer(scene, config)
+    for _ in trainer.run():
+        pass
+    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
+    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, scene.has_alpha, {}, {})
