@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 try:
@@ -14,6 +16,19 @@ except ImportError:  # an extra: without it the numpy twin of whatever is compil
 def available() -> bool:
     """Whether numba is installed."""
     return numba is not None
+
+
+def forget_outdated(folder: Path) -> None:
+    """Remove compiled code that numba kept in `folder` before any of the sources there was last changed.
+
+    numba looks at the file of a function alone: after an update it would go on with what the function took
+    from other files as they were, and compute something else without a word.
+    """
+    newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
+    for kept in folder.glob("__pycache__/*.nbi"):
+        with suppress(OSError):  # somebody else removed it, or it is not ours to remove
+            if kept.stat().st_mtime <= newest:
+                kept.unlink()
 
 
 def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
@@ -35,3 +50,7 @@ def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[...
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """A part of a compiled function, inlined: a call would pass 60 words."""
     return compiled(function, inline=True)
+
+
+if numba is not None:
+    forget_outdated(Path(__file__).parent)

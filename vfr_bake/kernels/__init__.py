@@ -6,8 +6,13 @@ training runs in float32, `gradcheck` in float64. Constants are cast to the type
 `1.0` would silently turn float32 arithmetic into float64.
 """
 
+from pathlib import Path
+
 from numba import config
+
+from player.compiling import forget_outdated
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
 config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore[reportAttributeAccessIssue]
+forget_outdated(Path(__file__).parent)

@@ -1,0 +1,51 @@
+"""What is kept of compiled code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+USER = """
+from pathlib import Path
+import player.compiling as compiling
+compiling.forget_outdated(Path(__file__).parent)
+from other import part
+
+@compiling.compiled
+def whole():
+    return part() + 1
+
+print(whole())
+"""
+PART = """
+from player.compiling import compiled
+
+@compiled
+def part():
+    return {}
+"""
+
+
+def run(folder: Path) -> str:
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, str(folder / "user.py")], env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def kept(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("__pycache__/*.nbi")}
+
+
+def test_a_change_in_another_file_is_compiled(tmp_path: Path) -> None:
+    """numba alone answers 2 the third time."""
+    (tmp_path / "user.py").write_text(USER)
+    (tmp_path / "other.py").write_text(PART.format(1))
+    assert run(tmp_path) == "2"
+    first = kept(tmp_path)
+    assert first and run(tmp_path) == "2" and kept(tmp_path) == first  # nothing is compiled again
+    (tmp_path / "other.py").write_text(PART.format(5))
+    assert run(tmp_path) == "6"
