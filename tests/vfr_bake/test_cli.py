@@ -238,8 +238,11 @@ def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
     while "training" not in process.stderr.readline():
         assert time.monotonic() < deadline and process.poll() is None
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
-    process.stderr.close()
+    try:
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+        process.stderr.close()
     assert eval_main([str(path), str(small_data)]) == 0
 
 
