@@ -15,6 +15,9 @@ from player.asset import Asset, GridArrays
 from player.bricks import pack_vertices, unpack_vertices
 from player.errors import DataError
 
+REACH = 2.0
+"""Cells of features that are kept around the ball: the diagonal of one."""
+
 
 def inner_region(asset: Asset) -> Asset:
     """The asset as exporters of surfaces and volumes take it: itself, or of an unbounded scene its inner
@@ -25,14 +28,23 @@ def inner_region(asset: Asset) -> Asset:
     m, a = asset.manifest, asset.arrays
     if not m.contracted:
         return asset
-    index = unpack_vertices(a.brick_coords, a.brick_masks)
-    edge = m.resolution / 4  # cells of a model unit; the middle is at two of them
-    inside = np.linalg.norm(index / edge - 2, axis=-1) <= 1
-    if not inside.any():
+    densities = _inside(a.brick_coords, a.brick_masks, a.density, m.resolution, 0.0)
+    # Cells of features reach over the ball's border, as the density's cells at it do.
+    features = _inside(a.feature_coords, a.feature_masks, a.features, m.feature_resolution, REACH)
+    if not len(densities[2]):
         raise DataError(
             f"{asset.folder}: expected an unbounded scene with something in its unit ball, got all "
-            f"{len(index)} vertices outside: surroundings without end are not exported"
+            f"{len(a.density)} vertices outside: surroundings without end are not exported"
         )
-    coords, masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
-    arrays = GridArrays(coords, masks, np.asarray(a.density)[inside], np.asarray(a.features)[inside])
-    return Asset(asset.folder, replace(m, contracted=False), arrays)
+    return Asset(asset.folder, replace(m, contracted=False), GridArrays(*densities, *features))
+
+
+def _inside(
+    coords: np.ndarray, masks: np.ndarray, codes: np.ndarray, resolution: int, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of bricks and their codes what lies in the unit ball, or within `reach` cells of it."""
+    index = unpack_vertices(coords, masks)
+    edge = resolution / 4  # cells of a model unit; the middle is at two of them
+    inside = np.linalg.norm(index / edge - 2, axis=-1) <= 1 + reach / edge
+    kept_coords, kept_masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
+    return kept_coords, kept_masks, np.asarray(codes)[inside]

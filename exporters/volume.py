@@ -20,9 +20,11 @@ from player.asset import Asset
 from player.bricks import unpack_vertices
 from player.density import decode_density
 from player.errors import ConfigError, ShapeError
+from player.few_samples import MIN_TOTAL, stored_features
 from player.head import Head
 from player.render import default_threads
-from player.sparse_grid import ABSENT, SparseGrid
+from player.sparse_grid import SparseGrid
+from player.vertex_rows import VertexRows, vertex_rows
 
 _ROWS = 1 << 16  # vertices at a time: some megabytes of scratch memory a thread
 
@@ -115,22 +117,24 @@ def asset_volume(
     volume = Volume(
         index[keep],
         (densities / np.float32(scale)).astype(np.float32),
-        _colours(asset, index[keep], keep) if colour else None,
+        _colours(asset, index[keep]) if colour else None,
         matrix,
     )
     return volume, 1 - len(keep) / max(len(index), 1)
 
 
-def _colours(asset: Asset, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """[n, 3] uint8: each vertex's own features through the head, as if it alone were the whole pixel."""
+def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
+    """[n, 3] uint8: the features at each vertex through the head, as if it alone were the whole pixel."""
     head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
-    grid = asset.grid
-    codes = np.asarray(asset.arrays.density)
+    grid, arrays = asset.grid, asset.arrays
+    codes = np.asarray(arrays.density)
+    rows = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
 
     def part(start: int) -> np.ndarray:
         some = slice(start, start + _ROWS)
-        dirs = _slope(grid, codes, index[some])
-        rgb = head(asset.arrays.features[rows[some]].astype(np.float32), dirs)
+        dirs = _slope(grid, rows, codes, index[some])
+        values, total = stored_features(grid, index[some].T.astype(np.float32))
+        rgb = head(values / np.maximum(total, MIN_TOTAL)[:, None], dirs)
         return np.floor(np.clip(np.nan_to_num(rgb), 0, 1) * 255 + 0.5).astype(np.uint8)
 
     with ThreadPoolExecutor(default_threads()) as pool:
@@ -138,27 +142,21 @@ def _colours(asset: Asset, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((0, 3), np.uint8), *parts])
 
 
-def _slope(grid: SparseGrid, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _slope(grid: SparseGrid, rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
     """[n, 3] float32 unit directions up the density, which is how a surface is looked at; down where it is
     flat, inside a solid, which nobody sees."""
     slope = np.empty((len(index), 3))
     for axis in range(3):
         step = np.zeros(3, np.int64)
         step[axis] = 1
-        rise = _codes_at(grid, codes, index + step) - _codes_at(grid, codes, index - step)
+        rise = _codes_at(rows, codes, index + step) - _codes_at(rows, codes, index - step)
         slope[:, axis] = rise * grid.cells_per_unit[axis]
     length = np.linalg.norm(slope, axis=-1, keepdims=True)
     down = np.array([0.0, 0.0, -1.0])
     return np.where(length > 0, slope / np.where(length > 0, length, 1), down).astype(np.float32)
 
 
-def _codes_at(grid: SparseGrid, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _codes_at(rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
     """[n] float64 codes at vertices that may lie outside; 0 where none is stored."""
-    n = grid.n_per_axis
-    inside = np.all((index >= 0) & (index < 8 * n), axis=-1)
-    x, y, z = np.where(inside[:, None], index, 0).T.astype(np.int64)
-    brick = grid.bricks[((x >> 3) * n + (y >> 3)) * n + (z >> 3)].astype(np.int64)
-    rank = grid.ranks[np.maximum(brick, 0) * 512 + (x & 7) * 64 + (y & 7) * 8 + (z & 7)].astype(np.int64)
-    stored = inside & (brick >= 0) & (rank != ABSENT)
-    row = np.where(stored, grid.base[np.maximum(brick, 0)] + rank, 0)
-    return np.where(stored, codes[row], 0).astype(np.float64)
+    found = rows.find(index)
+    return np.where(found >= 0, codes[np.maximum(found, 0)], 0).astype(np.float64)

@@ -20,11 +20,20 @@ from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_man
 from player.packing import pack_codes, unpack_codes
 from player.sparse_grid import SparseGrid, build_grid
 
-_DTYPES = {"brick_coords": "<u2", "brick_masks": "<u8", "density": "|u1", "features": "|i1"}
+_DTYPES = {
+    "brick_coords": "<u2",
+    "brick_masks": "<u8",
+    "density": "|u1",
+    "feature_coords": "<u2",
+    "feature_masks": "<u8",
+    "features": "|i1",
+}
 _FILES = {
     "brick_coords": "brick_coords.npy",
     "brick_masks": "brick_masks.npy",
     "density": "density.codes",
+    "feature_coords": "feature_coords.npy",
+    "feature_masks": "feature_masks.npy",
     "features": "features.codes",
 }
 
@@ -42,27 +51,36 @@ _HEADER_ERRORS = (
 """What numpy raises for broken .npy files; the last one where it tries the header again as Python 2 wrote
 it."""
 
+Names = tuple[str, str, str]
+_DENSITIES: Names = ("brick_coords", "brick_masks", "density")
+_FEATURES: Names = ("feature_coords", "feature_masks", "features")
+
 
 @dataclass(frozen=True, eq=False)
 class GridArrays:
-    """The four arrays of an asset, as `player.manifest` describes them."""
+    """The arrays of an asset, as `player.manifest` describes them."""
 
     brick_coords: np.ndarray
     brick_masks: np.ndarray
     density: np.ndarray
+    feature_coords: np.ndarray
+    feature_masks: np.ndarray
     features: np.ndarray
 
     def check(self, manifest: Manifest, where: str) -> None:
         """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
-        n_bricks = len(self.brick_coords) if self.brick_coords.ndim else 0
-        n_vertices = (
-            int(np.bitwise_count(self.brick_masks).sum()) if self.brick_masks.dtype.kind == "u" else 0
-        )
+        self._check_grid(_DENSITIES, (), manifest.resolution, where)
+        self._check_grid(_FEATURES, (manifest.n_channels,), manifest.feature_resolution, where)
+
+    def _check_grid(self, names: Names, of_a_vertex: tuple[int, ...], resolution: int, where: str) -> None:
+        coords_name, masks_name, codes_name = names
+        coords, masks = getattr(self, coords_name), getattr(self, masks_name)
+        n_bricks = len(coords) if coords.ndim else 0
+        n_vertices = int(np.bitwise_count(masks).sum()) if masks.dtype.kind == "u" else 0
         shapes = {
-            "brick_coords": (n_bricks, 3),
-            "brick_masks": (n_bricks, 8),
-            "density": (n_vertices,),
-            "features": (n_vertices, manifest.n_channels),
+            coords_name: (n_bricks, 3),
+            masks_name: (n_bricks, 8),
+            codes_name: (n_vertices, *of_a_vertex),
         }
         for name, shape in shapes.items():
             array = getattr(self, name)
@@ -72,18 +90,20 @@ class GridArrays:
                     f"{where}{_FILES[name]}: expected {dtype.name} {list(shape)}, "
                     f"got {array.dtype.name} {list(array.shape)}"
                 )
-        coords = np.asarray(self.brick_coords, np.int64)
+        coords = np.asarray(coords, np.int64)
         keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
         if (np.diff(keys) <= 0).any():
-            raise FormatError(f"{where}brick_coords.npy: expected bricks sorted by x, y, z, each once")
-        n = bricks_per_axis(manifest.resolution)
+            raise FormatError(f"{where}{_FILES[coords_name]}: expected bricks sorted by x, y, z, each once")
+        n = bricks_per_axis(resolution)
         if (coords >= n).any():
-            raise FormatError(f"{where}brick_coords.npy: expected coordinates below {n}, got {coords.max()}")
-        edge = (coords == n - 1).any(axis=1)
-        beyond = unpack_vertices(coords[edge], self.brick_masks[edge]).max(initial=0)
-        if beyond > manifest.resolution:
             raise FormatError(
-                f"{where}brick_masks.npy: expected vertices up to {manifest.resolution}, got one at {beyond}"
+                f"{where}{_FILES[coords_name]}: expected coordinates below {n}, got {coords.max()}"
+            )
+        edge = (coords == n - 1).any(axis=1)
+        beyond = unpack_vertices(coords[edge], masks[edge]).max(initial=0)
+        if beyond > resolution:
+            raise FormatError(
+                f"{where}{_FILES[masks_name]}: expected vertices up to {resolution}, got one at {beyond}"
             )
 
 
@@ -135,8 +155,9 @@ class Asset:
         m, a = self.manifest, self.arrays
         low, high = m.density_range
         return build_grid(
-            (a.brick_coords, a.brick_masks, a.density, a.features),
-            m.resolution,
+            (a.brick_coords, a.brick_masks, a.density),
+            (a.feature_coords, a.feature_masks, a.features),
+            (m.resolution, m.feature_resolution),
             np.array(m.aabb),
             m.step,
             (low, high),
@@ -186,7 +207,7 @@ def write_asset(
     Args:
         folder: the new folder.
         manifest: everything but `files`, which is filled in here.
-        arrays: the four arrays; checked before anything is written.
+        arrays: checked before anything is written.
         head: bytes of `head.onnx`.
         mesh: bytes of `mesh.ply`, world frame.
         cameras: bytes of `cameras.json`, world frame.
@@ -200,7 +221,7 @@ def write_asset(
     """
     arrays.check(manifest, "")
     with new_folder(folder, force) as new:
-        for name in ("brick_coords", "brick_masks"):
+        for name in ("brick_coords", "brick_masks", "feature_coords", "feature_masks"):
             with (new / _FILES[name]).open("wb") as file:
                 array = np.ascontiguousarray(getattr(arrays, name), _DTYPES[name])
                 np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
@@ -225,18 +246,15 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
-    coords, masks = (_map_array(folder / _FILES[name]) for name in ("brick_coords", "brick_masks"))
-    if masks.dtype != np.dtype(_DTYPES["brick_masks"]):
-        raise FormatError(f"{folder / _FILES['brick_masks']}: expected uint64, got {masks.dtype.name}")
-    n_vertices = int(np.bitwise_count(masks).sum())
+    def grid(names: Names, *of_a_vertex: int) -> list[np.ndarray]:
+        coords_name, masks_name, codes_name = names
+        coords, masks = (_map_array(folder / _FILES[name]) for name in (coords_name, masks_name))
+        if masks.dtype != np.dtype(_DTYPES[masks_name]):
+            raise FormatError(f"{folder / _FILES[masks_name]}: expected uint64, got {masks.dtype.name}")
+        path, shape = folder / _FILES[codes_name], (int(np.bitwise_count(masks).sum()), *of_a_vertex)
+        return [coords, masks, unpack_codes(path.read_bytes(), shape, _DTYPES[codes_name], str(path))]
 
-    def codes(name: str, *shape: int) -> np.ndarray:
-        path = folder / _FILES[name]
-        return unpack_codes(path.read_bytes(), shape, _DTYPES[name], str(path))
-
-    return GridArrays(
-        coords, masks, codes("density", n_vertices), codes("features", n_vertices, manifest.n_channels)
-    )
+    return GridArrays(*grid(_DENSITIES), *grid(_FEATURES, manifest.n_channels))
 
 
 def _read_manifest(folder: Path) -> Manifest:

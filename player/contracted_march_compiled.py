@@ -35,7 +35,8 @@ def march(
         (grid.resolution, grid.n_per_axis, grid.density_low, grid.density_slope, rays.cells),
         (np.cos(half), np.sin(half), np.sin(grid.step), MAX_SPEED * grid.step * rays.cells, capacity - SPARE),
         (grid.table, grid.live, grid.density),
-        (grid.bricks, grid.base, grid.ranks, grid.features),
+        (grid.rows.bricks, grid.rows.base, grid.rows.ranks, grid.features),
+        (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (rays.nearest, rays.along, rays.t_nearest, rays.width, rays.cos, rays.sin, rays.length),
         table,
         n_samples,
@@ -48,7 +49,7 @@ def march(
 
 
 @compiled
-def _march_rays(settings, steps, lookup, stored, rays, table, k, scratch, corners, composite, out):
+def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, scratch, corners, composite, out):
     """Every ray: its samples into the scratch arrays, then its fetches into the next row of `features`."""
     nearest, along, t_nearest, width, cos0, sin0, length = rays
     scratch_s, scratch_w, _ = scratch
@@ -72,7 +73,7 @@ def _march_rays(settings, steps, lookup, stored, rays, table, k, scratch, corner
         depth[index] = t_nearest[index] + width[index] * sin / max(cos, MIN_COS)
         if mass > MIN_OPACITY:
             composite[:] = F32(0.0)
-            _gather(stored, settings, ray, scratch, n, total, mass, k, corners, composite)
+            _gather(stored, sizes, settings[4], ray, scratch, n, total, mass, k, corners, composite)
             for c in range(features.shape[1]):
                 features[n_hits, c] = composite[0, c]
             hits[n_hits] = index
@@ -164,26 +165,25 @@ def _free(g, brick, reach):
 
 
 @inlined
-def _gather(stored, settings, ray, samples, n, total, mass, k, corners, out):
+def _gather(stored, sizes, cells, ray, samples, n, total, mass, k, corners, out):
     """Choose the fetches of one ray and add them up in `out`."""
     scratch_s, scratch_w, places = samples
     if k == 0 or n <= k:
         for i in range(n):
-            _fetch_at(stored, settings, ray, scratch_s[i], scratch_w[i], corners, out)
+            _fetch_at(stored, sizes, cells, ray, scratch_s[i], scratch_w[i], corners, out)
         return
     equal_mass(scratch_s, scratch_w, n, total, k, places)
     weight = mass / F32(k)
     for i in range(k):
-        if not _fetch_at(stored, settings, ray, places[0, i], weight, corners, out):
-            _fetch_at(stored, settings, ray, places[1, i], weight, corners, out)
+        if not _fetch_at(stored, sizes, cells, ray, places[0, i], weight, corners, out):
+            _fetch_at(stored, sizes, cells, ray, places[1, i], weight, corners, out)
 
 
 @inlined
-def _fetch_at(stored, settings, ray, s, weight, corners, out):
+def _fetch_at(stored, sizes, cells, ray, s, weight, corners, out):
     """Add `weight` times the features at s to `out`; False, and nothing added, where too little is
     stored."""
-    resolution, n_per_axis, _, _, cells = settings
     cos, sin = _turned(ray, F32(math.cos(s)), F32(math.sin(s)))
     place = _on_grid(ray, cos, sin, cells)
     still = (F32(0), F32(0), F32(0))
-    return fetch(stored, (resolution, n_per_axis), place, still, F32(0), weight, corners, out)
+    return fetch(stored, sizes, place, still, F32(0), weight, corners, out)

@@ -17,7 +17,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from player.sparse_grid import ABSENT, SparseGrid
+from player.sparse_grid import SparseGrid
+from player.vertex_rows import ABSENT
 
 MIN_TOTAL = np.float32(1e-3)
 """Least share of stored corners with which a place counts as stored."""
@@ -185,7 +186,7 @@ def _add(
     edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
     for start, stop in itertools.pairwise(edges):
         ray, s, weights = (column[start:stop] for column in fetches)
-        values, total = _fetch(grid, entries.at(ray, s))
+        values, total = stored_features(grid, entries.at(ray, s))
         poor = total < MIN_TOTAL
         scale = np.where(poor, np.float32(0), weights / np.where(poor, np.float32(1), total))
         values *= scale[:, None]
@@ -195,28 +196,29 @@ def _add(
     return np.concatenate(gaps) if gaps else np.zeros(0, np.int64)
 
 
-def _fetch(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stored corners' weighted sum of codes [n, n_channels] at grid coordinates g [3, n], and their
-    weights' sum [n]."""
-    g = np.clip(g, np.float32(0), np.float32(grid.resolution))
-    low = np.minimum(g.astype(np.int32), grid.resolution - 1)
+def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stored corners' weighted sum of codes [n, n_channels] at g [3, n] float32, cells of the density's grid,
+    and their weights' sum [n]."""
+    vertices = grid.rows
+    g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
+    low = np.minimum(g.astype(np.int32), vertices.resolution - 1)
     fraction = g - low.astype(np.float32)
-    n = np.int32(grid.n_per_axis)
+    n = np.int32(vertices.n_per_axis)
     brick, bit, share = [], [], []  # per axis and side: parts of the two addresses, interpolation weight
     for axis, (stride, shift) in enumerate(((n * n, 6), (n, 3), (1, 0))):
-        vertices = (low[axis], low[axis] + np.int32(1))
-        brick.append([(v >> 3) * np.int32(stride) for v in vertices])
-        bit.append([(v & 7) << np.int32(shift) for v in vertices])
+        sides = (low[axis], low[axis] + np.int32(1))
+        brick.append([(v >> 3) * np.int32(stride) for v in sides])
+        bit.append([(v & 7) << np.int32(shift) for v in sides])
         share.append([np.float32(1) - fraction[axis], fraction[axis]])
     values = np.zeros((g.shape[1], grid.n_channels), np.float32)
     total = np.zeros(g.shape[1], np.float32)
     for x, y, z in np.ndindex(2, 2, 2):
-        held = grid.bricks.take(brick[0][x] + brick[1][y] + brick[2][z])
+        held = vertices.bricks.take(brick[0][x] + brick[1][y] + brick[2][z])
         at = np.maximum(held, 0)
-        rank = grid.ranks.take(at.astype(np.int64) * 512 + (bit[0][x] + bit[1][y] + bit[2][z]))
+        rank = vertices.ranks.take(at.astype(np.int64) * 512 + (bit[0][x] + bit[1][y] + bit[2][z]))
         stored = (held >= 0) & (rank != ABSENT)
         weight = share[0][x] * share[1][y] * share[2][z] * stored
-        row = np.where(stored, grid.base.take(at) + rank, 0)
+        row = np.where(stored, vertices.base.take(at) + rank, 0)
         values += weight[:, None] * grid.features.take(row, axis=0)
         total += weight
     return values, total

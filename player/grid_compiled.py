@@ -11,7 +11,7 @@ import numpy as np
 
 from player.compiling import inlined
 from player.few_samples import MIN_TOTAL
-from player.sparse_grid import ABSENT
+from player.vertex_rows import ABSENT
 
 try:
     from player.eight_rows import LANES, add_rows
@@ -87,13 +87,13 @@ def equal_mass(scratch_s, scratch_w, n, total, k, places):
 def fetch(stored, sizes, point, direction, s, weight, corners, out):
     """Add `weight` times the features at s to `out`; False, and nothing added, where too little is
     stored."""
-    resolution, n_per_axis = sizes
+    resolution, n_per_axis, scale = sizes
     bricks, base, ranks, features = stored
     rows, shares = corners
     size = F32(resolution)
-    gx = min(max(point[0] + s * direction[0], F32(0.0)), size)
-    gy = min(max(point[1] + s * direction[1], F32(0.0)), size)
-    gz = min(max(point[2] + s * direction[2], F32(0.0)), size)
+    gx = min(max((point[0] + s * direction[0]) * scale, F32(0.0)), size)
+    gy = min(max((point[1] + s * direction[1]) * scale, F32(0.0)), size)
+    gz = min(max((point[2] + s * direction[2]) * scale, F32(0.0)), size)
     last = resolution - 1
     x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
     fx, fy, fz = gx - F32(x), gy - F32(y), gz - F32(z)

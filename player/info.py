@@ -16,15 +16,18 @@ from player.manifest import Manifest
 from player.transforms import read_cameras
 
 MANIFEST_KEYS = (
-    "version", "generator", "resolution", "aabb", "world_from_model", "contracted", "step", "n_samples",
-    "density_range", "n_channels", "background", "colour_space", "view_size", "provenance",
+    "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
+    "step", "n_samples", "density_range", "n_channels", "background", "colour_space", "view_size",
+    "provenance",
 )  # fmt: skip
 
 CONTENT = {
-    "features.npy": "what the head is given",
-    "density.npy": "where there is something",
-    "brick_masks.npy": "which vertices are stored",
-    "brick_coords.npy": "where the bricks are",
+    "features.codes": "what the head is given",
+    "density.codes": "where there is something",
+    "brick_masks.npy": "which densities are stored",
+    "brick_coords.npy": "where their bricks are",
+    "feature_masks.npy": "which features are stored",
+    "feature_coords.npy": "where their bricks are",
     "head.onnx": "features to colour",
     "mesh.ply": "the surface, for other programs",
     "cameras.json": "the training cameras",
@@ -39,6 +42,7 @@ def facts(asset: Asset) -> dict[str, Any]:
         "bytes_total": sum(entry.bytes for entry in m.files.values()),
         "n_bricks": len(asset.arrays.brick_coords),
         "n_vertices": len(asset.arrays.density),
+        "n_feature_vertices": len(asset.arrays.features),
         "head_parameters": count_parameters(asset.path("head.onnx").read_bytes()),
         "n_cameras": len(read_cameras(asset.path("cameras.json"), (m.view_size[0], m.view_size[1]))),
         "world_box": _world_box(asset),
@@ -72,7 +76,8 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         *_section("how it is rendered", [
             ("grid", f"{m.resolution} cells per axis, {known['n_vertices']:,} vertices stored "
              f"({share:.2%}) in {known['n_bricks']:,} bricks of 8 x 8 x 8"),
-            ("features", f"{m.n_channels} channels of 8 bits, fetched "
+            ("features", f"{m.feature_resolution} cells per axis, {known['n_feature_vertices']:,} vertices "
+             f"of {m.n_channels} channels of 8 bits, fetched "
              f"{f'at {m.n_samples} places a ray' if m.n_samples else 'at every sample'}"),
             ("step", _step(m, scale)),
             ("head", f"{known['head_parameters']:,} parameters, once a pixel"),

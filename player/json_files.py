@@ -58,9 +58,13 @@ def as_float(value: Any) -> float | None:
 
 
 def brief(value: Any) -> str:
-    """What was found, in one short line of plain characters."""
-    text = ascii(value) if not isinstance(value, str) else value
-    text = text.encode("ascii", "backslashreplace").decode().replace("\n", " ").replace("\r", " ")
+    """What was found, in one short line of plain characters.
+
+    >>> brief("two\\nlines, \\x1e, \\u00fc"), brief([1, None])
+    ('two lines, \\\\x1e, \\\\xfc', '[1, None]')
+    """
+    text = ascii(value)[1:-1] if isinstance(value, str) else ascii(value)
+    text = text.replace("\\n", " ").replace("\\r", " ")
     return text if len(text) <= 80 else text[:77] + "..."
 
 

@@ -1,4 +1,4 @@
-"""The format `vfr-asset`, version 2.1: this docstring is its specification, the module parses and writes
+"""The format `vfr-asset`, version 3.0: this docstring is its specification, the module parses and writes
 the manifest.
 
 An asset is a folder. It holds no absolute path and plays wherever it is moved.
@@ -6,10 +6,12 @@ An asset is a folder. It holds no absolute path and plays wherever it is moved.
 | file | content |
 |---|---|
 | `manifest.json` | what is described below; UTF-8, keys sorted, at most 16 MiB |
-| `brick_coords.npy` | uint16 [n_bricks, 3], sorted by (x, y, z), each at most once |
+| `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
 | `brick_masks.npy` | uint64 [n_bricks, 8], which vertices of a brick are stored |
 | `density.codes` | uint8 [n_vertices], codes, packed as `player.packing` describes |
-| `features.codes` | int8 [n_vertices, n_channels], codes, packed in the same way |
+| `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
+| `feature_masks.npy` | uint64 [n_feature_bricks, 8], which of their vertices are stored |
+| `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed in the same way |
 | `head.onnx` | `features` [n, n_channels], `dirs` [n, 3] -> `rgb` [n, 3], float32 |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
@@ -17,7 +19,9 @@ An asset is a folder. It holds no absolute path and plays wherever it is moved.
 
 GRID. The box `aabb`, in the model frame, has `resolution` R cells and R + 1 vertices along each axis;
 vertex i is at `lo + i (hi - lo) / R`. Vertices are stored in bricks of 8 x 8 x 8 as `player.bricks`
-describes. A cell is live when its eight corners are stored; outside live cells the density is 0.
+describes. A cell is live when its eight corners are stored; outside live cells the density is 0. Features
+have a grid of their own over the same box, of `feature_resolution` cells: where a surface is has to be known
+more finely than what colour it has.
 
 CONTRACTED. Where `contracted` is true the box is [-2, 2]^3 of contracted coordinates (`player.contraction`),
 which are those of the model frame inside its unit ball and hold the rest of space around it.
@@ -36,12 +40,13 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [2, 1]; unknown keys of a newer minor are ignored |
+| `version` | [major, minor] | [3, 0]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
-| `resolution` | integer, 1..2048 | cells per axis |
+| `resolution` | integer, 1..2048 | cells per axis of the density |
+| `feature_resolution` | integer, 1..2048 | cells per axis of the features |
 | `aabb` | 2 x 3 numbers | box, model frame |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
-| `contracted` | true or false | since 2.1; false where it is missing |
+| `contracted` | true or false | |
 | `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
 | `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
@@ -54,7 +59,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 
 Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
 History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports; 2.1,
-contracted.
+contracted; 3.0, features have a grid of their own.
 """
 
 from __future__ import annotations
@@ -69,14 +74,14 @@ from typing import Any
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
-VERSION = (2, 1)
-SINCE = {"contracted": (2, 1)}
-"""Keys that older minor versions have not: their manifests stand for the default."""
+VERSION = (3, 0)
 NAME = "manifest.json"
 FILES = (
     "brick_coords.npy",
     "brick_masks.npy",
     "density.codes",
+    "feature_coords.npy",
+    "feature_masks.npy",
     "features.codes",
     "head.onnx",
     "mesh.ply",
@@ -103,14 +108,15 @@ class Manifest:
     """The manifest; its fields are the keys above. Built by the bake or by `parse_manifest`, checked either
     way.
 
-    >>> manifest = Manifest(generator="doctest", resolution=8, step=0.2, density_range=(-5, 5), n_channels=4,
-    ...     view_size=(4, 3))
+    >>> manifest = Manifest(generator="doctest", resolution=8, feature_resolution=4, step=0.2,
+    ...     density_range=(-5, 5), n_channels=4, view_size=(4, 3))
     >>> parse_manifest(manifest_bytes(manifest), "manifest.json", complete=False) == manifest
     True
     """
 
     generator: str
     resolution: int
+    feature_resolution: int
     step: float
     density_range: Vector
     n_channels: int
@@ -152,7 +158,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
-    known = {f.name for f in fields(Manifest)} - {key for key, since in SINCE.items() if version < since}
+    known = {f.name for f in fields(Manifest)}
     missing = sorted(known - set(document))
     if missing:
         raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
@@ -172,8 +178,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
 
 def manifest_bytes(manifest: Manifest) -> bytes:
     """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
-    names = {f.name for f in fields(manifest)} - {k for k, since in SINCE.items() if manifest.version < since}
-    document: dict[str, Any] = {name: getattr(manifest, name) for name in names}
+    document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
     document["format"] = FORMAT
     document["files"] = {
         name: {"bytes": entry.bytes, "sha256": entry.sha256} for name, entry in manifest.files.items()
@@ -340,6 +345,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "version": _parse_version,
     "generator": _text,
     "resolution": _integer(1, MAX_RESOLUTION),
+    "feature_resolution": _integer(1, MAX_RESOLUTION),
     "aabb": _matrix(2, 3),
     "world_from_model": _similarity,
     "step": _number(1e-9, 1e9),

@@ -37,7 +37,8 @@ def march(
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
         (grid.table, grid.live, grid.density),
-        (grid.bricks, grid.base, grid.ranks, grid.features),
+        (grid.rows.bricks, grid.rows.base, grid.rows.ranks, grid.features),
+        (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
         n_samples,
         (np.empty(capacity, F32), np.empty(capacity, F32), np.empty((2, max(n_samples, 1)), F32)),
@@ -49,7 +50,7 @@ def march(
 
 
 @compiled
-def _march_rays(settings, lookup, stored, rays, k, scratch, corners, composite, out):
+def _march_rays(settings, lookup, stored, sizes, rays, k, scratch, corners, composite, out):
     """Every ray: its samples into the scratch arrays, then its fetches into the next row of `features`."""
     resolution, n_per_axis, step, low, slope, origin, scale = settings
     rays_o, rays_d, near, far = rays
@@ -88,7 +89,7 @@ def _march_rays(settings, lookup, stored, rays, k, scratch, corners, composite, 
         if mass > MIN_OPACITY:
             composite[:] = F32(0.0)
             _gather(
-                stored, (resolution, n_per_axis), point, (dx, dy, dz), scratch, n, total, mass, k, corners,
+                stored, sizes, point, (dx, dy, dz), scratch, n, total, mass, k, corners,
                 composite,
             )  # fmt: skip
             for c in range(features.shape[1]):

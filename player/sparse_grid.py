@@ -3,17 +3,13 @@
 Letters: R cells per axis, nb bricks per axis, C channels; a slot is the number of a brick that has a live
 cell. Everything is flat, so that one integer addresses it, in numpy as in compiled code:
 
-    table      [nb^3] int32        at (bx * nb + by) * nb + bz: the slot, or minus the Chebyshev distance,
-    in bricks, to
-                                   the nearest brick with a live cell (at most MAX_DISTANCE)
+    table      [nb^3] int32        at (bx * nb + by) * nb + bz: the slot, or minus the Chebyshev distance, in
+                                   bricks, to the nearest brick with a live cell (at most MAX_DISTANCE)
     live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
-    density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron,
-    so that the
-                                   eight corners of a cell are in one brick
-    bricks     [nb^3] int32        the brick that holds a vertex, -1 where there is none
-    base       [n_bricks] int32    row of the brick's first vertex in `features`
-    ranks      [n_bricks * 512] u16  at brick * 512 + b: row of the vertex counted from the base, ABSENT if
-    not stored features   [n_vertices, C] int8
+    density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
+                                   that the eight corners of a cell are in one brick
+    features   [n_vertices, C] int8, the vertices of a grid of its own over the same box, whose rows `rows`
+                                   finds
 """
 
 from __future__ import annotations
@@ -24,12 +20,10 @@ import numpy as np
 
 from player.bricks import BRICK, bricks_per_axis, dense_index, live_cells, neighbours, stored_bits
 from player.density import decode_constants
+from player.vertex_rows import VertexRows, vertex_rows
 
 MAX_DISTANCE = 31
 """Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
-
-ABSENT = 0xFFFF
-"""The rank of a vertex that is not stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +45,7 @@ class SparseGrid:
     table: np.ndarray
     live: np.ndarray
     density: np.ndarray
-    bricks: np.ndarray
-    base: np.ndarray
-    ranks: np.ndarray
+    rows: VertexRows
     features: np.ndarray
     contracted: bool = False
     """Whether the box is all of space, contracted."""
@@ -61,6 +53,11 @@ class SparseGrid:
     @property
     def n_channels(self) -> int:
         return self.features.shape[1]
+
+    @property
+    def feature_scale(self) -> np.float32:
+        """Cells of the features' grid in a cell of the density's."""
+        return np.float32(self.rows.resolution / self.resolution)
 
     @property
     def most_samples(self) -> int:
@@ -71,8 +68,9 @@ class SparseGrid:
 
 
 def build_grid(
-    arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    resolution: int,
+    densities: tuple[np.ndarray, np.ndarray, np.ndarray],
+    features: tuple[np.ndarray, np.ndarray, np.ndarray],
+    resolutions: tuple[int, int],
     aabb: np.ndarray,
     step: float,
     density_range: tuple[float, float],
@@ -81,8 +79,9 @@ def build_grid(
     """Arrange the arrays of an asset for marching.
 
     Args:
-        arrays: `brick_coords`, `brick_masks`, `density`, `features` as on disk, already checked.
-        resolution: R, cells per axis.
+        densities: coordinates and masks of the bricks, and codes, as on disk, already checked.
+        features: the same of the features.
+        resolutions: cells per axis of the two.
         aabb: [2, 3] the box, model frame.
         step: distance between lattice samples, model units; dphi if contracted.
         density_range: log sigma at codes 0 and 255.
@@ -91,11 +90,13 @@ def build_grid(
     >>> from player.bricks import pack_vertices
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((5, 5, 5))))
     >>> codes, features = np.zeros(125, np.uint8), np.zeros((125, 2), np.int8)
-    >>> grid = build_grid((coords, masks, codes, features), 4, np.array([[-1] * 3, [1] * 3]), 0.1, (0.0, 1.0))
+    >>> box, range_ = np.array([[-1] * 3, [1] * 3]), (0.0, 1.0)
+    >>> grid = build_grid((coords, masks, codes), (coords, masks, features), (4, 4), box, 0.1, range_)
     >>> grid.table.tolist(), int(np.bitwise_count(grid.live).sum())
     ([0], 64)
     """
-    coords, masks, density, features = arrays
+    coords, masks, density = densities
+    resolution, feature_resolution = resolutions
     n_per_axis = bricks_per_axis(resolution)
     index = dense_index(coords, n_per_axis)
     cells = live_cells(coords, masks, index)
@@ -103,8 +104,6 @@ def build_grid(
     slots = np.full(len(coords), -1, np.int32)
     slots[has_cells] = np.arange(len(has_cells), dtype=np.int32)
     slot_coords = np.asarray(coords, np.int32)[has_cells]
-    stored = stored_bits(masks)
-    base, ranks = _ranks(stored)
     low, slope = decode_constants(density_range)
     box = np.asarray(aabb, np.float64)
     return SparseGrid(
@@ -118,22 +117,11 @@ def build_grid(
         slot_coords=slot_coords,
         table=_table(slot_coords, n_per_axis),
         live=np.ascontiguousarray(cells[has_cells], "<u8").view(np.uint8).reshape(-1),
-        density=_with_apron(stored, density, coords, index, has_cells),
-        bricks=index.reshape(-1),
-        base=base,
-        ranks=ranks,
-        features=np.ascontiguousarray(features, np.int8),
+        density=_with_apron(stored_bits(masks), density, coords, index, has_cells),
+        rows=vertex_rows(*features[:2], feature_resolution),
+        features=np.ascontiguousarray(features[2], np.int8),
         contracted=contracted,
     )
-
-
-def _ranks(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    counts = np.cumsum(stored, axis=1, dtype=np.uint16)
-    totals = counts[:, -1].astype(np.int64) if len(stored) else np.zeros(0, np.int64)
-    base = (np.cumsum(totals) - totals).astype(np.int32)
-    counts -= np.uint16(1)
-    counts[~stored] = ABSENT
-    return base, counts.reshape(-1)
 
 
 def _with_apron(

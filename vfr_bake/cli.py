@@ -225,7 +225,8 @@ def _bake(options: Any) -> int:
     minutes = expected_seconds(model, options.config, plan) / 60
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes and {plan.n_bytes / 1e9:.1f} GB of memory at most, "
-        f"{plan.resolution} cells per axis, {plan.n_rays:,} rays to learn from",
+        f"densities on {plan.resolution} cells per axis and features on {plan.feature_resolution}, "
+        f"{plan.n_rays:,} rays to learn from",
         file=sys.stderr,
     )
     with Bars() as bars:

@@ -273,7 +273,10 @@ class BakeConfig:
     """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: the
     fewest bytes and the smallest head."""
     resolution: int | None = None
-    """Cells per axis of the baked grid, at most the field's finest level."""
+    """Cells per axis of the baked densities, at most half again the field's finest level."""
+    feature_resolution: int | None = None
+    """Cells per axis of the baked features, at most the field's finest level and no more than the densities
+    have. Not given: the preset's share of those."""
     n_channels: int | None = None
     """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
     few as the preset's loss allows."""
@@ -318,6 +321,12 @@ class BakeConfig:
             "resolution",
             "8 to 2048",
             self.resolution,
+        )
+        _check(
+            self.feature_resolution is None or 8 <= self.feature_resolution <= (self.resolution or 2048),
+            "feature_resolution",
+            "8 to 2048, at most the resolution",
+            self.feature_resolution,
         )
         _check(
             self.max_loss_db is None or self.max_loss_db > 0, "max_loss_db", "more than 0", self.max_loss_db

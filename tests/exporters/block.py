@@ -50,6 +50,7 @@ def write_block(folder: Path) -> Path:
     manifest = Manifest(
         generator="tests",
         resolution=RESOLUTION,
+        feature_resolution=RESOLUTION,
         step=1 / RESOLUTION,
         density_range=density_range,
         n_channels=3,
@@ -57,7 +58,7 @@ def write_block(folder: Path) -> Path:
         view_size=(160, 128),
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
     )
-    arrays = GridArrays(coords, masks, codes, (vertices * 2 - 64).astype(np.int8))
+    arrays = GridArrays(coords, masks, codes, coords, masks, (vertices * 2 - 64).astype(np.int8))
     write_asset(folder, manifest, arrays, _head(), ply_bytes(_mesh()), write_cameras(cameras()))
     return folder
 

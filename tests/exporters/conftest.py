@@ -38,13 +38,14 @@ def shells_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     manifest = Manifest(
         generator="tests",
         resolution=shells.RESOLUTION,
+        feature_resolution=shells.RESOLUTION,
         step=shells.STEP,
         density_range=shells.DENSITY_RANGE,
         n_channels=4,
         view_size=(48, 40),
         world_from_model=tuple(map(tuple, shells.WORLD_FROM_MODEL)),
     )
-    arrays = GridArrays(coords, masks, codes, features)
+    arrays = GridArrays(coords, masks, codes, coords, masks, features)
     write_asset(folder, manifest, arrays, shells.head_bytes(), ply_bytes(box(*BOX)), shells.cameras_bytes())
     return folder
 

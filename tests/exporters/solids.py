@@ -57,11 +57,14 @@ def write_solid(folder: Path, distance: Distance, resolution: int, n_cameras: in
         coords,
         masks,
         encode_density(AT_SURFACE - SLOPE * voxels, DENSITY_RANGE),
+        coords,
+        masks,
         np.rint(features).astype(np.int8),
     )
     manifest = Manifest(
         generator="tests",
         resolution=resolution,
+        feature_resolution=resolution,
         step=0.9 * 2 / resolution,
         density_range=DENSITY_RANGE,
         n_channels=4,

@@ -33,10 +33,11 @@ def write_small_asset(folder: Path, mesh: bytes) -> Path:
     """One stored cell, a head that nobody opens, and `mesh`: all that `vfr-export` looks at."""
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     coords, masks, _ = pack_vertices(corners)
-    arrays = GridArrays(coords, masks, np.full(8, 200, np.uint8), np.zeros((8, 4), np.int8))
+    arrays = GridArrays(coords, masks, np.full(8, 200, np.uint8), coords, masks, np.zeros((8, 4), np.int8))
     manifest = Manifest(
         generator="tests",
         resolution=8,
+        feature_resolution=8,
         step=0.25,
         density_range=(-2.0, 6.0),
         n_channels=4,

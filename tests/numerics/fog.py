@@ -19,4 +19,5 @@ def fog(optical: float, resolution: int = RESOLUTION, step: float = 2 / 128) -> 
     codes = np.zeros(len(vertices), np.uint8)
     features = np.full((len(vertices), 1), FEATURE, np.int8)
     box = np.array([[-1.0] * 3, [1.0] * 3])
-    return build_grid((coords, masks, codes, features), resolution, box, step, (low, low + 1))
+    where, both = (coords, masks), (resolution, resolution)
+    return build_grid((*where, codes), (*where, features), both, box, step, (low, low + 1))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from exporters.colour import linear_from_srgb, srgb_from_linear
 from player import march, march_compiled
-from player.asset import Asset, GridArrays
+from player.asset import Asset
 from player.bricks import pack_vertices
 from player.density import decode_density, encode_density
 from player.packing import pack_codes, unpack_codes
@@ -79,7 +79,8 @@ def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
     coords, masks, order = pack_vertices(vertices)
     values = vertices[order][:, axis] + shift
     codes, features = (values + 100).astype(np.uint8), values.astype(np.int8)[:, None]
-    return build_grid((coords, masks, codes, features), resolution, BOX, 0.01, (-4.0, 5.0))
+    where, both = (coords, masks), (resolution, resolution)
+    return build_grid((*where, codes), (*where, features), both, BOX, 0.01, (-4.0, 5.0))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -205,8 +206,8 @@ def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleTyp
     grids = []
     for points, which in ((vertices, np.arange(len(vertices))), (turned, order)):
         c, m, _ = pack_vertices(points)
-        arrays = GridArrays(c, m, codes[which], features[which])
-        grids.append(build_grid((c, m, arrays.density, arrays.features), RESOLUTION, BOX, STEP, (-2.0, 6.0)))
+        where = (c, m, codes[which]), (c, m, features[which])
+        grids.append(build_grid(*where, (RESOLUTION, RESOLUTION), BOX, STEP, (-2.0, 6.0)))
     random = np.random.default_rng(0)
     rays_o = random.normal(size=(500, 3)).astype(np.float32) * 2
     rays_d = random.uniform(-1, 1, (500, 3)) - rays_o

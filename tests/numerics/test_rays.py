@@ -176,8 +176,8 @@ def test_an_empty_box_is_left_in_a_few_jumps(module: ModuleType) -> None:
 @pytest.mark.parametrize("aabb", [((0, 0, 0), (0, 1, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, 1, 2e9))])
 def test_boxes_without_thickness_are_refused(aabb: tuple) -> None:
     with pytest.raises(FormatError, match="aabb: expected"):
-        Manifest(generator="t", resolution=8, step=0.1, density_range=(-5, 5), n_channels=1,
-                 view_size=(4, 3), aabb=aabb)  # fmt: skip
+        Manifest(generator="t", resolution=8, feature_resolution=8, step=0.1, density_range=(-5, 5),
+                 n_channels=1, view_size=(4, 3), aabb=aabb)  # fmt: skip
 
 
 @pytest.mark.parametrize("focal", [1e-6, 1.0, 1e6])

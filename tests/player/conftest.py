@@ -97,6 +97,7 @@ def write_shells(folder: Path) -> Path:
     manifest = Manifest(
         generator="tests",
         resolution=RESOLUTION,
+        feature_resolution=RESOLUTION,
         step=STEP,
         density_range=DENSITY_RANGE,
         n_channels=4,
@@ -104,7 +105,7 @@ def write_shells(folder: Path) -> Path:
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
         provenance={"psnr": 30.5},
     )
-    arrays = GridArrays(coords, masks, codes, features)
+    arrays = GridArrays(coords, masks, codes, coords, masks, features)
     write_asset(folder, manifest, arrays, head_bytes(), b"ply\n", cameras_bytes())
     return folder
 

@@ -43,7 +43,8 @@ def contracted_grid(log_sigma: Function, keep: Function) -> SparseGrid:
     coords, masks, _ = pack_vertices(vertices)
     features = np.concatenate([vertices * 4 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
     box = np.array([[-2.0] * 3, [2.0] * 3])
-    return build_grid((coords, masks, codes, features), RESOLUTION, box, STEP, RANGE, True)
+    where, both = (coords, masks), (RESOLUTION, RESOLUTION)
+    return build_grid((*where, codes), (*where, features), both, box, STEP, RANGE, True)
 
 
 def naive(

@@ -32,7 +32,7 @@ def test_round_trip_is_byte_for_byte(asset: Asset, tmp_path: Path) -> None:
     assert again.manifest == asset.manifest
     for name in (*FILES, "manifest.json"):
         assert (tmp_path / "copy" / name).read_bytes() == (asset.folder / name).read_bytes()
-    for name in ("brick_coords", "brick_masks", "density", "features"):
+    for name in vars(asset.arrays):
         assert (getattr(again.arrays, name) == getattr(asset.arrays, name)).all()
 
 
@@ -164,6 +164,8 @@ def test_arrays_that_do_not_fit(broken_folder: Path, asset: Asset) -> None:
         ("brick_coords.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
         ("brick_coords.npy", b"", "expected a numpy array"),
         ("brick_masks.npy", npy(a.brick_masks.astype(np.float64)), "expected uint64"),
+        ("feature_coords.npy", npy(a.feature_coords[::-1].copy()), "expected bricks sorted"),
+        ("feature_masks.npy", npy(a.feature_masks[:-1]), "packed codes, got more"),
     ]
     for name, data, message in bad:
         good = (broken_folder / name).read_bytes()
@@ -183,10 +185,18 @@ def test_vertices_beyond_the_grid(broken_folder: Path) -> None:
         np.zeros((1, 3), np.uint16),
         np.full((1, 8), 2**7, np.uint64),
         np.zeros(8, np.uint8),
-        np.zeros((8, 1), np.int8),
+        np.zeros((0, 3), np.uint16),
+        np.zeros((0, 8), np.uint64),
+        np.zeros((0, 1), np.int8),
     )
     manifest = Manifest(
-        generator="t", resolution=6, step=0.1, density_range=(0, 1), n_channels=1, view_size=(1, 1)
+        generator="t",
+        resolution=6,
+        feature_resolution=6,
+        step=0.1,
+        density_range=(0, 1),
+        n_channels=1,
+        view_size=(1, 1),
     )
     with pytest.raises(FormatError, match="expected vertices up to 6, got one at 7"):
         arrays.check(manifest, "")
@@ -242,7 +252,13 @@ def test_bad_manifest(change: dict[str, Any], message: str, asset: Asset) -> Non
 
 def keys_of_a_manifest() -> list[str]:
     smallest = Manifest(
-        generator="t", resolution=6, step=0.1, density_range=(0, 1), n_channels=1, view_size=(1, 1)
+        generator="t",
+        resolution=6,
+        feature_resolution=6,
+        step=0.1,
+        density_range=(0, 1),
+        n_channels=1,
+        view_size=(1, 1),
     )
     return [key for key in json.loads(manifest_bytes(smallest)) if key != "format"]
 
@@ -257,21 +273,11 @@ def test_missing_key(key: str, asset: Asset) -> None:
 
 def test_versions(asset: Asset) -> None:
     document = json.loads(manifest_bytes(asset.manifest))
-    newer = document | {"version": [2, 7], "surprise": 1}
-    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(2, 7))
-    for version, fix in (([3, 0], "install a newer vfr-bake"), ([1, 0], "bake the asset again")):
-        with pytest.raises(VersionError, match=rf"m\.json: version: expected 2\.x, got {version[0]}.*{fix}"):
+    newer = document | {"version": [3, 7], "surprise": 1}
+    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(3, 7))
+    for version, fix in (([4, 0], "install a newer vfr-bake"), ([2, 1], "bake the asset again")):
+        with pytest.raises(VersionError, match=rf"m\.json: version: expected 3\.x, got {version[0]}.*{fix}"):
             parse_manifest(json.dumps(document | {"version": version}).encode(), "m.json")
-
-
-def test_a_manifest_of_the_minor_before_is_one_of_a_box(asset: Asset) -> None:
-    document = json.loads(manifest_bytes(asset.manifest)) | {"version": [2, 0]}
-    with pytest.raises(FormatError, match="contracted: expected no such key in version"):
-        parse_manifest(json.dumps(document).encode(), "m.json")
-    del document["contracted"]
-    older = parse_manifest(json.dumps(document).encode(), "m.json")
-    assert older == replace(asset.manifest, version=(2, 0)) and not older.contracted
-    assert parse_manifest(manifest_bytes(older), "m.json") == older
 
 
 def test_contracted_space_has_one_box(asset: Asset) -> None:
@@ -300,6 +306,7 @@ def test_golden_manifest() -> None:
     manifest = Manifest(
         generator="t",
         resolution=6,
+        feature_resolution=4,
         step=0.5,
         density_range=(0, 1),
         n_channels=1,
@@ -309,8 +316,8 @@ def test_golden_manifest() -> None:
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
-        '"contracted":false,"density_range":[0.0,1.0],"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
-        '"provenance":{},"resolution":6,"step":0.5,"version":[2,1],"view_size":[4,3],'
+        '"contracted":false,"density_range":[0.0,1.0],"feature_resolution":4,"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
+        '"provenance":{},"resolution":6,"step":0.5,"version":[3,0],"view_size":[4,3],'
         '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'
     )
 

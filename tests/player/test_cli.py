@@ -132,7 +132,7 @@ def test_output_that_is_not_empty(
 def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(shells_folder), "--info"]) == 0
     page = capsys.readouterr().out
-    for text in ("vfr-asset 2.1", "64 cells per axis", "4 channels", "at 5 places a ray", "21 parameters",
+    for text in ("vfr-asset 3.0", "64 cells per axis", "4 channels", "at 5 places a ray", "21 parameters",
                  "5 training views of 48x40", "psnr", "4 x 4 x 4 units, from -1, 0, 1 to 3, 4, 5",
                  "head.onnx"):  # fmt: skip
         assert text in page, text
@@ -144,17 +144,17 @@ def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(broken_folder), "--check"]) == 0
-    assert len(re.findall(r"^ok ", capsys.readouterr().out, re.M)) == 7
+    assert len(re.findall(r"^ok ", capsys.readouterr().out, re.M)) == 9
     data = bytearray((broken_folder / "mesh.ply").read_bytes())
     data[0] ^= 1
     (broken_folder / "mesh.ply").write_bytes(bytes(data))
     (broken_folder / "density.codes").unlink()
     assert cli.main([str(broken_folder), "--check"]) == 1
     printed = capsys.readouterr()
-    assert len(re.findall(r"^ok ", printed.out, re.M)) == 5
+    assert len(re.findall(r"^ok ", printed.out, re.M)) == 7
     assert re.search(r"^FAILED  mesh\.ply .*sha256", printed.out, re.M)
     assert re.search(r"^FAILED  density\.codes .*got none", printed.out, re.M)
-    assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 7 files failed\n"
+    assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 9 files failed\n"
     assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
     assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"
 

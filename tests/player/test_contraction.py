@@ -65,8 +65,9 @@ def test_gradients_are_pulled_back_by_the_jacobian() -> None:
 
 
 def empty_grid(resolution: int, step: float) -> SparseGrid:
-    nothing = np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64), np.zeros(0, np.uint8)
-    return build_grid((*nothing, np.zeros((0, 1), np.int8)), resolution, BOX, step, (0.0, 1.0), True)
+    where, both = (np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64)), (resolution, resolution)
+    codes, features = np.zeros(0, np.uint8), np.zeros((0, 1), np.int8)
+    return build_grid((*where, codes), (*where, features), both, BOX, step, (0.0, 1.0), True)
 
 
 def rays_of_all_kinds() -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,8 @@ from player.bricks import (
     unpack_vertices,
 )
 from player.density import decode_density, encode_density
-from player.sparse_grid import ABSENT, MAX_DISTANCE, build_grid
+from player.sparse_grid import MAX_DISTANCE, build_grid
+from player.vertex_rows import ABSENT
 
 RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
 
@@ -81,9 +82,9 @@ def test_grid_against_dense_arrays(share: float) -> None:
     vertices = vertices[order]
     codes = rng.integers(1, 256, len(vertices)).astype(np.uint8)
     features = rng.integers(-128, 128, (len(vertices), 3)).astype(np.int8)
-    grid = build_grid(
-        (coords, masks, codes, features), resolution, np.array([[-1] * 3, [1] * 3]), 0.1, (0, 1)
-    )
+    where, both = (coords, masks), (resolution, resolution)
+    box = np.array([[-1] * 3, [1] * 3])
+    grid = build_grid((*where, codes), (*where, features), both, box, 0.1, (0, 1))
     n = grid.n_per_axis
     full = np.zeros((n * 8 + 1,) * 3, np.uint8)
     full[tuple(vertices.T)] = codes
@@ -94,8 +95,8 @@ def test_grid_against_dense_arrays(share: float) -> None:
     rows = np.full((n * 8,) * 3, -1)
     rows[tuple(vertices.T)] = np.arange(len(vertices))
     for brick, (x, y, z) in enumerate(coords.tolist()):
-        ranks = grid.ranks[brick * 512 : brick * 512 + 512].astype(np.int64)
-        got = np.where(ranks == ABSENT, -1, grid.base[brick] + ranks).reshape(8, 8, 8)
+        ranks = grid.rows.ranks[brick * 512 : brick * 512 + 512].astype(np.int64)
+        got = np.where(ranks == ABSENT, -1, grid.rows.base[brick] + ranks).reshape(8, 8, 8)
         assert (got == rows[x * 8 : x * 8 + 8, y * 8 : y * 8 + 8, z * 8 : z * 8 + 8]).all()
     for at in np.ndindex(n, n, n):
         entry = int(grid.table.reshape(n, n, n)[at])
@@ -105,5 +106,5 @@ def test_grid_against_dense_arrays(share: float) -> None:
 
 
 def test_grid_of_the_asset_keeps_every_vertex(asset: Asset) -> None:
-    assert stored_bits(asset.arrays.brick_masks).sum() == len(asset.grid.features)
+    assert stored_bits(asset.arrays.feature_masks).sum() == len(asset.grid.features)
     assert (asset.grid.features == asset.arrays.features).all()

@@ -10,8 +10,12 @@ import pytest
 
 from player import march, march_compiled
 from player.asset import Asset
+from player.bricks import pack_vertices
 from player.few_samples import Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
+from player.sparse_grid import SparseGrid
+from player.vertex_rows import vertex_rows
+from tests.player.conftest import RESOLUTION
 from tests.player.oracle_march import Scene, bins, march_ray
 
 # float32: 2^-24 a rounding, some dozen samples of optical depth up to 7; measured 1e-6.
@@ -160,6 +164,28 @@ def test_numba_is_numpy_in_any_number_of_channels(n_channels: int, kind: type, a
         a, b = march.march(grid, *rays, k), march_compiled.march(grid, *rays, k)
         assert a.features.shape == b.features.shape == (len(a.hits), n_channels)
         np.testing.assert_allclose(a.features, b.features, rtol=0, atol=40 * FEATURES)  # noise, not 3 a cell
+
+
+def with_linear_features(grid: SparseGrid, resolution: int) -> SparseGrid:
+    """The grid with features on every vertex of a grid of `resolution`: a linear function of the place, and
+    one that is 50."""
+    index = np.argwhere(np.ones((resolution + 1,) * 3))
+    coords, masks, order = pack_vertices(index)
+    place = index[order] * np.float32(120 / resolution) - 60
+    features = np.concatenate([place, np.full((len(place), 1), 50)], axis=1).astype(np.float32)
+    return replace(grid, rows=vertex_rows(coords, masks, resolution), features=features)
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("resolution", [8, 20, 33, 90])
+@pytest.mark.parametrize("k", [0, 3])
+def test_features_on_a_grid_of_their_own(module: ModuleType, resolution: int, k: int, asset: Asset) -> None:
+    """Coarser, of no simple ratio, or finer than the densities': a linear function stays what it is."""
+    rays = random_rays(1000, seed=9)
+    own = module.march(with_linear_features(asset.grid, RESOLUTION), *rays, k)
+    other = module.march(with_linear_features(asset.grid, resolution), *rays, k)
+    assert len(own.hits) > 300 and own.opacity.tobytes() == other.opacity.tobytes()
+    np.testing.assert_allclose(other.features, own.features, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("module", MARCHES)

@@ -120,7 +120,10 @@ def _asset_targets(work: Path) -> list[Target]:
     def read_manifest() -> None:
         parse_manifest((broken / "manifest.json").read_bytes(), "manifest.json")
 
-    arrays = ("brick_coords.npy", "brick_masks.npy", "density.codes", "features.codes")
+    arrays = (
+        *("brick_coords.npy", "brick_masks.npy", "density.codes"),
+        *("feature_coords.npy", "feature_masks.npy", "features.codes"),
+    )
     return [
         Target("manifest", write_manifest, read_manifest),
         *(Target(name, write_array(name), read_asset) for name in arrays),

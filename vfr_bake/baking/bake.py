@@ -33,7 +33,7 @@ from vfr_bake import __version__
 from vfr_bake.baking.budget import channels_that_fit, check_budget
 from vfr_bake.baking.cells import find_cells
 from vfr_bake.baking.estimate import make_plan
-from vfr_bake.baking.grids import Layout, evaluate_vertices, make_layout
+from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
 from vfr_bake.baking.loss import HeldOut, Stage
@@ -124,7 +124,8 @@ class _Bake:
         if layout.contracted:
             self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         figures = {
-            "n_vertices": len(layout.vertices),
+            "n_vertices": len(layout.densities),
+            "n_feature_vertices": len(layout.features),
             "mesh_faces": len(mesh.faces),
             "mesh_floaters_removed": removed.floaters,
             "stages": self.held_out.table(),
@@ -145,29 +146,30 @@ class _Bake:
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
         n_bytes = sum(_file_sizes(folder).values())
         seconds = sum(self.seconds.values())
-        return BakeResult(len(layout.vertices), n_bytes, seconds, figures, result["missed"])
+        return BakeResult(len(layout.densities), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> Layout:
-        model, resolution = self.model, self.plan.resolution
+        model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = self._progress("visibility")
-            visible, step, left_out = find_cells(model, self.config, resolution, self.held_out, progress)
+            visible, step, left_out = find_cells(
+                model, self.config, plan.feature_resolution, self.held_out, progress
+            )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        layout = make_layout(visible, step, model.field.config.unbounded)
-        n_vertices, most = len(layout.vertices), self.plan.most_vertices
-        if n_vertices > most:
+        n_cells = int(np.count_nonzero(visible))
+        if n_cells > plan.most_cells:
             raise TrainingError(
-                f"bake: vertices: expected at most {most:,}, which fit into {self.config.max_memory:g} GB of "
-                f"memory, got {n_vertices:,} of {(resolution + 1) ** 3:,}: is the model a fog? Lower "
-                "--resolution, raise --weight-floor, or allow more by --max-memory"
+                f"bake: cells: expected at most {plan.most_cells:,}, which fit into "
+                f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of {visible.size:,}: is the model "
+                "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
-        return layout
+        return make_layout(visible, step, plan.resolution, model.field.config.unbounded)
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
         """The mesh of what is about to be written."""
         manifest = self._manifest(layout, arrays.features.shape[1], {})
-        size = self.choice.mesh_resolution or layout.resolution
+        size = self.choice.mesh_resolution or layout.densities.resolution
         with self._part("mesh"), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             files = {"head.onnx": head, "cameras.json": write_cameras(self.model.cameras)}
             asset = unwritten_asset(Path(folder), manifest, arrays, files)
@@ -181,7 +183,8 @@ class _Bake:
             views = cameras + views_between(model, len(cameras), seed=1)
             taught = teach(model, views, self.plan.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
-            features, density = evaluate_vertices(model, layout, self._progress("grid"))
+            density = evaluate_densities(model, layout, self._progress("densities"))
+            features = evaluate_features(model, layout, self._progress("features"))
             own = fold_head(model.field.head, model.field.head.first_weights().astype(np.float64))
             held_out.measure("grid", layout.float_grid(density, features), runner(own), 0)
             projection = self._projection(taught)
@@ -222,8 +225,10 @@ class _Bake:
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
-        rest = mesh_size(layout.grid(density, features), self.choice.mesh_resolution or layout.resolution)
+        size = self.choice.mesh_resolution or layout.densities.resolution
+        rest = mesh_size(layout.grid(density, features), size)
         rest += arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
+        rest += arrays.feature_coords.nbytes + arrays.feature_masks.nbytes
         rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
         if not self.choice.head_width:
             rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
@@ -239,7 +244,7 @@ class _Bake:
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         with self._part("refinement"):
             grid = layout.grid(stored.density, stored.features)
-            lessons = collect_lessons(taught, grid, 0)
+            lessons = collect_lessons(taught, grid, 0, layout.densities.rows())
             if choice.head_width:
                 new = self._new_head(stored.head, lessons.typical(stored.features))
                 stored = replace(stored, head=new)
@@ -327,7 +332,8 @@ class _Bake:
         camera = model.cameras[0]
         return Manifest(
             generator=f"vfr-bake {__version__}",
-            resolution=layout.resolution,
+            resolution=layout.densities.resolution,
+            feature_resolution=layout.features.resolution,
             step=layout.step,
             aabb=layout.aabb,
             contracted=layout.contracted,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.errors import ConfigError
-from vfr_bake.baking.contracted import BLOCK, VERTEX_SHARE, rays_of_contracted_views
+from vfr_bake.baking.contracted import BLOCK, CELL_SHARE, rays_of_contracted_views
 from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
 from vfr_bake.baking.culling import FLOORS
 from vfr_bake.baking.refinement import BATCH
@@ -29,7 +29,11 @@ RAY_BYTES = 500
 """Of a ray that is learned from: a third meets something, at about 10 samples of 76 bytes, and what the model
 shows there."""
 STORED_SHARE = 1.0
-"""Vertices for each cell that may hold matter: culling takes away what corners add."""
+"""Cells that are stored for each that may hold matter, and the corners that they add."""
+FINE_MARKS = 4
+"""Bytes of a cell of the densities' grid while it is decided which are stored."""
+DENSITY_BYTES = 50
+"""Of a density, of which each cell of the features has as many as finer cells."""
 N_TIMED = 8192
 """Rays that tell how fast the model answers."""
 STEP_COST, VERTEX_COST = {False: 2.5, True: 0.2}, 0.12
@@ -42,13 +46,15 @@ class Plan:
     """What follows from the memory allowed, and what is expected."""
 
     resolution: int
-    """Cells per axis."""
+    """Cells per axis of the densities."""
+    feature_resolution: int
+    """Cells per axis of the features."""
     n_rays: int
     """Rays that are learned from."""
-    most_vertices: int
-    """More do not fit."""
-    n_vertices: float
-    """Vertices that are expected."""
+    most_cells: int
+    """Of the features' grid: more do not fit."""
+    n_cells: float
+    """Cells of it that are expected."""
     n_bytes: int
     """Peak of memory that is expected."""
 
@@ -59,48 +65,54 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """
     choice, field = config.choice(), model.field.config
-    resolution = _resolution(model, config)
-    cells = _marks_bytes(model, config) * resolution**3
-    vertex_bytes = 4 * field.n_channels + 13 * min(choice.n_channels, field.n_channels) + 60
-    n_vertices = _vertices(model, resolution)
+    resolution, coarse = _resolutions(model, config)
+    marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
+    cell_bytes = 4 * field.n_channels + 13 * min(choice.n_channels, field.n_channels) + 60
+    cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
+    n_cells = _cells(model, coarse)
     allowed = config.max_memory * 1e9
-    left = allowed - PROGRAM_BYTES - n_vertices * vertex_bytes
+    left = allowed - PROGRAM_BYTES - n_cells * cell_bytes
     most_rays = UNBOUNDED_RAYS if field.unbounded else N_RAYS
     n_rays = int(np.clip(left / RAY_BYTES, FEWEST_RAYS, most_rays))
     room = allowed - PROGRAM_BYTES - n_rays * RAY_BYTES
-    if room <= 0 or PROGRAM_BYTES + cells > allowed:
-        least = (PROGRAM_BYTES + max(cells, FEWEST_RAYS * RAY_BYTES)) / 1e9
+    if room <= 0 or PROGRAM_BYTES + marks > allowed:
+        least = (PROGRAM_BYTES + max(marks, FEWEST_RAYS * RAY_BYTES)) / 1e9
         raise ConfigError(
             f"max_memory: expected at least {least:.2f} GB for {resolution} cells per axis, got "
             f"{config.max_memory:g} GB: allow more, or lower --resolution"
         )
-    peak = PROGRAM_BYTES + max(cells, n_vertices * vertex_bytes + n_rays * RAY_BYTES)
-    return Plan(resolution, n_rays, int(room / vertex_bytes), n_vertices, int(min(peak, allowed)))
+    peak = PROGRAM_BYTES + max(marks, n_cells * cell_bytes + n_rays * RAY_BYTES)
+    return Plan(resolution, coarse, n_rays, int(room / cell_bytes), n_cells, int(min(peak, allowed)))
 
 
-def _resolution(model: Model, config: BakeConfig) -> int:
+def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
+    """Cells per axis of the densities and of the features."""
     choice, field = config.choice(), model.field.config
     if config.resolution:
         resolution = config.resolution
     elif field.unbounded:
-        room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
-        resolution = min(choice.contracted_resolution, int(np.cbrt(room / _marks_bytes(model, config))))
+        resolution = choice.contracted_resolution
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
-    resolution = int(np.clip(resolution, 8, field.max_resolution))
-    return resolution - resolution % BLOCK if field.unbounded else resolution
+    room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
+    if not config.resolution:
+        resolution = min(resolution, int(np.cbrt(room / FINE_MARKS)))
+    resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
+    coarse = config.feature_resolution or round(choice.feature_share * resolution)
+    coarse = int(np.clip(coarse, 8, min(field.max_resolution, resolution)))
+    return resolution, coarse - coarse % BLOCK if field.unbounded else coarse
 
 
 def _marks_bytes(model: Model, config: BakeConfig) -> int:
-    """For each cell, while it is decided which are stored."""
+    """For each cell of the features' grid, while it is decided which are stored."""
     n_floors = len(FLOORS) if config.weight_floor is None and not model.field.config.unbounded else 1
     return 4 + (0 if config.no_cull else n_floors)
 
 
-def _vertices(model: Model, resolution: int) -> float:
-    """How many vertices will be stored, roughly."""
+def _cells(model: Model, resolution: int) -> float:
+    """How many cells of the features' grid will be stored, roughly."""
     if model.field.config.unbounded:
-        return VERTEX_SHARE * resolution**3
+        return CELL_SHARE * resolution**3
     return STORED_SHARE * float(np.count_nonzero(occupied_cells(model, resolution)))
 
 
@@ -115,12 +127,13 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         begin = time.perf_counter()
         model.sampler.composited_features(model.field, rays_o, rays_d)
         times.append(time.perf_counter() - begin)
-    work = plan.n_rays + VERTEX_COST * plan.n_vertices
+    finer = plan.resolution / plan.feature_resolution
+    work = plan.n_rays + VERTEX_COST * plan.n_cells * (1 + finer**3)
     if model.field.config.unbounded:
-        work += rays_of_contracted_views(model, plan.resolution)
+        work += rays_of_contracted_views(model, plan.feature_resolution)
     elif not config.no_cull:
-        finer = max(model.occupancy.step * plan.resolution / 2, 1.0)
-        work += finer * rays_of_views(model, plan.resolution)
+        shorter = max(model.occupancy.step * plan.feature_resolution / 2, 1.0)
+        work += shorter * rays_of_views(model, plan.feature_resolution)
     n_rounds = 3 if choice.head_width else 2
     work += n_rounds * choice.refine_steps * BATCH * STEP_COST[model.field.config.unbounded]
     return times[-1] * work / N_TIMED

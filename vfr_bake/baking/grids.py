@@ -1,8 +1,13 @@
-"""From cells to the arrays of an asset and back to a grid that can be marched."""
+"""From cells to the arrays of an asset and back to a grid that can be marched.
+
+Densities and features are stored at the vertices of two grids over the same box. What a picture loses first
+is where a surface is: densities take the finer one, a byte a vertex; features, whose vertices take a byte a
+channel, the coarser one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +16,9 @@ from player.asset import GridArrays
 from player.bricks import pack_vertices
 from player.density import encode_density
 from player.sparse_grid import SparseGrid, build_grid
+from player.vertex_rows import VertexRows, vertex_rows
 from vfr_bake.baking.projection import encode_features
-from vfr_bake.baking.visibility import corner_vertices
+from vfr_bake.baking.visibility import corners_of, subdivided
 from vfr_bake.training.model_file import Model
 
 VERTEX_CHUNK = 1 << 18
@@ -22,49 +28,59 @@ FAINTEST, DENSEST = 1e-5, 20.0
 FAR = 30.0
 """In contracted space a step has different lengths, from dphi on: codes begin at what is invisible even so
 many model units away, where a step is as long as its square."""
+Progress = Callable[[int, int], object]
+"""Called with (done, of)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """The stored vertices of a grid, in the order of the rows on disk."""
+
+    coords: np.ndarray
+    masks: np.ndarray
+    """Of their bricks, as `player.bricks` has them."""
+    index: np.ndarray
+    """[n, 3] int16."""
+    resolution: int
+    """Cells per axis."""
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def rows(self) -> VertexRows:
+        return vertex_rows(self.coords, self.masks, self.resolution)
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Which vertices are stored, and how their densities are coded."""
 
-    brick_coords: np.ndarray
-    brick_masks: np.ndarray
-    vertices: np.ndarray
-    """[n_vertices, 3] grid indices, in the order of the rows on disk."""
-    resolution: int
+    densities: Vertices
+    features: Vertices
     step: float
     density_range: tuple[float, float]
     contracted: bool = False
 
     @property
     def aabb(self) -> tuple[tuple[float, ...], ...]:
-        """The grid's box: that of an object, or of contracted space."""
+        """The grids' box: that of an object, or of contracted space."""
         edge = 2.0 if self.contracted else 1.0
         return (-edge,) * 3, (edge,) * 3
 
-    def unit_points(self, rows: slice) -> np.ndarray:
-        """[n, 3] float32: where the vertices in `rows` are looked up in the unit cube of the field. Corners
-        of cells that stick out of contracted space, where the field has learnt nothing, take what is at its
-        border."""
-        points = self.vertices[rows] / self.resolution
-        if self.contracted:
-            centred = points - 0.5
-            norm = np.linalg.norm(centred, axis=-1, keepdims=True)
-            points = np.where(norm > 0.5, centred * (0.5 / np.maximum(norm, 0.5)) + 0.5, points)
-        return points.astype(np.float32)
-
     def arrays(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
-        """The asset's arrays, from codes that need not be whole: [n_vertices], [n_vertices, n_channels]."""
+        """The asset's arrays, from codes that need not be whole: one for each vertex of the densities,
+        [n, n_channels] for each of the features."""
         whole = np.clip(np.rint(density), 0, 255).astype(np.uint8)
-        return GridArrays(self.brick_coords, self.brick_masks, whole, encode_features(features))
+        d, f = self.densities, self.features
+        return GridArrays(d.coords, d.masks, whole, f.coords, f.masks, encode_features(features))
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
         """The grid that a player makes of `arrays`."""
         a = self.arrays(density, features)
         return build_grid(
-            (a.brick_coords, a.brick_masks, a.density, a.features),
-            self.resolution,
+            (a.brick_coords, a.brick_masks, a.density),
+            (a.feature_coords, a.feature_masks, a.features),
+            (self.densities.resolution, self.features.resolution),
             np.array(self.aabb),
             self.step,
             self.density_range,
@@ -72,32 +88,58 @@ class Layout:
         )
 
     def float_grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
-        """The same with features [n_vertices, n_channels] float32 as they are, for measuring alone."""
+        """The same with features [n, n_channels] float32 as they are, for measuring alone."""
         empty = np.zeros((len(features), 1), np.float32)
         return replace(self.grid(density, empty), features=features)
 
 
-def make_layout(visible: np.ndarray, step: float, contracted: bool = False) -> Layout:
-    """Layout of the corners of the cells `visible` [n, n, n] bool, for march steps of `step`."""
-    vertices = corner_vertices(visible)
-    coords, masks, order = pack_vertices(vertices)
+def make_layout(visible: np.ndarray, step: float, resolution: int, contracted: bool = False) -> Layout:
+    """What is stored of the cells `visible` [n, n, n] bool: features at their corners, densities at those of
+    the finer cells in them, of which there are `resolution` along each axis; for march steps of `step`."""
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
-    whole = vertices[order].astype(np.int16)
-    return Layout(coords, masks, whole, len(visible), step, density_range, contracted)
+    densities = _corners(subdivided(visible, resolution))
+    return Layout(densities, _corners(visible), step, density_range, contracted)
 
 
-def evaluate_vertices(
-    model: Model, layout: Layout, progress: Callable[[int, int], object]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The field's features [n_vertices, n_channels] float32 and density codes [n_vertices] float32 there."""
-    n = len(layout.vertices)
-    features = np.empty((n, model.field.config.n_channels), np.float32)
-    density = np.empty(n, np.float32)
-    for start in range(0, n, VERTEX_CHUNK):
-        rows = slice(start, start + VERTEX_CHUNK)
-        points = layout.unit_points(rows)
+def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
+    """The field's density codes [n_densities] float32."""
+    vertices = layout.densities
+    codes = np.empty(len(vertices), np.float32)
+    for rows, points in _chunks(vertices, layout.contracted):
+        codes[rows] = encode_density(model.field.log_densities(points), layout.density_range)
+        progress(rows.stop, len(vertices))
+    return codes
+
+
+def evaluate_features(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
+    """The field's features [n_features, n_channels] float32."""
+    vertices = layout.features
+    features = np.empty((len(vertices), model.field.config.n_channels), np.float32)
+    for rows, points in _chunks(vertices, layout.contracted):
         features[rows] = model.field.features(points)
-        density[rows] = encode_density(model.field.log_densities(points), layout.density_range)
-        progress(min(start + VERTEX_CHUNK, n), n)
-    return features, density
+        progress(rows.stop, len(vertices))
+    return features
+
+
+def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
+    for start in range(0, len(vertices), VERTEX_CHUNK):
+        rows = slice(start, min(start + VERTEX_CHUNK, len(vertices)))
+        yield rows, unit_points(vertices.index[rows], vertices.resolution, contracted)
+
+
+def _corners(cells: np.ndarray) -> Vertices:
+    index = np.argwhere(corners_of(cells)).astype(np.int16)
+    coords, masks, order = pack_vertices(index)
+    return Vertices(coords, masks, index[order], len(cells))
+
+
+def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
+    """[n, 3] float32: where vertices are looked up in the unit cube of the field. Corners of cells that stick
+    out of contracted space, where the field has learnt nothing, take what is at its border."""
+    points = index / resolution
+    if contracted:
+        centred = points - 0.5
+        norm = np.linalg.norm(centred, axis=-1, keepdims=True)
+        points = np.where(norm > 0.5, centred * (0.5 / np.maximum(norm, 0.5)) + 0.5, points)
+    return points.astype(np.float32)

@@ -4,7 +4,7 @@ there.
 Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
 densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
 x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. A lesson holds that map, by the player's own choice
-of samples.
+of samples. Where the densities are learned too, at every sample, it also holds where their codes are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from player.errors import TrainingError
 from player.few_samples import MIN_TOTAL, Places, Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
 from player.marches import sampled_rays
-from player.sparse_grid import ABSENT, SparseGrid
+from player.sparse_grid import SparseGrid
+from player.vertex_rows import ABSENT, VertexRows
 from vfr_bake.kernels.stored_features import compose, corner_rows
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
@@ -39,6 +40,10 @@ class Lessons:
     """[n_fetches, 8] int32 rows of the stored arrays: the corners around each place."""
     shares: np.ndarray
     """[n_fetches, 8] float32 of the corners, 1 in all."""
+    density_rows: np.ndarray
+    """[n_fetches, 8] int32 rows of the stored densities in the same way; [0, 8] where they do not learn."""
+    density_shares: np.ndarray
+    """[n_fetches, 8] float32, or [0, 8]."""
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
@@ -104,16 +109,24 @@ def teach(
     return Taught(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def collect_lessons(taught: Taught, grid: SparseGrid, n_samples: int) -> Lessons:
-    """Lessons from those rays that meet something in the grid; n_samples as the player's k, 0 for every
-    sample.
+def collect_lessons(
+    taught: Taught, grid: SparseGrid, n_samples: int, densities: VertexRows | None = None
+) -> Lessons:
+    """Lessons from those rays that meet something in the grid.
 
-    Raises TrainingError where none does.
+    Args:
+        taught: the rays.
+        grid: as the player has it.
+        n_samples: the player's k, 0 for every sample.
+        densities: rows of the stored densities, at every sample: for densities that learn.
+
+    Raises TrainingError where no ray meets anything.
     """
     parts = []
     for first in range(0, len(taught.opacity), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_samples)
+        rays = taught.rays_o[rows], taught.rays_d[rows]
+        hits, opacity, fetches = player_fetches(grid, *rays, n_samples, densities)
         of_hits = (column[rows][hits] for column in (taught.rays_d, taught.colours, taught.opacity))
         dirs, colours, full_opacity = of_hits
         parts.append((*fetches, dirs, opacity, colours, full_opacity))
@@ -124,13 +137,18 @@ def collect_lessons(taught: Taught, grid: SparseGrid, n_samples: int) -> Lessons
 
 
 def player_fetches(
-    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    n_samples: int,
+    densities: VertexRows | None = None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """The linear map from stored codes to the composites of the rays that hit, as `player.march` composes
     them.
 
     Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8],
-    shares [n_fetches, 8], weights [n_fetches], lengths [n_fetches]).
+    shares [n_fetches, 8], rows and shares of the densities, weights [n_fetches], lengths [n_fetches]); of
+    the densities there are none without `densities`.
     """
     entries, samples, tau = sampled_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
@@ -145,7 +163,7 @@ def player_fetches(
         many = Samples(*(column[merged] for column in samples))
         bins = equal_mass_bins(many, n_samples)
         places = bins.s.copy()
-        gaps = np.flatnonzero(_corners(grid, entries, bins.ray, places)[1].sum(axis=1) < MIN_TOTAL)
+        gaps = np.flatnonzero(_feature_corners(grid, entries, bins.ray, places)[1].sum(axis=1) < MIN_TOTAL)
         if len(gaps):
             places[gaps] = many.s[heaviest(bins, gaps)]
         ray = np.concatenate([ray, bins.ray])
@@ -153,22 +171,30 @@ def player_fetches(
         weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_samples)])
         order = np.argsort(ray, kind="stable")
         ray, s, weights = ray[order], s[order], weights[order]
-    rows, shares = _corners(grid, entries, ray, s)
+    rows, shares = _feature_corners(grid, entries, ray, s)
     total = shares.sum(axis=1)
     stored = total >= MIN_TOTAL
     shares /= np.where(stored, total, 1)[:, None]
     weights = np.where(stored, weights, np.float32(0)).astype(np.float32)
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    return hits, opacity[hits], (counts, rows, shares, weights, entries.lengths(ray, s))
+    none = np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32)
+    of_densities = none if densities is None else _corners(densities, entries.at(ray, s))
+    lengths = entries.lengths(ray, s)
+    return hits, opacity[hits], (counts, rows, shares, *of_densities, weights, lengths)
 
 
-def _corners(
+def _feature_corners(
     grid: SparseGrid, entries: Places, ray: np.ndarray, s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    points = entries.at(ray, s)
-    rows, shares = np.empty((len(ray), 8), np.int32), np.empty((len(ray), 8), np.float32)
+    return _corners(grid.rows, entries.at(ray, s) * grid.feature_scale)
+
+
+def _corners(vertices: VertexRows, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and shares [n, 8] of the corners around `points` [3, n], cells of the vertices' own grid."""
+    n = points.shape[1]
+    rows, shares = np.empty((n, 8), np.int32), np.empty((n, 8), np.float32)
     corner_rows(
-        np.ascontiguousarray(points, np.float32), grid.resolution, grid.n_per_axis, grid.bricks, grid.base,
-        grid.ranks, ABSENT, rows, shares,
+        np.ascontiguousarray(points, np.float32), vertices.resolution, vertices.n_per_axis, vertices.bricks,
+        vertices.base, vertices.ranks, ABSENT, rows, shares,
     )  # fmt: skip
     return rows, shares

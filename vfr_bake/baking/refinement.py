@@ -44,9 +44,9 @@ class Stored:
 
     head: HeadWeights
     features: np.ndarray
-    """[n_vertices, n_channels] float32 within -127..127."""
+    """[n_features, n_channels] float32 within -127..127."""
     density: np.ndarray
-    """[n_vertices] float32 within 0..255."""
+    """[n_densities] float32 within 0..255."""
 
 
 def refine(
@@ -61,16 +61,17 @@ def refine(
     """Head and codes after `n_steps` on the squared error of the colours over random backgrounds.
 
     Codes are rounded wherever they are composed, and returned as they stand, not rounded; `stored` is left
-    alone. With `code_rate` 0 only the head learns. With a `grid`, whose lookups `lessons` must hold at every
-    sample, the densities learn too, and the weights of the lessons follow them.
+    alone. With `code_rate` 0 only the head learns. With a `grid`, whose lookups and densities `lessons` must
+    hold at every sample, the densities learn too, and the weights of the lessons follow them.
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
     typical = lessons.typical(stored.features)
     head = FoldedHead(stored.head, UNIT * typical)
     features, density = stored.features.copy(), stored.density.copy()
-    steep, steep_density = np.zeros((2, len(features)), np.float32)
+    steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     where = (lessons.starts, lessons.rows, lessons.shares)
+    of_densities = (lessons.density_rows, lessons.density_shares)
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in range(n_steps):
         falling = np.float32(0.5 * (1 + np.cos(np.pi * step / n_steps)))
@@ -78,8 +79,8 @@ def refine(
         some = random.integers(0, len(lessons), BATCH)
         if grid is not None:
             weigh(
-                some, *where, density, grid.density_low, grid.density_slope, lessons.lengths, MAX_TAU,
-                lessons.weights, lessons.opacity,
+                some, lessons.starts, *of_densities, density, grid.density_low, grid.density_slope,
+                lessons.lengths, MAX_TAU, lessons.weights, lessons.opacity,
             )  # fmt: skip
         composed = torch.from_numpy(lessons.composed(features, some)).requires_grad_(code_rate > 0)
         opacity = torch.from_numpy(lessons.opacity[some]).requires_grad_(grid is not None)
@@ -89,9 +90,9 @@ def refine(
         if grid is not None:
             assert composed.grad is not None and opacity.grad is not None
             descend_density(
-                some, *where, lessons.weights, lessons.opacity, features, composed.grad.numpy(),
-                opacity.grad.numpy(), grid.density_low, grid.density_slope, lessons.lengths,
-                np.float32(DENSITY_RATE) * falling, density, steep_density,
+                some, *where, *of_densities, lessons.weights, lessons.opacity, features,
+                composed.grad.numpy(), opacity.grad.numpy(), grid.density_low, grid.density_slope,
+                lessons.lengths, np.float32(DENSITY_RATE) * falling, density, steep_density,
             )  # fmt: skip
         if composed.grad is not None:
             rate = np.float32(code_rate) * falling

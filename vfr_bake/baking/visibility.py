@@ -11,7 +11,7 @@ from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
-HITS = 8
+HITS = 16
 """Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
 closed."""
 VIEWS_OF_A_CELL = 0.4
@@ -106,15 +106,31 @@ def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
     return out
 
 
-def corner_vertices(cells: np.ndarray) -> np.ndarray:
-    """Grid indices [n_vertices, 3] of all corners of the marked cells [n, n, n] bool.
+def corners_of(cells: np.ndarray) -> np.ndarray:
+    """[n + 1, n + 1, n + 1] bool: the corners of the marked cells [n, n, n] bool.
 
-    >>> corner_vertices(np.ones((1, 1, 1), bool)).shape
-    (8, 3)
+    >>> int(corners_of(np.ones((1, 1, 1), bool)).sum())
+    8
     """
-    stored = np.zeros(tuple(n + 1 for n in cells.shape), bool)
-    for corner in range(8):
-        x, y, z = corner & 1, corner >> 1 & 1, corner >> 2 & 1
-        n, m, k = cells.shape
-        stored[x : x + n, y : y + m, z : z + k] |= cells
-    return np.argwhere(stored)
+    corners = cells
+    for axis in range(3):
+        shape = list(corners.shape)
+        shape[axis] += 1
+        grown = np.zeros(shape, bool)
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        grown[tuple(low)] |= corners
+        grown[tuple(high)] |= corners
+        corners = grown
+    return corners
+
+
+def subdivided(cells: np.ndarray, resolution: int) -> np.ndarray:
+    """[resolution]^3 bool: cells of a finer grid over the same box whose middle is in one of `cells`
+    [n, n, n] bool.
+
+    >>> subdivided(np.array([True, False]).reshape(2, 1, 1).repeat(2, 1).repeat(2, 2), 5)[:, 0, 0].tolist()
+    [True, True, False, False, False]
+    """
+    which = (2 * np.arange(resolution) + 1) * len(cells) // (2 * resolution)
+    return cells[np.ix_(which, which, which)]

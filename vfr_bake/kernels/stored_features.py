@@ -3,7 +3,8 @@
 Letters: lesson i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
 weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
 x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
-of a ray, weights follow from the density codes q: delta_j = exp(low + slope q_j) lengths[j], T_j =
+of a ray, weights follow from the density codes q_j, which are interpolated in the same way on a grid of their
+own: delta_j = exp(low + slope q_j) lengths[j], T_j =
 exp(-sum_{i<j} delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as
 the integer nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the
 latent as if there were no rounding (straight through).
@@ -89,14 +90,14 @@ def weigh(lessons, starts, rows, shares, latent, low, slope, lengths, opaque, we
 
 @njit(cache=True)
 def descend_density(
-    lessons, starts, rows, shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope,
-    lengths, rate, latent, steepness,
+    lessons, starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
+    gradient_of_opacity, low, slope, lengths, rate, latent, steepness,
 ):  # fmt: skip
-    """One step of Adagrad on the latent density codes [n_vertices], in place, kept within 0..255.
+    """One step of Adagrad on the latent density codes [n_densities], in place, kept within 0..255.
 
     dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
-    n_channels] are the latent feature codes; `gradient` [n, n_channels] and `gradient_of_opacity` [n] are
-    those of x and A.
+    n_channels] are the latent feature codes, at `rows` by `shares`; `gradient` [n, n_channels] and
+    `gradient_of_opacity` [n] are those of x and A.
     """
     n_channels = values.shape[1]
     along = np.zeros(4096, np.float32)
@@ -123,17 +124,16 @@ def descend_density(
                 continue
             code = np.float32(0)
             for corner in range(8):
-                code += shares[first + j, corner] * np.rint(latent[rows[first + j, corner]])
+                code += density_shares[first + j, corner] * np.rint(latent[density_rows[first + j, corner]])
             delta = np.exp(low + slope * code) * lengths[first + j]
             behind -= weight * along[j]
             trans -= weight
             slant = (trans * along[j] - behind + left * gradient_of_opacity[i]) * delta * slope
             for corner in range(8):
-                share = shares[first + j, corner]
-                slant_of_row = share * slant
+                slant_of_row = density_shares[first + j, corner] * slant
                 if slant_of_row == 0:
                     continue
-                row = rows[first + j, corner]
+                row = density_rows[first + j, corner]
                 steepness[row] += slant_of_row * slant_of_row
                 moved = latent[row] - rate * slant_of_row / np.sqrt(steepness[row])
                 latent[row] = min(max(moved, np.float32(0)), np.float32(255))

@@ -27,7 +27,7 @@ from vfr_bake.baking.presets import PRESETS
 from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
 from vfr_bake.baking.refinement import FoldedHead, Stored, refine
 from vfr_bake.baking.views import views_between
-from vfr_bake.baking.visibility import corner_vertices, pixel_footprints
+from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
@@ -86,7 +86,7 @@ def test_feature_codes_are_within_half_a_step(size: float) -> None:
 def test_every_corner_of_a_visible_cell_is_stored() -> None:
     cells = np.random.default_rng(0).random((5, 5, 5)) < 0.1
     expected = {tuple(cell + corner) for cell in np.argwhere(cells) for corner in np.ndindex(2, 2, 2)}
-    assert {tuple(v) for v in corner_vertices(cells)} == expected
+    assert {tuple(v) for v in np.argwhere(corners_of(cells))} == expected
 
 
 def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lesso
     shares = np.zeros((n, 8), np.float32)
     shares[:, 3] = 1
     ones = np.ones(n, np.float32)
-    return Lessons(np.arange(n + 1), rows, shares, ones, ones, dirs, ones.copy(), wanted, ones)
+    return Lessons(np.arange(n + 1), rows, shares, rows, shares, ones, ones, dirs, ones.copy(), wanted, ones)
 
 
 def test_refinement_brings_the_head_back_to_its_teacher() -> None:
@@ -239,6 +239,7 @@ def test_density_gradient_is_that_of_the_composite() -> None:
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
     settings = BakeConfig(
         resolution=96,
+        feature_resolution=96,
         mesh_resolution=64,
         n_channels=16,
         check_views=2,
@@ -285,7 +286,13 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
 
 
 def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tmp_path: Path) -> None:
-    small: dict[str, Any] = {"resolution": 32, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    small: dict[str, Any] = {
+        "resolution": 32,
+        "feature_resolution": 32,
+        "mesh_resolution": 16,
+        "refine_steps": 0,
+        "check_views": 1,
+    }
     with pytest.raises(TrainingError, match=r"size: expected at most 0\.01 MB, got .* nothing was written"):
         bake(model, tmp_path / "asset", BakeConfig(max_mb=0.01, **small), quiet)
     with pytest.raises(TrainingError, match=r"loss: expected at most 0\.001 dB, got"):
@@ -297,7 +304,13 @@ def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tm
 
 
 def test_a_budget_takes_the_channels_that_fit(model: Model, tmp_path: Path) -> None:
-    small: dict[str, Any] = {"resolution": 96, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    small: dict[str, Any] = {
+        "resolution": 96,
+        "feature_resolution": 96,
+        "mesh_resolution": 16,
+        "refine_steps": 0,
+        "check_views": 1,
+    }
     small |= {"n_channels": 14}
     bake(model, tmp_path / "all", BakeConfig(**small), quiet)
     sizes = {name: entry.bytes for name, entry in Asset.open(tmp_path / "all").manifest.files.items()}
@@ -343,14 +356,19 @@ def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
         bake(model, tmp_path / "asset", BakeConfig(), quiet)
 
 
-def test_the_grid_is_as_fine_as_the_pictures_and_never_finer_than_the_field(
+def test_grids_are_as_fine_as_the_pictures_and_features_never_finer_than_the_field(
     model: Model, tmp_path: Path
 ) -> None:
     per_pixel = PRESETS["balanced"].cells_per_pixel
     cell_of_a_pixel = 2 * per_pixel / float(np.median(pixel_footprints(model)))
-    assert 40 < cell_of_a_pixel < 96
+    assert 40 < cell_of_a_pixel < 144
     bake(model, tmp_path / "a", BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1), quiet)
-    assert Asset.open(tmp_path / "a").manifest.resolution == round(cell_of_a_pixel)
-    finest = BakeConfig(resolution=500, mesh_resolution=16, refine_steps=0, check_views=1)
+    made = Asset.open(tmp_path / "a").manifest
+    assert made.resolution == round(cell_of_a_pixel)
+    assert made.feature_resolution == round(PRESETS["balanced"].feature_share * made.resolution)
+    finest = BakeConfig(
+        resolution=500, feature_resolution=400, mesh_resolution=16, refine_steps=0, check_views=1
+    )
     bake(model, tmp_path / "b", finest, quiet)
-    assert Asset.open(tmp_path / "b").manifest.resolution == 96
+    made = Asset.open(tmp_path / "b").manifest
+    assert (made.resolution, made.feature_resolution) == (144, 96)

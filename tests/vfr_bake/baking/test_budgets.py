@@ -18,7 +18,13 @@ from vfr_bake.baking.presets import PRESETS
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
-SMALL: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+SMALL: dict[str, Any] = {
+    "resolution": 48,
+    "feature_resolution": 48,
+    "mesh_resolution": 16,
+    "refine_steps": 0,
+    "check_views": 1,
+}
 
 
 def quiet(*_: object) -> None:

@@ -14,10 +14,11 @@ from player import contracted_march_compiled
 from player.asset import Asset
 from player.contraction import contract
 from player.render import render
+from player.vertex_rows import vertex_rows
 from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.contracted import lattice_step, weighty_cells
-from vfr_bake.baking.grids import make_layout
+from vfr_bake.baking.grids import unit_points
 from vfr_bake.baking.lessons import Lessons, Taught, collect_lessons
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.data.capture import PosedImages
@@ -61,6 +62,7 @@ def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bake") / "asset"
     settings = BakeConfig(
         resolution=64,
+        feature_resolution=64,
         mesh_resolution=24,
         refine_steps=20,
         head_width=0,
@@ -127,13 +129,15 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, folder: Path, 
     played = contracted_march_compiled.march(grid, rays_o, rays_d, k)
     nothing = np.zeros((len(rays_o), 3), np.float32)
     taught = Taught(rays_o, rays_d, nothing, nothing, nothing[:, 0])
-    lessons: Lessons = collect_lessons(taught, grid, k)
+    arrays = Asset.open(folder).arrays
+    densities = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
+    lessons: Lessons = collect_lessons(taught, grid, k, densities)
     assert len(lessons) == len(played.hits) > 1000
     composed = lessons.composed(grid.features.astype(np.float32))
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=5e-3)
     np.testing.assert_allclose(lessons.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
     if k == 0:  # the ways of the samples are what makes their weights
-        code = (lessons.shares * _codes(folder)[lessons.rows]).sum(axis=1)
+        code = (lessons.density_shares * _codes(folder)[lessons.density_rows]).sum(axis=1)
         optical = np.exp(grid.density_low + grid.density_slope * code) * lessons.lengths
         first = lessons.starts[:-1]
         np.testing.assert_allclose(-np.expm1(-optical[first]), lessons.weights[first], rtol=1e-3, atol=1e-6)
@@ -144,11 +148,11 @@ def _codes(folder: Path) -> np.ndarray:
 
 
 def test_vertices_outside_contracted_space_take_its_border() -> None:
-    layout = make_layout(np.ones((8, 8, 8), bool), 0.01, contracted=True)
-    points = layout.unit_points(slice(None)) * 4 - 2
+    index = np.argwhere(np.ones((9, 9, 9), bool))
+    points = unit_points(index, 8, contracted=True) * 4 - 2
     assert np.linalg.norm(points, axis=-1).max() < 2 + 1e-5
-    inside = np.linalg.norm(layout.vertices / 2.0 - 2, axis=-1) <= 2
-    np.testing.assert_allclose(points[inside], layout.vertices[inside] / 2.0 - 2, atol=1e-6)
+    inside = np.linalg.norm(index / 2.0 - 2, axis=-1) <= 2
+    np.testing.assert_allclose(points[inside], index[inside] / 2.0 - 2, atol=1e-6)
 
 
 def test_exports_hold_the_inner_region_in_world_units(model: Model, folder: Path, tmp_path: Path) -> None:

@@ -59,7 +59,13 @@ def test_a_low_floor_marks_more(model: Model) -> None:
 
 
 def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
-    small: dict[str, Any] = {"resolution": 48, "mesh_resolution": 16, "refine_steps": 0, "check_views": 1}
+    small: dict[str, Any] = {
+        "resolution": 48,
+        "feature_resolution": 48,
+        "mesh_resolution": 16,
+        "refine_steps": 0,
+        "check_views": 1,
+    }
     culled = bake(model, tmp_path / "a", BakeConfig(**small), quiet)
     everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
     # No more than a tenth of the preset's 0.4 dB may go: the scene is hazy, and a floor of 0.02 loses 0.047.
@@ -116,7 +122,12 @@ def test_the_highest_floor_that_loses_little_is_taken(model: Model) -> None:
 def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path: Path) -> None:
     """Thin weights everywhere: one sample weighs less than any floor, the sum along a ray is the picture."""
     thin = fog(model, -2)
-    small: dict[str, Any] = {"resolution": 32, "mesh_resolution": 16, "check_views": 1}
+    small: dict[str, Any] = {
+        "resolution": 32,
+        "feature_resolution": 32,
+        "mesh_resolution": 16,
+        "check_views": 1,
+    }
     result = bake(thin, tmp_path / "asset", BakeConfig(preset="fidelity", refine_steps=0, **small), quiet)
     assert result.figures["psnr_to_full_model"] > 35
     assert len(Asset.open(tmp_path / "asset").arrays.density) == 33**3

@@ -1,0 +1,54 @@
+"""Which vertices of the two grids are stored, and that what is left out is empty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from player.bricks import unpack_vertices
+from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout, unit_points
+from vfr_bake.baking.visibility import corners_of, occupied_cells, subdivided
+from vfr_bake.training.model_file import Model
+
+COARSE = 40
+
+
+def quiet(done: int, of: int) -> None:
+    """No progress."""
+
+
+@pytest.mark.parametrize(("n", "resolution"), [(4, 4), (4, 8), (5, 8), (7, 25), (8, 7)])
+def test_a_finer_cell_belongs_to_the_cell_around_its_middle(n: int, resolution: int) -> None:
+    cells = np.random.default_rng(n).random((n, n, n)) < 0.4
+    fine = subdivided(cells, resolution)
+    for index in np.ndindex(*fine.shape):
+        middle = tuple(int((i + 0.5) / resolution * n) for i in index)
+        assert fine[index] == cells[middle]
+
+
+@pytest.mark.parametrize("resolution", [COARSE, 64, 100])
+def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model, resolution: int) -> None:
+    visible, step = occupied_cells(model, COARSE), model.occupancy.step
+    layout = make_layout(visible, step, resolution)
+    assert (layout.densities.resolution, layout.features.resolution) == (resolution, COARSE)
+    for vertices, cells in ((layout.densities, subdivided(visible, resolution)), (layout.features, visible)):
+        assert len(vertices) == corners_of(cells).sum()
+        assert (unpack_vertices(vertices.coords, vertices.masks) == vertices.index).all()
+    codes = evaluate_densities(model, layout, quiet)
+    decoded = np.exp(layout.density_range[0] + np.diff(layout.density_range)[0] / 255 * codes) * step
+    points = unit_points(layout.densities.index, resolution, contracted=False)
+    wanted = np.exp(model.field.log_densities(points)) * step
+    inside = (wanted > 2e-5) & (wanted < 20)
+    np.testing.assert_allclose(decoded[inside], wanted[inside], rtol=0.031)  # half a code
+
+
+def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
+    layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, 64)
+    features = evaluate_features(model, layout, quiet)
+    assert features.shape == (len(layout.features), model.field.config.n_channels)
+    rows, random = layout.features.rows(), np.random.default_rng(0)
+    places = layout.densities.index * (COARSE / 64)
+    places += random.uniform(-0.3, 0.3, places.shape)
+    low = np.clip(np.floor(places).astype(int), 0, COARSE - 1)
+    found = np.stack([rows.find(low + corner) >= 0 for corner in np.ndindex(2, 2, 2)], axis=1)
+    assert found.mean() > 7 / 8 and found.any(axis=1).all()
