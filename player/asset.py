@@ -17,7 +17,7 @@ from player.bricks import bricks_per_axis, unpack_vertices
 from player.errors import FormatError, IntegrityError, OutputError
 from player.files import new_folder
 from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
-from player.packing import pack_codes, unpack_codes
+from player.packing import pack_codes, pack_masks, unpack_codes, unpack_masks
 from player.sparse_grid import SparseGrid, build_grid
 
 _DTYPES = {
@@ -30,10 +30,10 @@ _DTYPES = {
 }
 _FILES = {
     "brick_coords": "brick_coords.npy",
-    "brick_masks": "brick_masks.npy",
+    "brick_masks": "brick_masks.bits",
     "density": "density.codes",
     "feature_coords": "feature_coords.npy",
-    "feature_masks": "feature_masks.npy",
+    "feature_masks": "feature_masks.bits",
     "features": "features.codes",
 }
 
@@ -221,10 +221,12 @@ def write_asset(
     """
     arrays.check(manifest, "")
     with new_folder(folder, force) as new:
-        for name in ("brick_coords", "brick_masks", "feature_coords", "feature_masks"):
+        for name in ("brick_coords", "feature_coords"):
             with (new / _FILES[name]).open("wb") as file:
                 array = np.ascontiguousarray(getattr(arrays, name), _DTYPES[name])
                 np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
+        for name in ("brick_masks", "feature_masks"):
+            (new / _FILES[name]).write_bytes(pack_masks(getattr(arrays, name)))
         for name in ("density", "features"):
             (new / _FILES[name]).write_bytes(pack_codes(getattr(arrays, name)))
         for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
@@ -248,9 +250,9 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
 def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
     def grid(names: Names, *of_a_vertex: int) -> list[np.ndarray]:
         coords_name, masks_name, codes_name = names
-        coords, masks = (_map_array(folder / _FILES[name]) for name in (coords_name, masks_name))
-        if masks.dtype != np.dtype(_DTYPES[masks_name]):
-            raise FormatError(f"{folder / _FILES[masks_name]}: expected uint64, got {masks.dtype.name}")
+        coords = _map_array(folder / _FILES[coords_name])
+        path = folder / _FILES[masks_name]
+        masks = unpack_masks(path.read_bytes(), len(coords) if coords.ndim else 0, str(path))
         path, shape = folder / _FILES[codes_name], (int(np.bitwise_count(masks).sum()), *of_a_vertex)
         return [coords, masks, unpack_codes(path.read_bytes(), shape, _DTYPES[codes_name], str(path))]
 

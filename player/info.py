@@ -24,9 +24,9 @@ MANIFEST_KEYS = (
 CONTENT = {
     "features.codes": "what the head is given",
     "density.codes": "where there is something",
-    "brick_masks.npy": "which densities are stored",
+    "brick_masks.bits": "which densities are stored",
     "brick_coords.npy": "where their bricks are",
-    "feature_masks.npy": "which features are stored",
+    "feature_masks.bits": "which features are stored",
     "feature_coords.npy": "where their bricks are",
     "head.onnx": "features to colour",
     "mesh.ply": "the surface, for other programs",

@@ -7,10 +7,10 @@ An asset is a folder. It holds no absolute path and plays wherever it is moved.
 |---|---|
 | `manifest.json` | what is described below; UTF-8, keys sorted, at most 16 MiB |
 | `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
-| `brick_masks.npy` | uint64 [n_bricks, 8], which vertices of a brick are stored |
+| `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed likewise |
 | `density.codes` | uint8 [n_vertices], codes, packed as `player.packing` describes |
 | `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
-| `feature_masks.npy` | uint64 [n_feature_bricks, 8], which of their vertices are stored |
+| `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored |
 | `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed in the same way |
 | `head.onnx` | `features` [n, n_channels], `dirs` [n, 3] -> `rgb` [n, 3], float32 |
 | `mesh.ply` | the surface with vertex colours, world frame |
@@ -78,10 +78,10 @@ VERSION = (3, 0)
 NAME = "manifest.json"
 FILES = (
     "brick_coords.npy",
-    "brick_masks.npy",
+    "brick_masks.bits",
     "density.codes",
     "feature_coords.npy",
-    "feature_masks.npy",
+    "feature_masks.bits",
     "features.codes",
     "head.onnx",
     "mesh.ply",

@@ -18,7 +18,7 @@ import pytest
 from player.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.errors import FormatError, IntegrityError, OutputError, VersionError
 from player.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
-from player.packing import pack_codes, unpack_codes
+from player.packing import pack_codes, pack_masks, unpack_codes
 
 
 def parts(asset: Asset) -> tuple[Manifest, GridArrays, bytes, bytes, bytes]:
@@ -156,23 +156,24 @@ def test_arrays_that_do_not_fit(broken_folder: Path, asset: Asset) -> None:
         ("density.codes", b"", f"expected {len(a.density)} packed codes, got 0"),
         ("features.codes", pack_codes(a.features[:, :3]), "packed codes, got"),
         ("brick_coords.npy", npy(a.brick_coords[::-1].copy()), "expected bricks sorted"),
-        ("brick_coords.npy", npy(a.brick_coords[:-1]), "expected uint64"),
+        ("brick_coords.npy", npy(a.brick_coords[:-1]), "packed bytes, got more"),
         ("brick_coords.npy", npy(a.brick_coords + np.uint16(1)), "expected coordinates below 9"),
         ("brick_coords.npy", npy(np.asfortranarray(a.brick_coords)), "C order"),
         ("brick_coords.npy", npy(np.array([{}], object), allow_pickle=True), "expected a numpy array"),
         ("brick_coords.npy", npy(a.brick_coords) + b"tail", "bytes as its header says"),
         ("brick_coords.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
         ("brick_coords.npy", b"", "expected a numpy array"),
-        ("brick_masks.npy", npy(a.brick_masks.astype(np.float64)), "expected uint64"),
+        ("brick_masks.bits", npy(a.brick_masks), "expected packed bytes, got something else"),
+        ("brick_masks.bits", pack_masks(a.brick_masks)[:-9], "packed bytes, got"),
         ("feature_coords.npy", npy(a.feature_coords[::-1].copy()), "expected bricks sorted"),
-        ("feature_masks.npy", npy(a.feature_masks[:-1]), "packed codes, got more"),
+        ("feature_masks.bits", pack_masks(a.feature_masks[:-1]), "packed bytes, got"),
     ]
     for name, data, message in bad:
         good = (broken_folder / name).read_bytes()
         replace_file(broken_folder, name, data)
         with pytest.raises(FormatError, match=message) as caught:
             Asset.open(broken_folder)
-        assert re.search(r"\.(npy|codes): ", str(caught.value)) and "\n" not in str(caught.value)
+        assert re.search(r"\.(npy|bits|codes): ", str(caught.value)) and "\n" not in str(caught.value)
         replace_file(broken_folder, name, good)
     Asset.open(broken_folder)
 

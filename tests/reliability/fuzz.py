@@ -121,8 +121,8 @@ def _asset_targets(work: Path) -> list[Target]:
         parse_manifest((broken / "manifest.json").read_bytes(), "manifest.json")
 
     arrays = (
-        *("brick_coords.npy", "brick_masks.npy", "density.codes"),
-        *("feature_coords.npy", "feature_masks.npy", "features.codes"),
+        *("brick_coords.npy", "brick_masks.bits", "density.codes"),
+        *("feature_coords.npy", "feature_masks.bits", "features.codes"),
     )
     return [
         Target("manifest", write_manifest, read_manifest),

@@ -26,7 +26,7 @@ from player.errors import ConfigError, TrainingError
 from player.files import check_target
 from player.head import Head
 from player.manifest import Manifest
-from player.packing import pack_codes
+from player.packing import pack_codes, pack_masks
 from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
@@ -227,8 +227,8 @@ class _Bake:
         arrays = layout.arrays(density, features)
         size = self.choice.mesh_resolution or layout.densities.resolution
         rest = mesh_size(layout.grid(density, features), size)
-        rest += arrays.brick_coords.nbytes + arrays.brick_masks.nbytes
-        rest += arrays.feature_coords.nbytes + arrays.feature_masks.nbytes
+        rest += arrays.brick_coords.nbytes + len(pack_masks(arrays.brick_masks))
+        rest += arrays.feature_coords.nbytes + len(pack_masks(arrays.feature_masks))
         rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
         if not self.choice.head_width:
             rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
