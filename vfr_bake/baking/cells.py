@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
-from vfr_bake.baking.culling import CULLED_SHARE, cull, whole
+from vfr_bake.baking.culling import cull, whole
 from vfr_bake.baking.loss import HeldOut
 from vfr_bake.baking.visibility import Progress
 from vfr_bake.config import BakeConfig
@@ -43,6 +43,6 @@ def find_cells(
     step = float(model.occupancy.step)
     if config.no_cull:
         return StoredCells(whole(model, resolution).visible, step, None)
-    most_db = CULLED_SHARE * config.choice().target_loss_db
+    most_db = config.choice().culled_loss_db
     cells = cull(model, resolution, held_out, config.weight_floor, most_db, progress)
     return StoredCells(cells.visible, step, cells.report())

@@ -21,8 +21,6 @@ from vfr_bake.training.model_file import Model
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
 """Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
 is taken, and where none does, nothing is left out."""
-CULLED_SHARE = 0.1
-"""Of the loss that a preset aims at, what culling alone may take."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,14 +25,14 @@ PROGRAM_BYTES = 800_000_000
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
 FEWEST_RAYS = 100_000
-RAY_BYTES = 500
-"""Of a ray that is learned from: a third meets something, at about 10 samples of 76 bytes, and what the model
-shows there."""
+RAY_BYTES = 700
+"""Of a ray that is learned from: a third meets something, at about 10 samples of 140 bytes, and what the
+model shows there."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
 FINE_MARKS = 4
 """Bytes of a cell of the densities' grid while it is decided which are stored."""
-DENSITY_BYTES = 50
+DENSITY_BYTES = 40
 """Of a density, of which each cell of the features has as many as finer cells."""
 N_TIMED = 8192
 """Rays that tell how fast the model answers."""
@@ -67,7 +67,8 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     choice, field = config.choice(), model.field.config
     resolution, coarse = _resolutions(model, config)
     marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
-    cell_bytes = 4 * field.n_channels + 13 * min(choice.n_channels, field.n_channels) + 60
+    n_stored = min(choice.n_channels, field.n_channels)
+    cell_bytes = max(4 * (field.n_channels + n_stored), 13 * n_stored) + 60
     cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
     n_cells = _cells(model, coarse)
     allowed = config.max_memory * 1e9

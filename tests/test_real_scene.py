@@ -1,0 +1,83 @@
+"""The whole way of a scene without end: the fox capture, a phone's pictures with distortion, shortened. It
+fails, never skips, where that is missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from exporters.cli import main as export
+from player.asset import Asset
+from player.cli import main as play
+from vfr_bake.cli import bake_main, train_main
+from vfr_bake.data import load_scene
+from vfr_bake.training.metrics import psnr
+
+TRAIN = [
+    *(
+        "--downscale",
+        "8",
+        "--steps",
+        "400",
+        "--batch-rays",
+        "128",
+        "--pilot-steps",
+        "50",
+        "--eval-views",
+        "1",
+    ),
+    *("--n-levels", "8", "--max-resolution", "512", "--log2-table-size", "15", "--head-width", "32"),
+]
+BAKE = [
+    *("--resolution", "256", "--feature-resolution", "192", "--refine-steps", "60", "--check-views", "1"),
+    *("--mesh-resolution", "48", "--max-memory", "1.2", "--head-width", "0"),
+]
+
+
+@pytest.fixture(scope="module")
+def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Model, asset and one training view, played."""
+    out = tmp_path_factory.mktemp("fox")
+    model, asset = str(out / "model.pt"), str(out / "asset")
+    assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
+    assert bake_main([model, asset, *BAKE, "--json", str(out / "bake.json")]) == 0
+    view = ["--view", "0", "--output", str(out / "view.png"), "--json", str(out / "play.json")]
+    assert play([asset, *view]) == 0
+    return out
+
+
+def test_the_asset_holds_all_of_space(out: Path) -> None:
+    manifest = Asset.open(out / "asset", verify=True).manifest
+    assert manifest.contracted and (manifest.resolution, manifest.feature_resolution) == (256, 192)
+    assert json.loads((out / "play.json").read_text())["march"] == "numba"
+
+
+def test_a_played_training_view_is_the_photograph_nearly_as_well_as_the_model_knows_it(
+    out: Path, fox: Path
+) -> None:
+    photograph = load_scene(fox, downscale=8).train.images[0][..., :3] / 255
+    frame = np.asarray(Image.open(out / "view.png").convert("RGB")) / 255
+    assert frame.shape == photograph.shape
+    known = json.loads((out / "train.json").read_text())["training_psnr"]
+    assert psnr(frame, photograph) > max(known - 3, 17)
+
+
+def test_the_bake_says_what_it_lost(out: Path) -> None:
+    figures = json.loads((out / "bake.json").read_text())
+    assert figures["psnr_to_full_model"] > 24
+    assert {"grid", "files"} <= {stage["name"] for stage in figures["stages"]}
+
+
+def test_the_mesh_is_the_inner_region_in_world_units(out: Path) -> None:
+    import trimesh
+
+    assert export([str(out / "asset"), str(out / "mesh.glb")]) == 0
+    asset, mesh = Asset.open(out / "asset"), trimesh.load_mesh(out / "mesh.glb")
+    middle = asset.world_from_model[:3, 3]
+    middle = np.array([middle[0], middle[2], -middle[1]])  # Y up
+    assert len(mesh.faces) > 500
+    assert np.linalg.norm(mesh.vertices - middle, axis=-1).max() < 1.05 * asset.scale
