@@ -24,10 +24,10 @@ PROGRAM_BYTES = 800_000_000
 """Of Python, torch, numba and the model itself."""
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
-FEWEST_RAYS = 100_000
-RAY_BYTES = 700
-"""Of a ray that is learned from: a third meets something, at about 10 samples of 140 bytes, and what the
-model shows there."""
+FEWEST_RAYS = {False: 100_000, True: 50_000}
+RAY_BYTES = {False: 700, True: 6000}
+"""Of a ray that is learned from, by whether the scene is unbounded: of an object a third meets something, at
+about 10 samples of 140 bytes, of a scene all, at 30, and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
 FINE_MARKS = 4
@@ -66,6 +66,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     """
     choice, field = config.choice(), model.field.config
     resolution, coarse = _resolutions(model, config)
+    ray_bytes, fewest = RAY_BYTES[field.unbounded], FEWEST_RAYS[field.unbounded]
     marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
     n_stored = min(choice.n_channels, field.n_channels)
     cell_bytes = max(4 * (field.n_channels + n_stored), 13 * n_stored) + 60
@@ -74,15 +75,15 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     allowed = config.max_memory * 1e9
     left = allowed - PROGRAM_BYTES - n_cells * cell_bytes
     most_rays = UNBOUNDED_RAYS if field.unbounded else N_RAYS
-    n_rays = int(np.clip(left / RAY_BYTES, FEWEST_RAYS, most_rays))
-    room = allowed - PROGRAM_BYTES - n_rays * RAY_BYTES
+    n_rays = int(np.clip(left / ray_bytes, fewest, most_rays))
+    room = allowed - PROGRAM_BYTES - n_rays * ray_bytes
     if room <= 0 or PROGRAM_BYTES + marks > allowed:
-        least = (PROGRAM_BYTES + max(marks, FEWEST_RAYS * RAY_BYTES)) / 1e9
+        least = (PROGRAM_BYTES + max(marks, fewest * ray_bytes)) / 1e9
         raise ConfigError(
             f"max_memory: expected at least {least:.2f} GB for {resolution} cells per axis, got "
             f"{config.max_memory:g} GB: allow more, or lower --resolution"
         )
-    peak = PROGRAM_BYTES + max(marks, n_cells * cell_bytes + n_rays * RAY_BYTES)
+    peak = PROGRAM_BYTES + max(marks, n_cells * cell_bytes + n_rays * ray_bytes)
     return Plan(resolution, coarse, n_rays, int(room / cell_bytes), n_cells, int(min(peak, allowed)))
 
 
