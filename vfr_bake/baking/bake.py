@@ -152,9 +152,7 @@ class _Bake:
         model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = self._progress("visibility")
-            visible, step, left_out = find_cells(
-                model, self.config, plan.feature_resolution, self.held_out, progress
-            )
+            visible, step, left_out = find_cells(model, self.config, plan, self.held_out, progress)
         if left_out is not None:
             self.left_out["cells"] = left_out
         n_cells = int(np.count_nonzero(visible))

@@ -8,6 +8,7 @@ import numpy as np
 
 from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
 from vfr_bake.baking.culling import cull, whole
+from vfr_bake.baking.estimate import Plan
 from vfr_bake.baking.loss import HeldOut
 from vfr_bake.baking.visibility import Progress
 from vfr_bake.config import BakeConfig
@@ -26,12 +27,14 @@ class StoredCells(NamedTuple):
 
 
 def find_cells(
-    model: Model, config: BakeConfig, resolution: int, held_out: HeldOut, progress: Progress
+    model: Model, config: BakeConfig, plan: Plan, held_out: HeldOut, progress: Progress
 ) -> StoredCells:
-    """The cells of an object's box, or of contracted space, that matter in some view.
+    """The cells of an object's box, or of contracted space, that matter in some view; they are those of the
+    features' grid.
 
     Raises TrainingError when nothing is seen.
     """
+    resolution = plan.feature_resolution
     if model.field.config.unbounded:
         floor = config.weight_floor or WEIGHT_FLOOR
         visible = weighty_cells(model, resolution, floor, progress)
@@ -39,7 +42,7 @@ def find_cells(
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
             f"{floor:g}; part of the loss after 'grid'"
         )
-        return StoredCells(visible, lattice_step(resolution), left_out)
+        return StoredCells(visible, lattice_step(plan.resolution), left_out)
     step = float(model.occupancy.step)
     if config.no_cull:
         return StoredCells(whole(model, resolution).visible, step, None)
