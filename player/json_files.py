@@ -63,7 +63,7 @@ def brief(value: Any) -> str:
     >>> brief("two\\nlines, \\x1e, \\u00fc"), brief([1, None])
     ('two lines, \\\\x1e, \\\\xfc', '[1, None]')
     """
-    text = ascii(value)[1:-1] if isinstance(value, str) else ascii(value)
+    text = ascii(value if isinstance(value, str) else repr(value))[1:-1]  # nothing breaks the line
     text = text.replace("\\n", " ").replace("\\r", " ")
     return text if len(text) <= 80 else text[:77] + "..."
 
