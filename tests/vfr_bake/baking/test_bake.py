@@ -181,7 +181,8 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path
     grid = Asset.open(tmp_path / "asset").grid
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_samples)
-    hits, opacity, (counts, rows, shares, weights, lengths) = player_fetches(grid, rays_o, rays_d, n_samples)
+    hits, opacity, fetches = player_fetches(grid, rays_o, rays_d, n_samples)
+    counts, rows, shares, _, _, weights, lengths = fetches
     assert np.array_equal(hits, played.hits) and len(hits) > 100
     np.testing.assert_array_equal(opacity, played.opacity[hits])
     lessons = lessons_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
@@ -196,21 +197,25 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path
 def test_density_gradient_is_that_of_the_composite() -> None:
     # Against torch, on whole codes. Adagrad that has seen very steep slopes moves by rate * gradient / 1e15.
     random = np.random.default_rng(0)
-    n, n_vertices, k = 40, 200, 6
-    rows = random.integers(0, n_vertices, (n * k, 8)).astype(np.int32)
-    shares = random.random((n * k, 8)).astype(np.float32)
-    shares /= shares.sum(axis=1, keepdims=True)
+    n, n_vertices, n_densities, k = 40, 200, 300, 6
+
+    def corners(n_rows: int) -> tuple[np.ndarray, np.ndarray]:
+        shares = random.random((n * k, 8)).astype(np.float32)
+        return random.integers(0, n_rows, (n * k, 8)).astype(np.int32), shares / shares.sum(1, keepdims=True)
+
+    (rows, shares), of_densities = corners(n_vertices), corners(n_densities)
     starts = np.arange(0, n * k + 1, k)
-    density = random.integers(100, 200, n_vertices).astype(np.float32)
+    density = random.integers(100, 200, n_densities).astype(np.float32)
     values = random.integers(-90, 90, (n_vertices, 3)).astype(np.float32)
     low, slope = np.float32(-7), np.float32(0.05)
     lengths = random.uniform(0.02, 0.1, n * k).astype(np.float32)
     weights, opacity = np.zeros(n * k, np.float32), np.zeros(n, np.float32)
-    weigh(np.arange(n), starts, rows, shares, density, low, slope, lengths, np.float32(1e9), weights, opacity)
+    opaque = np.float32(1e9)
+    weigh(np.arange(n), starts, *of_densities, density, low, slope, lengths, opaque, weights, opacity)
     gx, ga = random.normal(size=(n, 3)).astype(np.float32), random.normal(size=n).astype(np.float32)
 
     latent = torch.tensor(density, dtype=torch.float64, requires_grad=True)
-    code = (latent[rows.astype(int)] * torch.from_numpy(shares).double()).sum(dim=1)
+    code = (latent[of_densities[0].astype(int)] * torch.from_numpy(of_densities[1]).double()).sum(dim=1)
     delta = (torch.exp(float(low) + float(slope) * code) * torch.from_numpy(lengths)).reshape(n, k)
     before = torch.cumsum(delta, dim=1) - delta
     w = torch.exp(-before) * -torch.expm1(-delta)
@@ -223,13 +228,14 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     assert latent.grad is not None
 
     # One lesson at a time: otherwise later lessons would start from where earlier ones moved the codes to.
-    moved = np.zeros(n_vertices)
+    moved = np.zeros(n_densities)
     for lesson in range(n):
         fresh = density.copy()
-        steepness = np.full(n_vertices, 1e30, np.float32)
+        steepness = np.full(n_densities, 1e30, np.float32)
         descend_density(
-            np.array([lesson]), starts, rows, shares, weights, opacity, values, gx[lesson : lesson + 1],
-            ga[lesson : lesson + 1], low, slope, lengths, np.float32(1e13), fresh, steepness,
+            np.array([lesson]), starts, rows, shares, *of_densities, weights, opacity, values,
+            gx[lesson : lesson + 1], ga[lesson : lesson + 1], low, slope, lengths, np.float32(1e13), fresh,
+            steepness,
         )  # fmt: skip
         moved += (density - fresh) * 100
     wanted = latent.grad.numpy()
