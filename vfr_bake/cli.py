@@ -226,7 +226,7 @@ def _bake(options: Any) -> int:
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes and {plan.n_bytes / 1e9:.1f} GB of memory at most, "
         f"densities on {plan.resolution} cells per axis and features on {plan.feature_resolution}, "
-        f"{plan.n_rays:,} rays to learn from",
+        f"about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )
     with Bars() as bars:

@@ -107,6 +107,7 @@ class _Bake:
         self.lookups: dict[str, float] = {}
         self.n_samples = self.choice.n_samples
         self.plan = make_plan(model, config)
+        self.n_rays = self.plan.n_rays(self.plan.n_cells)
         self._report = report
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)
@@ -162,6 +163,7 @@ class _Bake:
                 f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of {visible.size:,}: is the model "
                 "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
+        self.n_rays = plan.n_rays(n_cells)
         return make_layout(visible, step, plan.resolution, model.field.config.unbounded)
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
@@ -179,7 +181,7 @@ class _Bake:
         cameras = model.model_cameras()
         with self._part("teacher"):
             views = cameras + views_between(model, len(cameras), seed=1)
-            taught = teach(model, views, self.plan.n_rays, 0, self._progress("teacher"))
+            taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
             features = evaluate_features(model, layout, self._progress("features"))

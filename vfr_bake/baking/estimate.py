@@ -49,14 +49,32 @@ class Plan:
     """Cells per axis of the densities."""
     feature_resolution: int
     """Cells per axis of the features."""
-    n_rays: int
-    """Rays that are learned from."""
-    most_cells: int
-    """Of the features' grid: more do not fit."""
     n_cells: float
-    """Cells of it that are expected."""
-    n_bytes: int
-    """Peak of memory that is expected."""
+    """Cells of the features' grid that are expected to be stored."""
+    cell_bytes: float
+    """Of one of them, with its densities."""
+    unbounded: bool
+    room: float
+    """Bytes for cells and rays."""
+    marks: float
+    """Bytes while it is decided which cells are stored; the room is not taken yet."""
+
+    @property
+    def most_cells(self) -> int:
+        """More do not fit beside the fewest rays."""
+        return int((self.room - FEWEST_RAYS[self.unbounded] * RAY_BYTES[self.unbounded]) / self.cell_bytes)
+
+    def n_rays(self, n_cells: float) -> int:
+        """Rays that are learned from beside so many cells."""
+        left = (self.room - n_cells * self.cell_bytes) / RAY_BYTES[self.unbounded]
+        most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
+        return int(np.clip(left, FEWEST_RAYS[self.unbounded], most))
+
+    @property
+    def n_bytes(self) -> int:
+        """Peak of memory that is expected."""
+        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * RAY_BYTES[self.unbounded]
+        return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
 
 
 def make_plan(model: Model, config: BakeConfig) -> Plan:
@@ -66,25 +84,19 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     """
     choice, field = config.choice(), model.field.config
     resolution, coarse = _resolutions(model, config)
-    ray_bytes, fewest = RAY_BYTES[field.unbounded], FEWEST_RAYS[field.unbounded]
     marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
     n_stored = min(choice.n_channels, field.n_channels)
     cell_bytes = max(4 * (field.n_channels + n_stored), 13 * n_stored) + 60
     cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
-    n_cells = _cells(model, coarse)
-    allowed = config.max_memory * 1e9
-    left = allowed - PROGRAM_BYTES - n_cells * cell_bytes
-    most_rays = UNBOUNDED_RAYS if field.unbounded else N_RAYS
-    n_rays = int(np.clip(left / ray_bytes, fewest, most_rays))
-    room = allowed - PROGRAM_BYTES - n_rays * ray_bytes
-    if room <= 0 or PROGRAM_BYTES + marks > allowed:
-        least = (PROGRAM_BYTES + max(marks, fewest * ray_bytes)) / 1e9
+    room = config.max_memory * 1e9 - PROGRAM_BYTES
+    plan = Plan(resolution, coarse, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
+    if plan.most_cells <= 0 or marks > room:
+        least = max(marks, FEWEST_RAYS[field.unbounded] * RAY_BYTES[field.unbounded])
         raise ConfigError(
-            f"max_memory: expected at least {least:.2f} GB for {resolution} cells per axis, got "
-            f"{config.max_memory:g} GB: allow more, or lower --resolution"
+            f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {resolution} cells "
+            f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"
         )
-    peak = PROGRAM_BYTES + max(marks, n_cells * cell_bytes + n_rays * ray_bytes)
-    return Plan(resolution, coarse, n_rays, int(room / cell_bytes), n_cells, int(min(peak, allowed)))
+    return plan
 
 
 def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
@@ -130,7 +142,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         model.sampler.composited_features(model.field, rays_o, rays_d)
         times.append(time.perf_counter() - begin)
     finer = plan.resolution / plan.feature_resolution
-    work = plan.n_rays + VERTEX_COST * plan.n_cells * (1 + finer**3)
+    work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + finer**3)
     if model.field.config.unbounded:
         work += rays_of_contracted_views(model, plan.feature_resolution)
     elif not config.no_cull:
