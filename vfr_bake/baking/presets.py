@@ -52,8 +52,8 @@ PRESETS: dict[Preset, BakeChoice] = {
         target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.72, contracted_resolution=832, feature_share=0.64, culled_loss_db=0.04,
-        n_channels=18, channel_loss_db=0.12, n_samples=12, sample_loss_db=0.05, code_levels=50,
+        cells_per_pixel=1.55, contracted_resolution=832, feature_share=0.71, culled_loss_db=0.04,
+        n_channels=16, channel_loss_db=0.15, n_samples=12, sample_loss_db=0.05, code_levels=50,
         head_width=64, head_layers=3, head_bands=4, head_bits=32, refine_steps=2000, mesh_resolution=96,
         target_loss_db=0.4,
     ),
