@@ -21,8 +21,7 @@ from vfr_bake.training.model_file import Model
 N_RAYS = 500_000
 """Rays that head and stored values learn from: all of them meet something, and at many samples each."""
 HITS = 24
-"""Rays that meet a block of cells at the unit sphere over all views, on average. With 6, fox at 532 cells has
-holes: 1.3 dB lost before refinement, where 640 cells had 1.0."""
+"""Rays that meet a block of cells at the unit sphere over all views, on average."""
 BLOCK = 2
 """Cells along each edge of a block. Blocks are found whole: the model's proposals take their time, 4,000 rays
 a second of one core, and so a quarter of the rays is enough. Surfaces are some cells thick anyway."""

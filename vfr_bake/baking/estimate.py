@@ -24,10 +24,10 @@ PROGRAM_BYTES = 800_000_000
 """Of Python, torch, numba and the model itself."""
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
-FEWEST_RAYS = {False: 100_000, True: 50_000}
-RAY_BYTES = {False: 700, True: 6000}
+FEWEST_RAYS = {False: 100_000, True: 40_000}
+RAY_BYTES = {False: 700, True: 10_000}
 """Of a ray that is learned from, by whether the scene is unbounded: of an object a third meets something, at
-about 10 samples of 140 bytes, of a scene all, at 30, and while they are put together they are there twice."""
+about 10 samples of 140 bytes, of a scene all, at 33, and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
 FINE_MARKS = 4
