@@ -24,7 +24,7 @@ def forget_outdated(folder: Path) -> None:
     numba looks at the file of a function alone: after an update it would go on with what the function took
     from other files as they were, and compute something else without a word.
     """
-    newest = max(path.stat().st_mtime for path in folder.glob("*.py"))
+    newest = max((path.stat().st_mtime for path in folder.glob("*.py")), default=0.0)
     for kept in folder.glob("__pycache__/*.nbi"):
         with suppress(OSError):  # somebody else removed it, or it is not ours to remove
             if kept.stat().st_mtime <= newest:
