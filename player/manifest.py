@@ -1,17 +1,18 @@
 """The format `vfr-asset`, version 3.0: this docstring is its specification, the module parses and writes
 the manifest.
 
-An asset is a folder. It holds no absolute path and plays wherever it is moved.
+An asset is a folder. It holds no absolute path and plays wherever it is moved. What is packed is so as
+`player.packing` describes.
 
 | file | content |
 |---|---|
 | `manifest.json` | what is described below; UTF-8, keys sorted, at most 16 MiB |
 | `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
-| `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed likewise |
-| `density.codes` | uint8 [n_vertices], codes, packed as `player.packing` describes |
+| `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed |
+| `density.codes` | uint8 [n_vertices], codes, packed |
 | `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
-| `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored |
-| `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed in the same way |
+| `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored, packed |
+| `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed |
 | `head.onnx` | `features` [n, n_channels], `dirs` [n, 3] -> `rgb` [n, 3], float32 |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |

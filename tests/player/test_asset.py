@@ -21,6 +21,18 @@ from player.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_ma
 from player.packing import pack_codes, pack_masks, unpack_codes
 
 
+SMALLEST = Manifest(
+    generator="t",
+    resolution=6,
+    feature_resolution=6,
+    step=0.1,
+    density_range=(0, 1),
+    n_channels=1,
+    view_size=(1, 1),
+)
+"""Nothing that need not be said."""
+
+
 def parts(asset: Asset) -> tuple[Manifest, GridArrays, bytes, bytes, bytes]:
     rest = (asset.path(name).read_bytes() for name in ("head.onnx", "mesh.ply", "cameras.json"))
     return (asset.manifest, asset.arrays, *rest)
@@ -190,17 +202,8 @@ def test_vertices_beyond_the_grid(broken_folder: Path) -> None:
         np.zeros((0, 8), np.uint64),
         np.zeros((0, 1), np.int8),
     )
-    manifest = Manifest(
-        generator="t",
-        resolution=6,
-        feature_resolution=6,
-        step=0.1,
-        density_range=(0, 1),
-        n_channels=1,
-        view_size=(1, 1),
-    )
     with pytest.raises(FormatError, match="expected vertices up to 6, got one at 7"):
-        arrays.check(manifest, "")
+        arrays.check(SMALLEST, "")
 
 
 BAD_MANIFESTS: list[tuple[dict[str, Any], str]] = [
@@ -252,16 +255,7 @@ def test_bad_manifest(change: dict[str, Any], message: str, asset: Asset) -> Non
 
 
 def keys_of_a_manifest() -> list[str]:
-    smallest = Manifest(
-        generator="t",
-        resolution=6,
-        feature_resolution=6,
-        step=0.1,
-        density_range=(0, 1),
-        n_channels=1,
-        view_size=(1, 1),
-    )
-    return [key for key in json.loads(manifest_bytes(smallest)) if key != "format"]
+    return [key for key in json.loads(manifest_bytes(SMALLEST)) if key != "format"]
 
 
 @pytest.mark.parametrize("key", keys_of_a_manifest())
@@ -304,16 +298,7 @@ def test_not_a_manifest(data: bytes) -> None:
 
 
 def test_golden_manifest() -> None:
-    manifest = Manifest(
-        generator="t",
-        resolution=6,
-        feature_resolution=4,
-        step=0.5,
-        density_range=(0, 1),
-        n_channels=1,
-        view_size=(4, 3),
-        n_samples=0,
-    )
+    manifest = replace(SMALLEST, feature_resolution=4, step=0.5, view_size=(4, 3), n_samples=0)
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'

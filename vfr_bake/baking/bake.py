@@ -107,7 +107,7 @@ class _Bake:
         self.lookups: dict[str, float] = {}
         self.n_samples = self.choice.n_samples
         self.plan = make_plan(model, config)
-        self.n_rays = self.plan.n_rays(self.plan.n_cells)
+        self.n_rays: int
         self._report = report
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)

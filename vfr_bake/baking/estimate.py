@@ -60,20 +60,27 @@ class Plan:
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
 
     @property
+    def ray_bytes(self) -> int:
+        return RAY_BYTES[self.unbounded]
+
+    @property
+    def fewest_rays(self) -> int:
+        return FEWEST_RAYS[self.unbounded]
+
+    @property
     def most_cells(self) -> int:
         """More do not fit beside the fewest rays."""
-        return int((self.room - FEWEST_RAYS[self.unbounded] * RAY_BYTES[self.unbounded]) / self.cell_bytes)
+        return int((self.room - self.fewest_rays * self.ray_bytes) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
         """Rays that are learned from beside so many cells."""
-        left = (self.room - n_cells * self.cell_bytes) / RAY_BYTES[self.unbounded]
-        most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
-        return int(np.clip(left, FEWEST_RAYS[self.unbounded], most))
+        left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
+        return int(np.clip(left, self.fewest_rays, UNBOUNDED_RAYS if self.unbounded else N_RAYS))
 
     @property
     def n_bytes(self) -> int:
         """Peak of memory that is expected."""
-        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * RAY_BYTES[self.unbounded]
+        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * self.ray_bytes
         return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
 
 
@@ -91,7 +98,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     plan = Plan(resolution, coarse, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
     if plan.most_cells <= 0 or marks > room:
-        least = max(marks, FEWEST_RAYS[field.unbounded] * RAY_BYTES[field.unbounded])
+        least = max(marks, plan.fewest_rays * plan.ray_bytes)
         raise ConfigError(
             f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {resolution} cells "
             f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"
