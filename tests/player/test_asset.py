@@ -20,7 +20,6 @@ from player.errors import FormatError, IntegrityError, OutputError, VersionError
 from player.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
 from player.packing import pack_codes, pack_masks, unpack_codes
 
-
 SMALLEST = Manifest(
     generator="t",
     resolution=6,
