@@ -24,10 +24,11 @@ PROGRAM_BYTES = 800_000_000
 """Of Python, torch, numba and the model itself."""
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
-FEWEST_RAYS = {False: 100_000, True: 40_000}
-RAY_BYTES = {False: 700, True: 10_000}
-"""Of a ray that is learned from, by whether the scene is unbounded: of an object a third meets something, at
-about 10 samples of 140 bytes, of a scene all, at 33, and while they are put together they are there twice."""
+FEWEST_RAYS = 100_000
+RAY_BYTES = {False: 300, True: 1_900}
+"""Of a ray that is learned from, by whether the scene is unbounded: 168 bytes of what the model shows, and
+its samples, 20 bytes each; of an object a third meets something, at about 10 samples, of a scene all, at 33,
+and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
 FINE_MARKS = 4
@@ -64,18 +65,14 @@ class Plan:
         return RAY_BYTES[self.unbounded]
 
     @property
-    def fewest_rays(self) -> int:
-        return FEWEST_RAYS[self.unbounded]
-
-    @property
     def most_cells(self) -> int:
         """More do not fit beside the fewest rays."""
-        return int((self.room - self.fewest_rays * self.ray_bytes) / self.cell_bytes)
+        return int((self.room - FEWEST_RAYS * self.ray_bytes) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
         """Rays that are learned from beside so many cells."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
-        return int(np.clip(left, self.fewest_rays, UNBOUNDED_RAYS if self.unbounded else N_RAYS))
+        return int(np.clip(left, FEWEST_RAYS, UNBOUNDED_RAYS if self.unbounded else N_RAYS))
 
     @property
     def n_bytes(self) -> int:
@@ -98,7 +95,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     plan = Plan(resolution, coarse, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
     if plan.most_cells <= 0 or marks > room:
-        least = max(marks, plan.fewest_rays * plan.ray_bytes)
+        least = max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(
             f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {resolution} cells "
             f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"

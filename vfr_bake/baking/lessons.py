@@ -16,7 +16,7 @@ import numpy as np
 
 from player.cameras import Camera
 from player.errors import TrainingError
-from player.few_samples import MIN_TOTAL, Places, Samples, equal_mass_bins, heaviest
+from player.few_samples import MIN_TOTAL, Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
 from player.marches import sampled_rays
 from player.sparse_grid import SparseGrid
@@ -31,19 +31,34 @@ SOME = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons:
-    """n rays that meet something in the baked grid."""
+class Fetches:
+    """What n rays fetch, as `vfr_bake.kernels.stored_features` takes it."""
 
     starts: np.ndarray
-    """[n + 1] int64: lesson i has the fetches starts[i] to starts[i + 1]."""
+    """[n + 1] int64: ray i has the fetches starts[i] to starts[i + 1]."""
     rows: np.ndarray
-    """[n_fetches, 8] int32 rows of the stored arrays: the corners around each place."""
+    """[n_fetches, 8] int32 rows of the stored features: the corners around each place."""
     shares: np.ndarray
-    """[n_fetches, 8] float32 of the corners, 1 in all."""
+    """[n_fetches, 8] float32 of the corners, 1 in all, or 0 where too little is stored."""
     density_rows: np.ndarray
     """[n_fetches, 8] int32 rows of the stored densities in the same way; [0, 8] where they do not learn."""
     density_shares: np.ndarray
-    """[n_fetches, 8] float32, or [0, 8]."""
+    """[n_fetches, 8] float32, 0 of what is not stored; [0, 8] where they do not learn."""
+    weights: np.ndarray
+    """[n_fetches] float32 compositing weights."""
+    lengths: np.ndarray
+    """[n_fetches] float32 way that a sample stands for, model units."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons:
+    """n rays that meet something in the baked grid. They keep the places of their fetches, 20 bytes each; the
+    corners around them, 128 bytes, are found where a batch needs them."""
+
+    starts: np.ndarray
+    """[n + 1] int64: lesson i has the fetches starts[i] to starts[i + 1]."""
+    points: np.ndarray
+    """[n_fetches, 3] float32 places, cells of the densities' grid."""
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
@@ -56,22 +71,40 @@ class Lessons:
     """[n, 3] float32: the full model's colours times its opacity."""
     full_opacity: np.ndarray
     """[n] float32 of the full model."""
+    features: VertexRows
+    feature_scale: np.float32
+    """Cells of the features' grid in a cell of the densities'."""
+    densities: VertexRows | None
+    """Where they learn."""
 
     def __len__(self) -> int:
         return len(self.opacity)
 
-    def composed(self, codes: np.ndarray, some: np.ndarray | None = None, rounded: bool = True) -> np.ndarray:
-        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, of all lessons or
-        of those whose numbers are in `some`."""
-        some = np.arange(len(self)) if some is None else some
-        out = np.empty((len(some), codes.shape[1]), np.float32)
-        compose(some, self.starts, self.rows, self.shares, self.weights, codes, rounded, out)
+    def fetches(self, some: np.ndarray) -> Fetches:
+        """Those of the lessons whose numbers are in `some`, in that order."""
+        counts = self.starts[some + 1] - self.starts[some]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        index = np.repeat(self.starts[some] - starts[:-1], counts) + np.arange(starts[-1])
+        points = self.points[index]
+        of_features = _corners(self.features, points * self.feature_scale, MIN_TOTAL)
+        none = np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32)
+        of_densities = none if self.densities is None else _corners(self.densities, points, np.float32(0))
+        return Fetches(starts, *of_features, *of_densities, self.weights[index], self.lengths[index])
+
+    def composed(self, codes: np.ndarray) -> np.ndarray:
+        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded."""
+        out = np.empty((len(self), codes.shape[1]), np.float32)
+        for first in range(0, len(self), RAYS_AT_ONCE):
+            some = np.arange(first, min(first + RAYS_AT_ONCE, len(self)))
+            compose_into(self.fetches(some), codes, out[some[0] : some[-1] + 1])
         return out
 
     def typical(self, codes: np.ndarray) -> np.ndarray:
         """[n_channels] mean size of the composites of `codes`, of some lessons; never 0."""
         some = np.arange(min(SOME, len(self))) * len(self) // min(SOME, len(self))
-        return np.maximum(np.abs(self.composed(codes, some)).mean(axis=0), 1e-3)
+        out = np.empty((len(some), codes.shape[1]), np.float32)
+        compose_into(self.fetches(some), codes, out)
+        return np.maximum(np.abs(out).mean(axis=0), 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,30 +158,25 @@ def collect_lessons(
     parts = []
     for first in range(0, len(taught.opacity), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        rays = taught.rays_o[rows], taught.rays_d[rows]
-        hits, opacity, fetches = player_fetches(grid, *rays, n_samples, densities)
+        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_samples)
         of_hits = (column[rows][hits] for column in (taught.rays_d, taught.colours, taught.opacity))
         dirs, colours, full_opacity = of_hits
         parts.append((*fetches, dirs, opacity, colours, full_opacity))
     if sum(len(part[0]) for part in parts) == 0:
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return Lessons(np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)]), *columns[1:])
+    starts = np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)])
+    return Lessons(starts, *columns[1:], grid.rows, grid.feature_scale, densities)
 
 
 def player_fetches(
-    grid: SparseGrid,
-    rays_o: np.ndarray,
-    rays_d: np.ndarray,
-    n_samples: int,
-    densities: VertexRows | None = None,
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """The linear map from stored codes to the composites of the rays that hit, as `player.march` composes
-    them.
+    """Where the player fetches features on the rays that hit, and how much each fetch weighs, as
+    `player.march` composes them.
 
-    Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], rows [n_fetches, 8],
-    shares [n_fetches, 8], rows and shares of the densities, weights [n_fetches], lengths [n_fetches]); of
-    the densities there are none without `densities`.
+    Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], places [n_fetches, 3]
+    float32 in cells of the densities' grid, weights [n_fetches], lengths [n_fetches]).
     """
     entries, samples, tau = sampled_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
@@ -163,7 +191,8 @@ def player_fetches(
         many = Samples(*(column[merged] for column in samples))
         bins = equal_mass_bins(many, n_samples)
         places = bins.s.copy()
-        gaps = np.flatnonzero(_feature_corners(grid, entries, bins.ray, places)[1].sum(axis=1) < MIN_TOTAL)
+        points = np.ascontiguousarray(entries.at(bins.ray, places).T)
+        gaps = np.flatnonzero(~_corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
         if len(gaps):
             places[gaps] = many.s[heaviest(bins, gaps)]
         ray = np.concatenate([ray, bins.ray])
@@ -171,30 +200,23 @@ def player_fetches(
         weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_samples)])
         order = np.argsort(ray, kind="stable")
         ray, s, weights = ray[order], s[order], weights[order]
-    rows, shares = _feature_corners(grid, entries, ray, s)
-    total = shares.sum(axis=1)
-    stored = total >= MIN_TOTAL
-    shares /= np.where(stored, total, 1)[:, None]
-    weights = np.where(stored, weights, np.float32(0)).astype(np.float32)
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    none = np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32)
-    of_densities = none if densities is None else _corners(densities, entries.at(ray, s))
-    lengths = entries.lengths(ray, s)
-    return hits, opacity[hits], (counts, rows, shares, *of_densities, weights, lengths)
+    points = np.ascontiguousarray(entries.at(ray, s).T)
+    return hits, opacity[hits], (counts, points, weights.astype(np.float32), entries.lengths(ray, s))
 
 
-def _feature_corners(
-    grid: SparseGrid, entries: Places, ray: np.ndarray, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    return _corners(grid.rows, entries.at(ray, s) * grid.feature_scale)
+def compose_into(fetches: Fetches, codes: np.ndarray, out: np.ndarray) -> None:
+    """Composites [n, n_channels] float32 of `codes` [n_vertices, n_channels] float32, rounded, into `out`."""
+    compose(fetches.starts, fetches.rows, fetches.shares, fetches.weights, codes, out)
 
 
-def _corners(vertices: VertexRows, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and shares [n, 8] of the corners around `points` [3, n], cells of the vertices' own grid."""
-    n = points.shape[1]
+def _corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and shares [n, 8] of the corners around `points` [n, 3] float32, cells of the vertices' own
+    grid."""
+    n = len(points)
     rows, shares = np.empty((n, 8), np.int32), np.empty((n, 8), np.float32)
     corner_rows(
-        np.ascontiguousarray(points, np.float32), vertices.resolution, vertices.n_per_axis, vertices.bricks,
-        vertices.base, vertices.ranks, ABSENT, rows, shares,
+        points, vertices.resolution, vertices.n_per_axis, vertices.bricks, vertices.base, vertices.ranks,
+        ABSENT, least, rows, shares,
     )  # fmt: skip
     return rows, shares

@@ -19,7 +19,7 @@ from torch.nn.functional import gelu
 from exporters.onnx_head import HeadWeights, Layer
 from player.march import MAX_TAU
 from player.sparse_grid import SparseGrid
-from vfr_bake.baking.lessons import Lessons
+from vfr_bake.baking.lessons import Lessons, compose_into
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 from vfr_bake.kernels.stored_features import descend, descend_density, weigh
 
@@ -70,33 +70,36 @@ def refine(
     head = FoldedHead(stored.head, UNIT * typical)
     features, density = stored.features.copy(), stored.density.copy()
     steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
-    where = (lessons.starts, lessons.rows, lessons.shares)
-    of_densities = (lessons.density_rows, lessons.density_shares)
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in range(n_steps):
         falling = np.float32(0.5 * (1 + np.cos(np.pi * step / n_steps)))
         adam.param_groups[0]["lr"] = float(head_rate * falling)
         some = random.integers(0, len(lessons), BATCH)
+        fetches, of_grid = lessons.fetches(some), lessons.opacity[some]
+        of_densities = (fetches.density_rows, fetches.density_shares)
         if grid is not None:
             weigh(
-                some, lessons.starts, *of_densities, density, grid.density_low, grid.density_slope,
-                lessons.lengths, MAX_TAU, lessons.weights, lessons.opacity,
+                fetches.starts, *of_densities, density, grid.density_low, grid.density_slope,
+                fetches.lengths, MAX_TAU, fetches.weights, of_grid,
             )  # fmt: skip
-        composed = torch.from_numpy(lessons.composed(features, some)).requires_grad_(code_rate > 0)
-        opacity = torch.from_numpy(lessons.opacity[some]).requires_grad_(grid is not None)
+        codes = np.empty((BATCH, features.shape[1]), np.float32)
+        compose_into(fetches, features, codes)
+        composed = torch.from_numpy(codes).requires_grad_(code_rate > 0)
+        opacity = torch.from_numpy(of_grid).requires_grad_(grid is not None)
         adam.zero_grad(set_to_none=True)
         _loss(head, composed, opacity, lessons, some).backward()
         adam.step()
+        where = (fetches.starts, fetches.rows, fetches.shares)
         if grid is not None:
             assert composed.grad is not None and opacity.grad is not None
             descend_density(
-                some, *where, *of_densities, lessons.weights, lessons.opacity, features,
+                *where, *of_densities, fetches.weights, of_grid, features,
                 composed.grad.numpy(), opacity.grad.numpy(), grid.density_low, grid.density_slope,
-                lessons.lengths, np.float32(DENSITY_RATE) * falling, density, steep_density,
+                fetches.lengths, np.float32(DENSITY_RATE) * falling, density, steep_density,
             )  # fmt: skip
         if composed.grad is not None:
             rate = np.float32(code_rate) * falling
-            descend(some, *where, lessons.weights, composed.grad.numpy(), rate, features, steep)
+            descend(*where, fetches.weights, composed.grad.numpy(), rate, features, steep)
         if step % 50 == 49 or step == n_steps - 1:
             progress(step + 1, n_steps)
     return Stored(head.weights(), features, density)

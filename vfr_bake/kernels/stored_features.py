@@ -1,6 +1,6 @@
 """Stored codes as the player composes them, and their descent along a gradient.
 
-Letters: lesson i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
+Letters: ray i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
 weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
 x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
 of a ray, weights follow from the density codes q_j, which are interpolated in the same way on a grid of their
@@ -16,31 +16,29 @@ import numpy as np
 from numba import njit, prange
 
 BLOCK = 64
-"""Lessons that a thread takes at a time."""
+"""Rays that a thread takes at a time."""
 
 
 @njit(parallel=True, cache=True)
-def compose(lessons, starts, rows, shares, weights, latent, rounded, out):
-    """out [n, n_channels] of `lessons` [n], from the latent codes [n_vertices, n_channels], rounded or
-    not."""
+def compose(starts, rows, shares, weights, latent, out):
+    """out [n, n_channels] of all rays, from the latent codes [n_vertices, n_channels], rounded."""
     n_channels = latent.shape[1]
-    for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
-        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
+    for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
+        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
             for c in range(n_channels):
                 out[i, c] = np.float32(0)
-            for j in range(starts[lessons[i]], starts[lessons[i] + 1]):
+            for j in range(starts[i], starts[i + 1]):
                 for corner in range(8):
                     share = weights[j] * shares[j, corner]
                     if share == 0:
                         continue
                     row = rows[j, corner]
                     for c in range(n_channels):
-                        code = np.rint(latent[row, c]) if rounded else latent[row, c]
-                        out[i, c] += share * code
+                        out[i, c] += share * np.rint(latent[row, c])
 
 
 @njit(cache=True)
-def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, steepness):
+def descend(starts, rows, shares, weights, gradient, rate, latent, steepness):
     """One step of Adagrad on `latent`, in place, codes kept within -127..127.
 
     `gradient` [n, n_channels] is that of the composites; `steepness` [n_vertices] collects the mean square of
@@ -48,14 +46,14 @@ def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, stee
     """
     n_channels = latent.shape[1]
     low, high = np.float32(-127), np.float32(127)
-    for i in range(lessons.shape[0]):
+    for i in range(gradient.shape[0]):
         square = np.float32(0)
         for c in range(n_channels):
             square += gradient[i, c] * gradient[i, c]
         if square == 0:
             continue
         square /= np.float32(n_channels)
-        for j in range(starts[lessons[i]], starts[lessons[i] + 1]):
+        for j in range(starts[i], starts[i + 1]):
             for corner in range(8):
                 share = weights[j] * shares[j, corner]
                 if share == 0:
@@ -68,14 +66,13 @@ def descend(lessons, starts, rows, shares, weights, gradient, rate, latent, stee
 
 
 @njit(parallel=True, cache=True)
-def weigh(lessons, starts, rows, shares, latent, low, slope, lengths, opaque, weights, opacity):
-    """Weights of the fetches of `lessons`, and their opacity, from the latent density codes [n_vertices];
+def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, opacity):
+    """Weights of the fetches of all rays, and the rays' opacity, from the latent density codes [n_vertices];
     both in place. Behind the optical depth `opaque` nothing weighs."""
-    for chunk in prange((lessons.shape[0] + BLOCK - 1) // BLOCK):
-        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, lessons.shape[0])):
-            lesson = lessons[i]
+    for chunk in prange((opacity.shape[0] + BLOCK - 1) // BLOCK):
+        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, opacity.shape[0])):
             tau = np.float32(0)
-            for j in range(starts[lesson], starts[lesson + 1]):
+            for j in range(starts[i], starts[i + 1]):
                 if tau > opaque:
                     weights[j] = np.float32(0)
                     continue
@@ -85,12 +82,12 @@ def weigh(lessons, starts, rows, shares, latent, low, slope, lengths, opaque, we
                 delta = np.exp(low + slope * code) * lengths[j]
                 weights[j] = -np.exp(-tau) * np.expm1(-delta)
                 tau += delta
-            opacity[lesson] = -np.expm1(-tau)
+            opacity[i] = -np.expm1(-tau)
 
 
 @njit(cache=True)
 def descend_density(
-    lessons, starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
+    starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
     gradient_of_opacity, low, slope, lengths, rate, latent, steepness,
 ):  # fmt: skip
     """One step of Adagrad on the latent density codes [n_densities], in place, kept within 0..255.
@@ -101,9 +98,8 @@ def descend_density(
     """
     n_channels = values.shape[1]
     along = np.zeros(4096, np.float32)
-    for i in range(lessons.shape[0]):
-        lesson = lessons[i]
-        first, end = starts[lesson], starts[lesson + 1]
+    for i in range(gradient.shape[0]):
+        first, end = starts[i], starts[i + 1]
         n = min(end - first, along.shape[0])
         behind = np.float32(0)
         for j in range(n):
@@ -117,7 +113,7 @@ def descend_density(
             along[j] = total
             behind += weights[first + j] * total
         trans = np.float32(1)
-        left = np.float32(1) - opacity[lesson]
+        left = np.float32(1) - opacity[i]
         for j in range(n):
             weight = weights[first + j]
             if weight == 0:
@@ -140,18 +136,23 @@ def descend_density(
 
 
 @njit(parallel=True, cache=True)
-def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, rows, shares):
-    """The stored corners around `points` [3, n] float32 of the grid (cells): `rows` [n, 8] of features.codes
-    and trilinear `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states."""
+def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, least, rows, shares):
+    """The stored corners around `points` [n, 3] float32 of a grid (cells): `rows` [n, 8] and trilinear
+    `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states.
+
+    With a `least` above 0, shares are of what is stored: divided by their sum, and all 0 where that is
+    below it.
+    """
     size = np.float32(resolution)
     one = np.float32(1)
     last = resolution - 1
-    for i in prange(points.shape[1]):
-        gx = min(max(points[0, i], np.float32(0)), size)
-        gy = min(max(points[1, i], np.float32(0)), size)
-        gz = min(max(points[2, i], np.float32(0)), size)
+    for i in prange(points.shape[0]):
+        gx = min(max(points[i, 0], np.float32(0)), size)
+        gy = min(max(points[i, 1], np.float32(0)), size)
+        gz = min(max(points[i, 2], np.float32(0)), size)
         x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
         fx, fy, fz = gx - np.float32(x), gy - np.float32(y), gz - np.float32(z)
+        total = np.float32(0)
         for corner in range(8):
             ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
             vx, vy, vz = x + ix, y + iy, z + iz
@@ -165,3 +166,8 @@ def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, row
                 continue
             rows[i, corner] = base[brick] + rank
             shares[i, corner] = (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
+            total += shares[i, corner]
+        if least > 0:
+            scale = one / total if total >= least else np.float32(0)
+            for corner in range(8):
+                shares[i, corner] *= scale

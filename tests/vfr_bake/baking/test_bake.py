@@ -16,9 +16,11 @@ import torch
 from exporters.onnx_head import head_onnx
 from exporters.ply import read_ply
 from player.asset import Asset
+from player.bricks import pack_vertices
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march import march
 from player.render import render
+from player.vertex_rows import vertex_rows
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.budget import SMALL_FILES
 from vfr_bake.baking.head_weights import fold_head
@@ -135,13 +137,14 @@ def test_the_trainable_head_is_the_exported_one() -> None:
 
 
 def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lessons:
-    """One fetch a lesson, each of its own vertex."""
+    """One fetch a lesson, each of its own vertex of a grid of 16 cells."""
     n = len(codes)
-    rows = np.repeat(np.arange(n, dtype=np.int32)[:, None], 8, axis=1)
-    shares = np.zeros((n, 8), np.float32)
-    shares[:, 3] = 1
-    ones = np.ones(n, np.float32)
-    return Lessons(np.arange(n + 1), rows, shares, rows, shares, ones, ones, dirs, ones.copy(), wanted, ones)
+    coords, masks, order = pack_vertices(np.argwhere(np.ones((16, 16, 16)))[:n])
+    points = np.argwhere(np.ones((16, 16, 16)))[:n][order].astype(np.float32)
+    rows, ones = vertex_rows(coords, masks, 16), np.ones(n, np.float32)
+    return Lessons(
+        np.arange(n + 1), points, ones, ones, dirs, ones.copy(), wanted, ones, rows, np.float32(1), rows
+    )
 
 
 def test_refinement_brings_the_head_back_to_its_teacher() -> None:
@@ -182,12 +185,13 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_samples)
     hits, opacity, fetches = player_fetches(grid, rays_o, rays_d, n_samples)
-    counts, rows, shares, _, _, weights, lengths = fetches
+    counts, points, weights, lengths = fetches
     assert np.array_equal(hits, played.hits) and len(hits) > 100
     np.testing.assert_array_equal(opacity, played.opacity[hits])
     lessons = lessons_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
     starts = np.concatenate([[0], np.cumsum(counts)])
-    lessons = replace(lessons, starts=starts, rows=rows, shares=shares, weights=weights)
+    lessons = replace(lessons, starts=starts, points=points, weights=weights, lengths=lengths)
+    lessons = replace(lessons, features=grid.rows, feature_scale=grid.feature_scale)
     assert (lengths == grid.step).all()
     composed = lessons.composed(grid.features.astype(np.float32))
     # float32 sums of up to 127 in another order
@@ -211,7 +215,7 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     lengths = random.uniform(0.02, 0.1, n * k).astype(np.float32)
     weights, opacity = np.zeros(n * k, np.float32), np.zeros(n, np.float32)
     opaque = np.float32(1e9)
-    weigh(np.arange(n), starts, *of_densities, density, low, slope, lengths, opaque, weights, opacity)
+    weigh(starts, *of_densities, density, low, slope, lengths, opaque, weights, opacity)
     gx, ga = random.normal(size=(n, 3)).astype(np.float32), random.normal(size=n).astype(np.float32)
 
     latent = torch.tensor(density, dtype=torch.float64, requires_grad=True)
@@ -232,10 +236,10 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     for lesson in range(n):
         fresh = density.copy()
         steepness = np.full(n_densities, 1e30, np.float32)
+        one = slice(lesson, lesson + 1)
         descend_density(
-            np.array([lesson]), starts, rows, shares, *of_densities, weights, opacity, values,
-            gx[lesson : lesson + 1], ga[lesson : lesson + 1], low, slope, lengths, np.float32(1e13), fresh,
-            steepness,
+            starts[lesson : lesson + 2], rows, shares, *of_densities, weights, opacity[one], values, gx[one],
+            ga[one], low, slope, lengths, np.float32(1e13), fresh, steepness,
         )  # fmt: skip
         moved += (density - fresh) * 100
     wanted = latent.grad.numpy()

@@ -137,7 +137,8 @@ def test_a_lesson_composes_what_the_player_composes(model: Model, folder: Path, 
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=5e-3)
     np.testing.assert_allclose(lessons.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
     if k == 0:  # the ways of the samples are what makes their weights
-        code = (lessons.density_shares * _codes(folder)[lessons.density_rows]).sum(axis=1)
+        fetches = lessons.fetches(np.arange(len(lessons)))
+        code = (fetches.density_shares * _codes(folder)[fetches.density_rows]).sum(axis=1)
         optical = np.exp(grid.density_low + grid.density_slope * code) * lessons.lengths
         first = lessons.starts[:-1]
         np.testing.assert_allclose(-np.expm1(-optical[first]), lessons.weights[first], rtol=1e-3, atol=1e-6)
