@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to wait)
+
 # A deadline measures the machine, not the code.
 settings.register_profile("any_machine", deadline=None)
 settings.load_profile("any_machine")
