@@ -1,6 +1,6 @@
-"""Reading a sparse grid in compiled code: densities at samples, fetches of features.
+"""Fetches of features in compiled code: where, and what.
 
-Every function has its readable twin in `player.march` or `player.few_samples`.
+Every function has its readable twin in `player.few_samples`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,10 @@ import math
 import numpy as np
 
 from player.compiling import inlined
+from player.eight_rows import CHANNELS, add_rows
 from player.few_samples import MIN_TOTAL
-from player.vertex_rows import ABSENT
-
-try:
-    from player.eight_rows import LANES, add_rows
-except ImportError:  # without numba nothing here runs compiled, and nobody calls it
-    LANES = 1
+from player.lanes import LANES
+from player.packets import stored_corners
 
 F32 = np.float32
 
@@ -27,29 +24,6 @@ def opacity_of(tau):
     if tau < F32(1e-5):
         return tau - F32(0.5) * tau * tau
     return F32(1.0 - math.exp(-np.float64(tau)))
-
-
-@inlined
-def weight_of(optical, trans, behind):
-    """trans (1 - exp(-optical)) without the cost of expm1: where that does not cancel the difference to
-    `behind`, which is trans exp(-optical), else four terms."""
-    if optical > F32(0.1):
-        return trans - behind
-    series = F32(1) - optical * (F32(1 / 2) - optical * (F32(1 / 6) - optical * F32(1 / 24)))
-    return trans * optical * series
-
-
-@inlined
-def trilinear(density, at, fx, fy, fz):
-    """Codes between the corners of a cell: along z, then y, then x."""
-    c000, c001 = F32(density[at]), F32(density[at + 1])
-    c010, c011 = F32(density[at + 9]), F32(density[at + 10])
-    c100, c101 = F32(density[at + 81]), F32(density[at + 82])
-    c110, c111 = F32(density[at + 90]), F32(density[at + 91])
-    c00, c01 = c000 + (c001 - c000) * fz, c010 + (c011 - c010) * fz
-    c10, c11 = c100 + (c101 - c100) * fz, c110 + (c111 - c110) * fz
-    c0, c1 = c00 + (c01 - c00) * fy, c10 + (c11 - c10) * fy
-    return c0 + (c1 - c0) * fx
 
 
 @inlined
@@ -83,96 +57,89 @@ def equal_mass(scratch_s, scratch_w, n, total, k, places):
         places[0, bin_] = F32(moment / share)
 
 
+def scratch_arrays(capacity: int, k: int) -> tuple[np.ndarray, ...]:
+    """For the samples of one ray, at most `capacity`: s, weight, another place; and [2, k] for
+    `equal_mass`."""
+    return *(np.empty(capacity, F32) for _ in range(3)), np.empty((2, max(k, 1)), F32)
+
+
 @inlined
-def fetch(stored, sizes, point, direction, s, weight, corners, out):
-    """Add `weight` times the features at s to `out`; False, and nothing added, where too little is
-    stored."""
-    resolution, n_per_axis, scale = sizes
+def samples_of_ray(samples, n_rows, lane, scratch):
+    """What `player.packets` found on one ray into the scratch arrays: how many samples with weight, and the
+    sums of w and of w s."""
+    scratch_s, scratch_w, _, _ = scratch
+    n, total, moment = 0, 0.0, 0.0
+    for row in range(n_rows):
+        weight = samples[1, row, lane]
+        if weight > F32(0.0):
+            s = samples[0, row, lane]
+            scratch_s[n], scratch_w[n] = s, weight
+            n += 1
+            total += weight
+            moment += np.float64(weight) * s
+    return n, total, moment
+
+
+@inlined
+def choose_fetches(scratch, n, total, mass, k):
+    """From the n samples of a ray to its fetches, in place; returns their number. The other place of a fetch
+    is not a number where it has none."""
+    scratch_s, scratch_w, others, places = scratch
+    if k == 0 or n <= k:
+        others[:n] = F32(np.nan)
+        return n
+    equal_mass(scratch_s, scratch_w, n, total, k, places)
+    for j in range(k):
+        scratch_s[j], scratch_w[j], others[j] = places[0, j], mass / F32(k), places[1, j]
+    return k
+
+
+def queue_arrays() -> tuple[np.ndarray, ...]:
+    """LANES fetches: places [3, LANES] in cells of the densities' grid, weights, rows of the features they
+    are added to, lanes of the packet, s of other places; and [8, LANES] and [9, LANES] for
+    `stored_corners`."""
+    numbers = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    corners = np.empty((8, LANES), np.int32), np.empty((9, LANES), F32)
+    return np.zeros((3, LANES), F32), np.empty(LANES, F32), *numbers, np.empty(LANES, F32), *corners
+
+
+@inlined
+def enqueue(queue, at, place, weight, row, lane, other):
+    places, weights, into, lanes, others, _, _ = queue
+    places[0, at], places[1, at], places[2, at] = place
+    weights[at], into[at], lanes[at], others[at] = weight, row, lane, other
+
+
+@inlined
+def add_fetches(stored, sizes, queue, n, out):
+    """Add the first n fetches of the queue to their rows of `out`. Returns how many of them found too little
+    stored but have another place to be tried: they are now the first of the queue."""
+    places, weights, into, lanes, others, rows, shares = queue
     bricks, base, ranks, features = stored
-    rows, shares = corners
-    size = F32(resolution)
-    gx = min(max((point[0] + s * direction[0]) * scale, F32(0.0)), size)
-    gy = min(max((point[1] + s * direction[1]) * scale, F32(0.0)), size)
-    gz = min(max((point[2] + s * direction[2]) * scale, F32(0.0)), size)
-    last = resolution - 1
-    x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
-    fx, fy, fz = gx - F32(x), gy - F32(y), gz - F32(z)
-    held = np.int64(bricks[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)])
-    if max(x & 7, max(y & 7, z & 7)) < 7 and held >= 0:
-        total = _corners_of_brick(base[held], ranks, held * 512 + _bit(x, y, z), (fx, fy, fz), rows, shares)
-    else:
-        total = _corners(stored, n_per_axis, (x, y, z), (fx, fy, fz), rows, shares)
-    if total < MIN_TOTAL:
-        return False
-    _add(features, rows, shares, weight / total, out)
-    return True
-
-
-@inlined
-def _bit(x, y, z):
-    return (x & 7) * 64 + (y & 7) * 8 + (z & 7)
-
-
-@inlined
-def _corners_of_brick(first, ranks, at, fraction, rows, shares):
-    """Rows and interpolation weights of the corners of a cell within one brick; returns the weights' sum.
-
-    Of what is not stored the weight is 0.
-    """
-    total = F32(0.0)
-    for corner in range(8):
-        ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
-        rank = np.int64(ranks[at + (ix * 64 + iy * 8 + iz)])
-        rows[corner] = first + rank if rank != ABSENT else 0
-        shares[corner] = _share(fraction, ix, iy, iz) if rank != ABSENT else F32(0.0)
-        total += shares[corner]
-    return total
-
-
-@inlined
-def _corners(stored, n_per_axis, cell, fraction, rows, shares):
-    """`_corners_of_brick` for a cell whose corners lie in several bricks."""
-    bricks, base, ranks, _ = stored
-    total = F32(0.0)
-    for corner in range(8):
-        ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
-        vx, vy, vz = cell[0] + ix, cell[1] + iy, cell[2] + iz
-        brick = np.int64(bricks[((vx >> 3) * n_per_axis + (vy >> 3)) * n_per_axis + (vz >> 3)])
-        rows[corner] = 0
-        shares[corner] = F32(0.0)
-        if brick >= 0:
-            rank = np.int64(ranks[brick * 512 + _bit(vx, vy, vz)])
-            if rank != ABSENT:
-                rows[corner] = base[brick] + rank
-                shares[corner] = _share(fraction, ix, iy, iz)
-                total += shares[corner]
-    return total
-
-
-@inlined
-def _share(fraction, ix, iy, iz):
-    fx, fy, fz = fraction
-    return (fx if ix else F32(1.0) - fx) * (fy if iy else F32(1.0) - fy) * (fz if iz else F32(1.0) - fz)
-
-
-@inlined
-def _add(features, rows, shares, scale, out):
-    """Add `scale` times the weighted rows to `out`, in registers where there is room to read and write
-    them whole."""
+    stored_corners((bricks, base, ranks), sizes, places, rows, shares)
     n_channels = features.shape[1]
-    wide = out.shape[1] // LANES * LANES
-    last = max(
-        max(max(rows[0], rows[1]), max(rows[2], rows[3])), max(max(rows[4], rows[5]), max(rows[6], rows[7]))
-    )
-    if n_channels <= wide and last * n_channels + wide <= features.size:
-        eight = (rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7])
-        parts = (
-            shares[0] * scale, shares[1] * scale, shares[2] * scale, shares[3] * scale,
-            shares[4] * scale, shares[5] * scale, shares[6] * scale, shares[7] * scale,
-        )  # fmt: skip
-        for first in range(0, n_channels, LANES):
-            add_rows(features, eight, parts, out, first)
-        return
-    for corner in range(8):
-        for c in range(n_channels):
-            out[0, c] += shares[corner] * scale * features[rows[corner], c]
+    left = 0
+    for j in range(n):
+        total = shares[8, j]
+        if total < MIN_TOTAL:
+            if not math.isnan(others[j]):
+                weights[left], into[left], lanes[left], others[left] = (
+                    weights[j],
+                    into[j],
+                    lanes[j],
+                    others[j],
+                )
+                left += 1
+            continue
+        scale = weights[j] / total
+        last = 0
+        for corner in range(8):
+            last = max(last, rows[corner, j])
+        if last * n_channels + out.shape[1] <= features.size:
+            for first in range(0, n_channels, CHANNELS):
+                add_rows(features, rows, shares, j, scale, out, into[j], first)
+        else:  # there is not enough behind the last rows to be read in whole registers
+            for corner in range(8):
+                for c in range(n_channels):
+                    out[into[j], c] += shares[corner, j] * scale * features[rows[corner, j], c]
+    return left

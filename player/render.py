@@ -276,9 +276,11 @@ def check_size(width: int, height: int) -> None:
 def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
     """Name and module of a march through a box, or through contracted space."""
     if name != "numpy":
-        from player import compiling, contracted_march_compiled, march_compiled
+        from player import compiling
 
         if compiling.available():
+            from player import contracted_march_compiled, march_compiled
+
             return "numba", contracted_march_compiled if contracted else march_compiled
         if name == "numba":
             raise MissingExtraError(

@@ -7,7 +7,7 @@ cell. Everything is flat, so that one integer addresses it, in numpy as in compi
                                    bricks, to the nearest brick with a live cell (at most MAX_DISTANCE)
     live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
     density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
-                                   that the eight corners of a cell are in one brick
+                                   that the eight corners of a cell are in one brick; SPARE bytes follow
     features   [n_vertices, C] int8, the vertices of a grid of its own over the same box, whose rows `rows`
                                    finds
 """
@@ -21,6 +21,9 @@ import numpy as np
 from player.bricks import BRICK, bricks_per_axis, dense_index, live_cells, neighbours, stored_bits
 from player.density import decode_constants
 from player.vertex_rows import VertexRows, vertex_rows
+
+SPARE = 2
+"""Bytes behind the densities: compiled code reads whole words."""
 
 MAX_DISTANCE = 31
 """Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
@@ -132,13 +135,15 @@ def _with_apron(
     )  # the last row stands for every brick that is not there
     dense[:-1][stored] = density
     dense = dense.reshape(-1, BRICK, BRICK, BRICK)
-    apron = np.zeros((len(chosen), BRICK + 1, BRICK + 1, BRICK + 1), np.uint8)
+    n_apron = (BRICK + 1) ** 3 * len(chosen)
+    flat = np.zeros(n_apron + SPARE, np.uint8)
+    apron = flat[:n_apron].reshape(-1, BRICK + 1, BRICK + 1, BRICK + 1)
     for offset in np.ndindex(2, 2, 2):
         source = neighbours(coords[chosen], index, offset)
         into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
         take = tuple(slice(1) if o else slice(None) for o in offset)
         apron[(slice(None), *into)] = dense[(slice(None), *take)][source]
-    return apron.reshape(-1)
+    return flat
 
 
 def _table(slot_coords: np.ndarray, n_per_axis: int) -> np.ndarray:

@@ -34,7 +34,10 @@ LAZY = {
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
 TOP_LEVEL_EXCEPTIONS = {
-    *((f"player/{name}.py", "numba") for name in ("compiling", "eight_rows", "dense_tiles")),
+    *(
+        (f"player/{name}.py", "numba")
+        for name in ("compiling", "dense_tiles", "eight_rows", "lanes", "packets")
+    ),
     ("vfr_bake/options.py", "tyro"),
 }
 

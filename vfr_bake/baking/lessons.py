@@ -166,7 +166,9 @@ def collect_lessons(
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     starts = np.concatenate([[0], np.cumsum(columns[0], dtype=np.int64)])
-    return Lessons(starts, *columns[1:], grid.rows, grid.feature_scale, densities)
+    return Lessons(
+        starts, *columns[1:], features=grid.rows, feature_scale=grid.feature_scale, densities=densities
+    )
 
 
 def player_fetches(
