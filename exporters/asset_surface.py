@@ -138,7 +138,7 @@ def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _code_level(grid: SparseGrid, level: float | None) -> float:
-    if not len(grid.density) or not grid.live.any():
+    if not grid.live.any():
         raise DataError("surface: expected an asset with live cells, got none")
     low, slope = float(grid.density_low), float(grid.density_slope)
     lowest, highest = _stored_range(grid)
@@ -157,7 +157,7 @@ def _code_level(grid: SparseGrid, level: float | None) -> float:
 
 def _stored_range(grid: SparseGrid) -> tuple[int, int]:
     """Smallest and largest code at the corners of live cells, up to what their bricks hold besides."""
-    held = grid.density.reshape(-1, 729)
+    held = grid.codes
     return int(held.min()), int(held.max())
 
 
@@ -179,7 +179,7 @@ def _blocks(
         live = np.zeros((BLOCK + 1,) * 3, bool)
         for slot in slots:
             x, y, z = (grid.slot_coords[slot] - name * wide) * 8
-            codes = grid.density[slot * 729 : (slot + 1) * 729].reshape(9, 9, 9)
+            codes = grid.codes[slot].reshape(9, 9, 9)
             values = np.clip(codes - code_level, -limit, limit)
             near = np.abs(values) < _NUDGE
             values[near] = np.where(values[near] < 0, -_NUDGE, _NUDGE)

@@ -15,6 +15,8 @@ import numpy as np
 BRICK = 8
 """Vertices along each edge of a brick."""
 
+_ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
+_Y_FIRST = np.uint64(0xFF)  # the bits of a word with y = 0
 _Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
 _Z_FIRST = np.uint64(0x0101010101010101)  # the bits of a word with z = 0
 
@@ -92,6 +94,43 @@ def neighbours(brick_coords: np.ndarray, index: np.ndarray, offset: tuple[int, .
     """
     padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)
     return padded[tuple((np.asarray(brick_coords, np.int64) + offset).T)]
+
+
+def with_apron(values: np.ndarray, brick_coords: np.ndarray, index: np.ndarray, out: np.ndarray) -> None:
+    """Values of bricks and, behind their last vertices, of the first of the next bricks: into `out` [n, 9, 9,
+    9], so that the eight corners of a cell are in one brick.
+
+    Args:
+        values: [n_bricks + 1, 512], indexed by b; the last row stands for every brick that is not there.
+        brick_coords: [n, 3] the bricks that are wanted.
+        index: as `dense_index` has it.
+        out: of the type of `values`.
+    """
+    blocks = values.reshape(-1, BRICK, BRICK, BRICK)
+    for offset in np.ndindex(2, 2, 2):
+        source = neighbours(brick_coords, index, offset)
+        into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
+        take = tuple(slice(1) if o else slice(None) for o in offset)
+        out[(slice(None), *into)] = blocks[(slice(None), *take)][source]
+
+
+def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: int) -> np.ndarray:
+    """[n, 3] int64, sorted: the bricks in which a cell has a corner that is stored, there or in the next
+    brick.
+
+    >>> coords, masks, _ = pack_vertices(np.array([[8, 1, 0]]))
+    >>> with_corners(coords, masks, 2).tolist()
+    [[0, 0, 0], [1, 0, 0]]
+    """
+    found = np.zeros((n_per_axis,) * 3, bool)
+    coords = np.asarray(brick_coords, np.int64)
+    for offset in np.ndindex(2, 2, 2):
+        words = np.asarray(brick_masks, np.uint64)[:, :1] if offset[0] else np.asarray(brick_masks, np.uint64)
+        words = words & (_Y_FIRST if offset[1] else _ALL) & (_Z_FIRST if offset[2] else _ALL)
+        before = coords - offset
+        wanted = (words != 0).any(axis=1) & (before >= 0).all(axis=1)
+        found[tuple(before[wanted].T)] = True
+    return np.argwhere(found)
 
 
 def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndarray) -> np.ndarray:

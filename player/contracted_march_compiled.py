@@ -46,7 +46,7 @@ def march(
         (grid.resolution, grid.n_per_axis, grid.density_low, grid.density_slope),
         (np.cos(half), np.sin(half), np.sin(grid.step), MAX_SPEED * grid.step * rays.cells, rays.cells),
         (grid.table, grid.live, grid.density),
-        (grid.rows.bricks, grid.rows.base, grid.rows.ranks, grid.features),
+        (grid.rows.bricks, grid.rows.rows, grid.features),
         (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (*rays.nearest, *rays.along, rays.cos, rays.sin, rays.width, rays.length, rays.t_nearest),
         table,

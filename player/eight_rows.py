@@ -22,7 +22,7 @@ _FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), CHANNELS), [0] * CHANNEL
 
 
 def _add_rows(
-    _: Any, features: Any, rows: Any, shares: Any, which: Any, scale: Any, out: Any, row: Any, first: Any
+    _: Any, features: Any, rows: Any, shares: Any, which: Any, out: Any, row: Any, first: Any
 ) -> Any:
     stored, align = (_CODES, 1) if features.dtype == types.int8 else (_FLOATS, 4)
 
@@ -40,26 +40,26 @@ def _add_rows(
         for corner in range(8):
             at = [context.get_constant(types.intp, corner), arguments[3]]
             number = builder.sext(builder.load(address(1, at)), ir.IntType(64))
-            loaded = builder.load(vector(0, [number, arguments[7]], stored), align=align)
+            loaded = builder.load(vector(0, [number, arguments[6]], stored), align=align)
             values = builder.sitofp(loaded, _FLOATS) if stored is _CODES else loaded
-            share = builder.fmul(builder.load(address(2, at)), arguments[4])
+            share = builder.load(address(2, at))
             one = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), share, ir.IntType(32)(0))
             every = builder.shuffle_vector(one, ir.Constant(_FLOATS, ir.Undefined), _FIRST_LANE)
             terms.append(builder.fmul(values, every))
         while len(terms) > 1:
             terms = [builder.fadd(a, b) for a, b in zip(terms[::2], terms[1::2], strict=True)]
-        place = vector(5, [arguments[6], arguments[7]], _FLOATS)
+        place = vector(4, [arguments[5], arguments[6]], _FLOATS)
         builder.store(builder.fadd(builder.load(place, align=4), terms[0]), place, align=4)
         return context.get_dummy_value()
 
-    arrays = (features, rows, shares, types.intp, types.float32, out, types.intp, types.intp)
+    arrays = (features, rows, shares, types.intp, out, types.intp, types.intp)
     return types.void(*arrays), generate
 
 
 add_rows: Any = intrinsic(_add_rows)
 """add_rows(features [n, n_channels] int8 or float32, rows [8, m] int32, shares [8 or more, m] float32, which,
-scale, out [n_out, width] float32, row, first): add the eight rows in column `which` of `rows`, weighted by
-`scale` times that of `shares`, to `out[row]`, CHANNELS channels from `first` on.
+out [n_out, width] float32, row, first): add the eight rows in column `which` of `rows`, weighted by that of
+`shares`, to `out[row]`, CHANNELS channels from `first` on.
 
 CHANNELS values are read and as many sums written whatever n_channels: both have to be there. Sums beyond
 n_channels are of no meaning.

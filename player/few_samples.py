@@ -18,7 +18,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from player.sparse_grid import SparseGrid
-from player.vertex_rows import ABSENT
 
 MIN_TOTAL = np.float32(1e-3)
 """Least share of stored corners with which a place counts as stored."""
@@ -203,22 +202,17 @@ def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.nda
     g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
     low = np.minimum(g.astype(np.int32), vertices.resolution - 1)
     fraction = g - low.astype(np.float32)
-    n = np.int32(vertices.n_per_axis)
-    brick, bit, share = [], [], []  # per axis and side: parts of the two addresses, interpolation weight
-    for axis, (stride, shift) in enumerate(((n * n, 6), (n, 3), (1, 0))):
-        sides = (low[axis], low[axis] + np.int32(1))
-        brick.append([(v >> 3) * np.int32(stride) for v in sides])
-        bit.append([(v & 7) << np.int32(shift) for v in sides])
-        share.append([np.float32(1) - fraction[axis], fraction[axis]])
+    n = vertices.n_per_axis
+    held = vertices.bricks.take(((low[0] >> 3) * n + (low[1] >> 3)) * n + (low[2] >> 3))
+    lx, ly, lz = (low & 7).astype(np.int64)
+    at = np.maximum(held, 0) * np.int64(729) + lx * 81 + ly * 9 + lz
+    share = [(np.float32(1) - side, side) for side in fraction]
     values = np.zeros((g.shape[1], grid.n_channels), np.float32)
     total = np.zeros(g.shape[1], np.float32)
     for x, y, z in np.ndindex(2, 2, 2):
-        held = vertices.bricks.take(brick[0][x] + brick[1][y] + brick[2][z])
-        at = np.maximum(held, 0)
-        rank = vertices.ranks.take(at.astype(np.int64) * 512 + (bit[0][x] + bit[1][y] + bit[2][z]))
-        stored = (held >= 0) & (rank != ABSENT)
+        row = vertices.rows.take(at + (x * 81 + y * 9 + z))
+        stored = (held >= 0) & (row >= 0)
         weight = share[0][x] * share[1][y] * share[2][z] * stored
-        row = np.where(stored, vertices.base.take(at) + rank, 0)
-        values += weight[:, None] * grid.features.take(row, axis=0)
+        values += weight[:, None] * grid.features.take(np.where(stored, row, 0), axis=0)
         total += weight
     return values, total

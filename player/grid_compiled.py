@@ -14,6 +14,7 @@ from player.eight_rows import CHANNELS, add_rows
 from player.few_samples import MIN_TOTAL
 from player.lanes import LANES
 from player.packets import stored_corners
+from player.prefetch import prefetch
 
 F32 = np.float32
 
@@ -115,13 +116,16 @@ def add_fetches(stored, sizes, queue, n, out):
     """Add the first n fetches of the queue to their rows of `out`. Returns how many of them found too little
     stored but have another place to be tried: they are now the first of the queue."""
     places, weights, into, lanes, others, rows, shares = queue
-    bricks, base, ranks, features = stored
-    stored_corners((bricks, base, ranks), sizes, places, rows, shares)
+    bricks, of_bricks, features = stored
+    most = stored_corners((bricks, of_bricks), sizes, places, weights, rows, shares)
     n_channels = features.shape[1]
+    whole = most * n_channels + out.shape[1] <= features.size  # or the last rows cannot be read in registers
+    for j in range(n):
+        for corner in range(0, 8, 2):  # the next along z is the next row
+            prefetch(features, rows[corner, j])
     left = 0
     for j in range(n):
-        total = shares[8, j]
-        if total < MIN_TOTAL:
+        if shares[8, j] < MIN_TOTAL:
             if not math.isnan(others[j]):
                 weights[left], into[left], lanes[left], others[left] = (
                     weights[j],
@@ -130,16 +134,11 @@ def add_fetches(stored, sizes, queue, n, out):
                     others[j],
                 )
                 left += 1
-            continue
-        scale = weights[j] / total
-        last = 0
-        for corner in range(8):
-            last = max(last, rows[corner, j])
-        if last * n_channels + out.shape[1] <= features.size:
+        elif whole:
             for first in range(0, n_channels, CHANNELS):
-                add_rows(features, rows, shares, j, scale, out, into[j], first)
-        else:  # there is not enough behind the last rows to be read in whole registers
+                add_rows(features, rows, shares, j, out, into[j], first)
+        else:
             for corner in range(8):
                 for c in range(n_channels):
-                    out[into[j], c] += shares[corner, j] * scale * features[rows[corner, j], c]
+                    out[into[j], c] += shares[corner, j] * features[rows[corner, j], c]
     return left

@@ -18,7 +18,7 @@ from numba.core import cgutils
 LANES = 16 if binding.get_host_cpu_features().get("avx512f") else 8
 """Numbers in a vector: as many as a register of the processor holds."""
 
-FLOAT, INT, BYTE, BIT = ir.FloatType(), ir.IntType(32), ir.IntType(8), ir.IntType(1)
+FLOAT, INT, LONG, BYTE = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(8)
 _SIZES = {FLOAT: "f32", INT: "i32"}
 
 # exp(r) for |r| <= log(2) / 2, highest power first: Cephes
@@ -131,6 +131,12 @@ class Lanes:
         """Towards zero."""
         return self._new(self.b.fptosi(self.value, vector(INT)))
 
+    def halves(self) -> tuple[Lanes, Lanes]:
+        """The lower and the upper int32 of integers of 64 bits."""
+        upper = self.b.lshr(self.value, self._other(32))
+        low, high = (self.b.trunc(value, vector(INT)) for value in (self.value, upper))
+        return self._new(low), self._new(high)
+
     def as_float(self) -> Lanes:
         """The same bits."""
         return self._new(self.b.bitcast(self.value, vector(FLOAT)))
@@ -150,6 +156,12 @@ class Lanes:
         for part in (half, exponent - half):
             total = total * ((part + 127) << 23).as_float()
         return total
+
+    def greatest(self) -> Any:
+        """Of the lanes, an int32."""
+        kind = ir.FunctionType(INT, [vector(INT)])
+        name = f"llvm.vector.reduce.smax.v{LANES}i32"
+        return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), [self.value])
 
     def any(self) -> Any:
         """Whether one of the truth values is true, as a single one."""
@@ -180,18 +192,19 @@ def store(base: Any, first: Any, values: Lanes) -> None:
     b.store(values.value, place, align=4)
 
 
-def gather(base: Any, bytes_: Lanes, where: Lanes) -> Lanes:
-    """int32 that begin `bytes_` behind the address `base`, whatever that is a multiple of, of the lanes that
-    are true in `where`; 0 of the others, which read what is at `base`.
+def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT) -> Lanes:
+    """Integers of a `kind` that begin `index` times `size` bytes behind the address `base`, of the lanes that
+    are true in `where`; the others read what is at `base`, and are 0.
 
     One by one: the gathering instructions of Intel's processors take a fifth longer here.
     """
     b = where.b
-    numbers = choose(where, bytes_, 0).value
-    words: Any = ir.Constant(vector(INT), ir.Undefined)
+    numbers = choose(where, index, 0).value
+    start = b.bitcast(base, ir.PointerType(BYTE))
+    words: Any = ir.Constant(vector(kind), ir.Undefined)
     for lane in range(LANES):
-        at = b.sext(b.extract_element(numbers, INT(lane)), ir.IntType(64))
-        place = b.bitcast(b.gep(b.bitcast(base, ir.PointerType(BYTE)), [at]), ir.PointerType(INT))
+        at = b.mul(b.sext(b.extract_element(numbers, INT(lane)), LONG), LONG(size))
+        place = b.bitcast(b.gep(start, [at]), ir.PointerType(kind))
         words = b.insert_element(words, b.load(place, align=1), INT(lane))
     return choose(where, Lanes(b, words), 0)
 

@@ -48,7 +48,7 @@ def march(
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
         (grid.table, grid.live, grid.density),
-        (grid.rows.bricks, grid.rows.base, grid.rows.ranks, grid.features),
+        (grid.rows.bricks, grid.rows.rows, grid.features),
         (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
         n_samples,

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -22,6 +21,7 @@ from player.contracted_rays import MIN_COS, SPARE
 from player.lanes import (
     INT,
     LANES,
+    LONG,
     Lanes,
     Variable,
     choose,
@@ -32,7 +32,6 @@ from player.lanes import (
     while_any,
 )
 from player.march import MAX_TAU, SKIP_MARGIN
-from player.vertex_rows import ABSENT
 
 BOX_ROWS = 7
 """Rows of a packet in a box: point and direction in grid coordinates, length; see `march_box`."""
@@ -73,7 +72,7 @@ class _Path(Protocol):
 
 class _Box:
     def __init__(self, b: Any, packet: Any, step: Lanes) -> None:
-        rows = [load(b, packet, ir.IntType(64)(row * LANES)) for row in range(BOX_ROWS)]
+        rows = [load(b, packet, LONG(row * LANES)) for row in range(BOX_ROWS)]
         self._e, self._d, self._length = rows[:3], rows[3:6], rows[6]
         self._step = step
         self._per_step = 1.0 / self._step
@@ -102,7 +101,7 @@ class _Space:
     def __init__(self, b: Any, packet: Any, lattice: Any, pitch: Lanes, numbers: list[Lanes]) -> None:
         """pitch: samples that the lattice has. numbers: cos and sin of half a step of phi, sin of a step,
         cells that a step makes at most, cells in a contracted unit."""
-        rows = [load(b, packet, ir.IntType(64)(row * LANES)) for row in range(SPACE_ROWS)]
+        rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
         self._p, self._wd = rows[:3], rows[3:6]
         self._cos0, self._sin0, self._width, self._length = rows[6:]
         self._lattice, self._pitch = lattice, pitch
@@ -112,7 +111,7 @@ class _Space:
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
         active = active & (i < self._pitch - SPARE)
         s, cos_s, sin_s = (
-            gather(self._lattice, (i + self._pitch * row) << 2, active).as_float() for row in range(3)
+            gather(self._lattice, i + self._pitch * row, 4, active).as_float() for row in range(3)
         )
         cos = self._cos0 * cos_s - self._sin0 * sin_s
         sin = self._sin0 * cos_s + self._cos0 * sin_s
@@ -147,7 +146,7 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
     zero = grid.low.like(0.0)
     i, taken, active = Variable(first), Variable(first.like(0)), Variable(first >= 0)
     tau, trans = Variable(zero), Variable(zero.like(1.0))
-    n_rows = cgutils.alloca_once_value(b, ir.IntType(64)(0))
+    n_rows = cgutils.alloca_once_value(b, LONG(0))
     with while_any(b, active):
         now = i.get()
         s, inside, g = path.place(now, active.get())
@@ -155,14 +154,14 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
         cell = [x.most(0.0).least(top).to_int() for x in g]
         bricks = tuple(c >> 3 for c in cell)
         number = (bricks[0] * grid.n_per_axis + bricks[1]) * grid.n_per_axis + bricks[2]
-        slot = gather(grid.table, number << 2, inside)
+        slot = gather(grid.table, number, 4, inside)
         empty = inside & (slot < 0)
         i.set(now + 1)
         with b.if_then(empty.any()):
             i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))  # type: ignore[arg-type]
         within = [c & 7 for c in cell]
         column = (slot << 6) + (within[0] << 3) + within[1]
-        word = gather(grid.live, column & -4, inside & (slot > -1))
+        word = gather(grid.live, column >> 2, 4, inside & (slot > -1))
         bit = ((column & 3) << 3) + within[2]
         lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
         live = lit.is_not(0)
@@ -184,12 +183,12 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
             taken.set(taken.get() + lit)
             active.set(inside & ~(total > float(MAX_TAU)))
             row = b.load(n_rows)
-            place = b.mul(row, ir.IntType(64)(LANES))
+            place = b.mul(row, LONG(LANES))
             store(samples, place, s)
             store(samples, b.add(place, pitch), weight)
-            b.store(b.add(row, ir.IntType(64)(1)), n_rows)
-    store(out, ir.IntType(64)(0), tau.get())
-    store(out, ir.IntType(64)(LANES), taken.get().to_float())
+            b.store(b.add(row, LONG(1)), n_rows)
+    store(out, LONG(0), tau.get())
+    store(out, LONG(LANES), taken.get().to_float())
     return b.load(n_rows)
 
 
@@ -197,7 +196,7 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
     """Codes between the corners of cells: along z, then y, then x."""
 
     def along_z(offset: int) -> Lanes:
-        pair = gather(density, at + offset, where)
+        pair = gather(density, at + offset, 1, where)
         low, high = (pair & 255).to_float(), ((pair >> 8) & 255).to_float()
         return low + (high - low) * f[2]
 
@@ -229,9 +228,9 @@ def _march_box(
         rows, start, places, found = (
             _address(context, b, signature.args[n], arguments[n]) for n in range(3, 7)
         )
-        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, ir.IntType(64)(2))
+        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
         path = _Box(b, rows, splat(b, arguments[2]))
-        return _collect(b, grid, path, load(b, start, ir.IntType(64)(0), INT), places, pitch, found)
+        return _collect(b, grid, path, load(b, start, LONG(0), INT), places, pitch, found)
 
     return types.int64(lookup, numbers, step, packet, first, samples, out), generate
 
@@ -255,8 +254,8 @@ def _march_space(
         table, rows, places, found = (
             _address(context, b, signature.args[n], arguments[n]) for n in (2, 4, 5, 6)
         )
-        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, ir.IntType(64)(2))
-        n = b.udiv(context.make_array(lattice)(context, b, arguments[2]).nitems, ir.IntType(64)(3))
+        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
+        n = b.udiv(context.make_array(lattice)(context, b, arguments[2]).nitems, LONG(3))
         of_steps = [splat(b, b.extract_value(arguments[3], i)) for i in range(5)]
         path = _Space(b, rows, table, splat(b, b.trunc(n, INT)), of_steps)
         return _collect(b, grid, path, grid.last.like(0), places, pitch, found)
@@ -274,49 +273,57 @@ ray. The rest as in `march_box`.
 """
 
 
-def _stored_corners(_: Any, stored: Any, sizes: Any, places: Any, rows: Any, shares: Any) -> Any:
+def _stored_corners(
+    _: Any, stored: Any, sizes: Any, places: Any, weights: Any, rows: Any, shares: Any
+) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        kinds = signature.args[0]
-        parts = [b.extract_value(arguments[0], n) for n in range(3)]
-        bricks, base, ranks = (
-            _address(context, b, kind, part) for kind, part in zip(kinds, parts, strict=True)
+        bricks, of_bricks = (
+            _address(context, b, kind, b.extract_value(arguments[0], n))
+            for n, kind in enumerate(signature.args[0])
         )
-        at, row_at, share_at = (_address(context, b, signature.args[n], arguments[n]) for n in (2, 3, 4))
+        at, weight_at, row_at, share_at = (
+            _address(context, b, signature.args[n], arguments[n]) for n in range(2, 6)
+        )
         resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(arguments[1], n), INT)) for n in range(2))
         scale = splat(b, b.extract_value(arguments[1], 2))
-        every = resolution > 0
-        brick, bit, share = [], [], []  # per axis and side: parts of the two addresses, interpolation weight
-        for axis, (stride, shift) in enumerate(((n_per_axis * n_per_axis, 6), (n_per_axis, 3), (None, 0))):
-            g = load(b, at, ir.IntType(64)(axis * LANES)) * scale
-            g = g.most(0.0).least(resolution.to_float())
-            low = g.to_int().least(resolution - 1)
-            fraction = g - low.to_float()
-            sides = (low, low + 1)
-            brick.append([(v >> 3) if stride is None else (v >> 3) * stride for v in sides])
-            bit.append([(v & 7) << shift for v in sides])
-            share.append([1.0 - fraction, fraction])
+        low, share = [], []
+        for axis in range(3):
+            g = (load(b, at, LONG(axis * LANES)) * scale).most(0.0).least(resolution.to_float())
+            low.append(g.to_int().least(resolution - 1))
+            fraction = g - low[axis].to_float()
+            share.append((1.0 - fraction, fraction))
+        x, y, z = (cell >> 3 for cell in low)
+        held = gather(bricks, (x * n_per_axis + y) * n_per_axis + z, 4, resolution > 0)
+        x, y, z = (cell & 7 for cell in low)
+        first = held * 729 + x * 81 + y * 9 + z
         total = scale.like(0.0)
-        for corner, (x, y, z) in enumerate(np.ndindex(2, 2, 2)):
-            held = gather(bricks, (brick[0][x] + brick[1][y] + brick[2][z]) << 2, every)
-            place = (held << 9) + bit[0][x] + bit[1][y] + bit[2][z]
-            word = gather(ranks, (place & -2) << 1, held > -1)
-            rank = Lanes(b, b.lshr(word.value, ((place & 1) << 4).value)) & 0xFFFF
-            there = (held > -1) & rank.is_not(ABSENT)
-            row = choose(there, gather(base, held << 2, there) + rank, 0)
-            part = choose(there, share[0][x] * share[1][y] * share[2][z], 0.0)
-            total = total + part
-            store(row_at, ir.IntType(64)(corner * LANES), row)
-            store(share_at, ir.IntType(64)(corner * LANES), part)
-        store(share_at, ir.IntType(64)(8 * LANES), total)
-        return context.get_dummy_value()
+        parts = []
+        for x, y in np.ndindex(2, 2):
+            pair = gather(of_bricks, first + (x * 81 + y * 9), 4, held > -1, LONG).halves()
+            for z, row in enumerate(pair):
+                there = (held > -1) & (row > -1)
+                parts.append(
+                    (choose(there, row, 0), choose(there, share[0][x] * share[1][y] * share[2][z], 0.0))
+                )
+                total = total + parts[-1][1]
+        weight = load(b, weight_at, LONG(0)) / total
+        most = parts[0][0]
+        for corner, (row, part) in enumerate(parts):
+            store(row_at, LONG(corner * LANES), row)
+            store(share_at, LONG(corner * LANES), part * weight)
+            most = most.most(row)
+        store(share_at, LONG(8 * LANES), total)
+        return b.sext(most.greatest(), LONG)
 
-    return types.void(stored, sizes, places, rows, shares), generate
+    return types.int64(stored, sizes, places, weights, rows, shares), generate
 
 
 stored_corners: Any = intrinsic(_stored_corners)
-"""stored_corners((bricks, base, ranks), (resolution, n_per_axis, scale), places [3, LANES] float32, rows [8,
-LANES] int32, shares [9, LANES] float32): the corners around LANES places, cells of the densities' grid.
+"""stored_corners((bricks, rows), (resolution, n_per_axis, scale), places [3, LANES] float32, weights [LANES]
+float32, rows [8, LANES] int32, shares [9, LANES] float32): the greatest of the rows.
 
-Interpolation weights and, behind them, their sums; of what is not stored the weight is 0, and the row.
+The corners around LANES places, cells of the densities' grid: their rows, and their shares of the weights.
+Of what is not stored the share is 0, and the row. Behind the shares there is how much of the interpolation
+is stored: where that is 0, shares are not numbers.
 """

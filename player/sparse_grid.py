@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.bricks import BRICK, bricks_per_axis, dense_index, live_cells, neighbours, stored_bits
+from player.bricks import BRICK, bricks_per_axis, dense_index, live_cells, stored_bits, with_apron
 from player.density import decode_constants
 from player.vertex_rows import VertexRows, vertex_rows
 
@@ -56,6 +56,11 @@ class SparseGrid:
     @property
     def n_channels(self) -> int:
         return self.features.shape[1]
+
+    @property
+    def codes(self) -> np.ndarray:
+        """[n_slots, 729] uint8: the densities, slot by slot."""
+        return self.density[: 729 * len(self.slot_coords)].reshape(-1, 729)
 
     @property
     def feature_scale(self) -> np.float32:
@@ -130,19 +135,12 @@ def build_grid(
 def _with_apron(
     stored: np.ndarray, density: np.ndarray, coords: np.ndarray, index: np.ndarray, chosen: np.ndarray
 ) -> np.ndarray:
-    dense = np.zeros(
-        (len(stored) + 1, 512), np.uint8
-    )  # the last row stands for every brick that is not there
+    dense = np.zeros((len(stored) + 1, stored.shape[1]), np.uint8)
     dense[:-1][stored] = density
-    dense = dense.reshape(-1, BRICK, BRICK, BRICK)
-    n_apron = (BRICK + 1) ** 3 * len(chosen)
-    flat = np.zeros(n_apron + SPARE, np.uint8)
-    apron = flat[:n_apron].reshape(-1, BRICK + 1, BRICK + 1, BRICK + 1)
-    for offset in np.ndindex(2, 2, 2):
-        source = neighbours(coords[chosen], index, offset)
-        into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
-        take = tuple(slice(1) if o else slice(None) for o in offset)
-        apron[(slice(None), *into)] = dense[(slice(None), *take)][source]
+    n_codes = (BRICK + 1) ** 3 * len(chosen)
+    flat = np.zeros(n_codes + SPARE, np.uint8)
+    apron = flat[:n_codes].reshape(-1, BRICK + 1, BRICK + 1, BRICK + 1)
+    with_apron(dense, coords[chosen], index, apron)
     return flat
 
 

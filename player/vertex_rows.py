@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.bricks import bricks_per_axis, dense_index, stored_bits
-
-ABSENT = 0xFFFF
-"""The rank of a vertex that is not stored."""
+from player.bricks import bricks_per_axis, dense_index, stored_bits, with_apron, with_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +19,11 @@ class VertexRows:
     n_per_axis: int
     """nb."""
     bricks: np.ndarray
-    """[nb^3] int32 at (bx * nb + by) * nb + bz: the brick that holds a vertex, -1 where there is none."""
-    base: np.ndarray
-    """[n_bricks] int32: row of the brick's first vertex."""
-    ranks: np.ndarray
-    """[n_bricks * 512] uint16 at brick * 512 + bit: row of the vertex counted from the base, ABSENT if it is
-    not stored."""
+    """[nb^3] int32 at (bx * nb + by) * nb + bz: the brick that holds a cell, -1 where no corner of any cell
+    is stored."""
+    rows: np.ndarray
+    """[n_bricks * 729] int32 at brick * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: the row of a vertex, -1 if
+    it is not stored. Bricks have an apron, so that the eight corners of a cell are in one."""
 
     def find(self, index: np.ndarray) -> np.ndarray:
         """Rows [n] int64 of vertices [n, 3] that may lie outside; -1 where none is stored."""
@@ -35,13 +31,12 @@ class VertexRows:
         inside = np.all((index >= 0) & (index < 8 * n), axis=-1)
         x, y, z = np.where(inside[:, None], index, 0).T.astype(np.int64)
         brick = self.bricks[((x >> 3) * n + (y >> 3)) * n + (z >> 3)].astype(np.int64)
-        held = np.maximum(brick, 0)
-        rank = self.ranks[held * 512 + (x & 7) * 64 + (y & 7) * 8 + (z & 7)].astype(np.int64)
-        return np.where(inside & (brick >= 0) & (rank != ABSENT), self.base[held] + rank, -1)
+        row = self.rows[np.maximum(brick, 0) * 729 + (x & 7) * 81 + (y & 7) * 9 + (z & 7)]
+        return np.where(inside & (brick >= 0), row, -1).astype(np.int64)
 
 
 def vertex_rows(coords: np.ndarray, masks: np.ndarray, resolution: int) -> VertexRows:
-    """Rows of the vertices of bricks as they are on disk.
+    """Rows of the vertices of bricks as they are on disk; at least one is stored.
 
     >>> from player.bricks import pack_vertices
     >>> coords, masks, _ = pack_vertices(np.array([[0, 0, 0], [9, 0, 0], [9, 0, 1]]))
@@ -50,11 +45,10 @@ def vertex_rows(coords: np.ndarray, masks: np.ndarray, resolution: int) -> Verte
     """
     n_per_axis = bricks_per_axis(resolution)
     stored = stored_bits(masks)
-    counts = np.cumsum(stored, axis=1, dtype=np.uint16)
-    totals = counts[:, -1].astype(np.int64) if len(stored) else np.zeros(0, np.int64)
-    base = (np.cumsum(totals) - totals).astype(np.int32)
-    counts -= np.uint16(1)
-    counts[~stored] = ABSENT
-    return VertexRows(
-        resolution, n_per_axis, dense_index(coords, n_per_axis).reshape(-1), base, counts.reshape(-1)
-    )
+    rows = np.full((len(stored) + 1, stored.shape[1]), -1, np.int32)
+    rows[:-1][stored] = np.arange(np.count_nonzero(stored), dtype=np.int32)
+    held = with_corners(coords, masks, n_per_axis)
+    apron = np.empty((len(held), 9, 9, 9), np.int32)
+    with_apron(rows, held, dense_index(coords, n_per_axis), apron)
+    bricks = dense_index(held, n_per_axis).reshape(-1)
+    return VertexRows(resolution, n_per_axis, bricks, apron.reshape(-1))

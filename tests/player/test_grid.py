@@ -15,8 +15,7 @@ from player.bricks import (
     unpack_vertices,
 )
 from player.density import decode_density, encode_density
-from player.sparse_grid import MAX_DISTANCE, SPARE, build_grid
-from player.vertex_rows import ABSENT
+from player.sparse_grid import MAX_DISTANCE, build_grid
 
 RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
 
@@ -88,15 +87,14 @@ def test_grid_against_dense_arrays(share: float) -> None:
     n = grid.n_per_axis
     full = np.zeros((n * 8 + 1,) * 3, np.uint8)
     full[tuple(vertices.T)] = codes
-    apron = grid.density[:-SPARE].reshape(-1, 9, 9, 9)
+    apron = grid.codes.reshape(-1, 9, 9, 9)
     for slot, (x, y, z) in enumerate(grid.slot_coords.tolist()):
         assert grid.table[(x * n + y) * n + z] == slot
         assert (apron[slot] == full[x * 8 : x * 8 + 9, y * 8 : y * 8 + 9, z * 8 : z * 8 + 9]).all()
     rows = np.full((n * 8,) * 3, -1)
     rows[tuple(vertices.T)] = np.arange(len(vertices))
-    for brick, (x, y, z) in enumerate(coords.tolist()):
-        ranks = grid.rows.ranks[brick * 512 : brick * 512 + 512].astype(np.int64)
-        got = np.where(ranks == ABSENT, -1, grid.rows.base[brick] + ranks).reshape(8, 8, 8)
+    for x, y, z in coords.tolist():
+        got = grid.rows.rows.reshape(-1, 9, 9, 9)[grid.rows.bricks[(x * n + y) * n + z]][:8, :8, :8]
         assert (got == rows[x * 8 : x * 8 + 8, y * 8 : y * 8 + 8, z * 8 : z * 8 + 8]).all()
     for at in np.ndindex(n, n, n):
         entry = int(grid.table.reshape(n, n, n)[at])

@@ -20,7 +20,7 @@ from player.few_samples import MIN_TOTAL, Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
 from player.marches import sampled_rays
 from player.sparse_grid import SparseGrid
-from player.vertex_rows import ABSENT, VertexRows
+from player.vertex_rows import VertexRows
 from vfr_bake.kernels.stored_features import compose, corner_rows
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
@@ -218,7 +218,6 @@ def _corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> tup
     n = len(points)
     rows, shares = np.empty((n, 8), np.int32), np.empty((n, 8), np.float32)
     corner_rows(
-        points, vertices.resolution, vertices.n_per_axis, vertices.bricks, vertices.base, vertices.ranks,
-        ABSENT, least, rows, shares,
+        points, vertices.resolution, vertices.n_per_axis, vertices.bricks, vertices.rows, least, rows, shares,
     )  # fmt: skip
     return rows, shares

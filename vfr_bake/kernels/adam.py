@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from player.prefetch import prefetch
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
-from vfr_bake.kernels.prefetch import prefetch
 
 AHEAD = 16
 """Rows asked for before they are stepped: a trip to memory takes about as long as so many steps."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from vfr_bake.kernels.prefetch import prefetch
+from player.prefetch import prefetch
 
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)

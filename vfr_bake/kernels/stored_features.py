@@ -136,7 +136,7 @@ def descend_density(
 
 
 @njit(parallel=True, cache=True)
-def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, least, rows, shares):
+def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, shares):
     """The stored corners around `points` [n, 3] float32 of a grid (cells): `rows` [n, 8] and trilinear
     `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states.
 
@@ -153,19 +153,17 @@ def corner_rows(points, resolution, n_per_axis, bricks, base, ranks, absent, lea
         x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
         fx, fy, fz = gx - np.float32(x), gy - np.float32(y), gz - np.float32(z)
         total = np.float32(0)
+        brick = np.int64(bricks[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)])
+        first = brick * 729 + (x & 7) * 81 + (y & 7) * 9 + (z & 7)
         for corner in range(8):
             ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
-            vx, vy, vz = x + ix, y + iy, z + iz
-            rows[i, corner] = 0
+            row = of_bricks[first + ix * 81 + iy * 9 + iz] if brick >= 0 else -1
+            rows[i, corner] = max(row, 0)
             shares[i, corner] = np.float32(0)
-            brick = np.int64(bricks[((vx >> 3) * n_per_axis + (vy >> 3)) * n_per_axis + (vz >> 3)])
-            if brick < 0:
-                continue
-            rank = np.int64(ranks[brick * 512 + ((vx & 7) * 64 + (vy & 7) * 8 + (vz & 7))])
-            if rank == absent:
-                continue
-            rows[i, corner] = base[brick] + rank
-            shares[i, corner] = (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
+            if row >= 0:
+                shares[i, corner] = (
+                    (fx if ix else one - fx) * (fy if iy else one - fy) * (fz if iz else one - fz)
+                )
             total += shares[i, corner]
         if least > 0:
             scale = one / total if total >= least else np.float32(0)

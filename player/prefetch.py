@@ -1,7 +1,7 @@
 """Asking for memory before it is needed.
 
-The rows of a hash table that one sample or one step reads lie all over it, and a core that meets them one by
-one waits for each: asked for ahead, they come side by side.
+The rows of a hash table or of a grid that one sample or one step reads lie all over it, and a core that meets
+them one by one waits for each: asked for ahead, they come side by side. Compiled code alone imports this.
 """
 
 from __future__ import annotations
