@@ -11,6 +11,7 @@ VIDEO = ".mp4"
 
 EXAMPLES = """examples:
   vfr-play out/                                                        look at it in a browser
+  vfr-play fidelity/ balanced/ fast/                                   and switch between bakes of a scene
   vfr-play out/ --info
   vfr-play out/ --check
   vfr-play out/ --view 3 --output view.png
@@ -33,6 +34,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("asset", type=Path, help="folder of the asset")
+    add("others", type=Path, nargs="*", metavar="asset", help="more of them, to switch to in the viewer")
     views = parser.add_argument_group("views").add_mutually_exclusive_group()
     views.add_argument(
         "--cameras",
@@ -81,6 +83,8 @@ def _add_files(group: argparse._ArgumentGroup) -> None:
 
 
 def _check_together(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
+    if a.others and (a.info or a.check or a.output is not None):
+        parser.error(f"{a.others[0]}: one asset at a time, but in the viewer")
     if a.info or a.check:
         return
     output: Path | None = a.output

@@ -8,7 +8,8 @@ import os
 import socket
 import sys
 import threading
-from contextlib import redirect_stdout
+from collections.abc import Sequence
+from contextlib import ExitStack, redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -37,14 +38,17 @@ def serve(arguments: argparse.Namespace) -> None:
         raise ConfigError("--background: expected a colour for the viewer, got transparent")
     viser = _viser(files)
     import_ahead()
-    asset = Asset.open(arguments.asset)
+    assets = [Asset.open(folder) for folder in (arguments.asset, *arguments.others)]
     host = arguments.host or HOST
     port = free_port(host, arguments.port)
-    with Renderer(asset, arguments.threads, arguments.march) as renderer:
+    with ExitStack() as stack:
+        renderers = [
+            stack.enter_context(Renderer(asset, arguments.threads, arguments.march)) for asset in assets
+        ]
         with redirect_stdout(io.StringIO()):  # its banner: ours is the one line that scripts read
-            server = local_server(viser)(host=host, port=port, label=_title(asset), verbose=False)
+            server = local_server(viser)(host=host, port=port, label=_title(assets[0]), verbose=False)
         try:
-            windows = open_windows(server, renderer, arguments.samples, arguments.background)
+            windows = open_windows(server, renderers, arguments.samples, arguments.background)
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
             sys.stdout.flush()
             sys.stderr.write(_advice(files, server.get_port()))
@@ -58,10 +62,12 @@ def serve(arguments: argparse.Namespace) -> None:
                 server.stop()
 
 
-def open_windows(server: Any, renderer: Renderer, samples: int | None, background: Any) -> dict[int, Window]:
+def open_windows(
+    server: Any, renderers: Sequence[Renderer], samples: int | None, background: Any
+) -> dict[int, Window]:
     """Give every client of a viser server a window, and end it when the client is gone; returns those that
-    are open."""
-    asset = renderer.asset
+    are open. Cameras are those of the first asset."""
+    asset = renderers[0].asset
     width, height = asset.manifest.view_size
     trained = read_cameras(asset.path("cameras.json"), (width, height))
     focus = focus_point(trained)
@@ -76,7 +82,7 @@ def open_windows(server: Any, renderer: Renderer, samples: int | None, backgroun
     @server.on_client_connect
     def _(client: Any) -> None:
         client.camera.fov = fov
-        window = Window(client, renderer, trained, focus, samples, background)
+        window = Window(client, renderers, trained, focus, samples, background)
         windows[client.client_id] = window
         window.start()
 

@@ -32,14 +32,15 @@ class Window:
     def __init__(
         self,
         client: Any,
-        renderer: Renderer,
+        renderers: Sequence[Renderer],
         trained: Sequence[Camera],
         focus: np.ndarray,
         samples: int | None,
         background: tuple[float, float, float] | None,
     ) -> None:
         self._client = client
-        self._renderer = renderer
+        self._renderers = _named(renderers)
+        self._renderer = renderers[0]
         self._trained = trained
         self._focus = focus
         self._pace = Pace()
@@ -49,7 +50,7 @@ class Window:
         self._moved = 0.0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
-        own = renderer.asset.manifest
+        own = self._renderer.asset.manifest
         self._add_controls(
             own.n_samples if samples is None else samples,
             own.background if background is None else background,
@@ -78,6 +79,10 @@ class Window:
     def _add_controls(self, samples: int, background: Sequence[float]) -> None:
         gui = self._client.gui
         with gui.add_folder("Picture"):
+            if len(self._renderers) > 1:
+                names = list(self._renderers)
+                self._asset = gui.add_dropdown("Asset", names, initial_value=names[0])
+                self._asset.on_update(lambda _: self._switch())
             self._layer = gui.add_dropdown("Show", LAYERS, initial_value="colour")
             self._samples = gui.add_slider(
                 "Fetches",
@@ -111,6 +116,14 @@ class Window:
         record.on_click(lambda _: self._record())
         self._save.on_click(lambda _: self._save_path())
         self._clear.on_click(lambda _: self._clear_path())
+
+    def _switch(self) -> None:
+        """To another asset, with the fetches that it was baked for."""
+        self._renderer = self._renderers[self._asset.value]
+        n_samples = self._renderer.asset.manifest.n_samples
+        self._samples.max = max(self._samples.max, n_samples)
+        self._samples.value = n_samples
+        self.touch()
 
     def _set_fov(self) -> None:
         self._client.camera.fov = math.radians(self._fov.value)
@@ -224,6 +237,15 @@ class Window:
     def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
         self._state.value = state
+
+
+def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
+    """By the name of the asset's folder, or by its path where two have the same."""
+    folders = [renderer.asset.folder.resolve() for renderer in renderers]
+    names = [folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        names = [str(folder) for folder in folders]
+    return dict(zip(names, renderers, strict=True))
 
 
 def _joined(frames: Sequence[Frame], layer: str) -> Frame:

@@ -90,9 +90,10 @@ def scene() -> Scene:
     return Scene(RESOLUTION, box, STEP, DENSITY_RANGE, *by_key)
 
 
-def write_shells(folder: Path) -> Path:
-    """Write the asset; returns its folder."""
+def write_shells(folder: Path, sign: int = 1) -> Path:
+    """Write the asset, its features times `sign`; returns its folder."""
     vertices, codes, features = shells()
+    features = (sign * features).astype(np.int8)
     coords, masks, _ = pack_vertices(vertices)
     manifest = Manifest(
         generator="tests",

@@ -27,6 +27,7 @@ from player.transforms import read_cameras
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.pace import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, Pace, fitted
 from player.viewer.server import free_port, local_server
+from tests.player.conftest import write_shells
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SECONDS = 120.0
@@ -147,14 +148,14 @@ def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.Captu
 
 
 class Server:
-    """`vfr-play ASSET` as a process."""
+    """`vfr-play ASSET ...` as a process."""
 
-    def __init__(self, folder: Path, errors: Path) -> None:
+    def __init__(self, errors: Path, *folders: Path) -> None:
         environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
         self.errors = errors
         with errors.open("w") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "player", str(folder)],
+                [sys.executable, "-m", "player", *map(str, folders)],
                 env=environment | {"PYTHONPATH": str(REPOSITORY)},
                 stdout=subprocess.PIPE,
                 stderr=file,
@@ -177,7 +178,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def server(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    server = Server(shells_folder, tmp_path_factory.mktemp("viewer") / "errors.txt")
+    server = Server(tmp_path_factory.mktemp("viewer") / "errors.txt", shells_folder)
     yield server
     server.stop()
 
@@ -259,9 +260,9 @@ def drag(page: Page, dx: int) -> None:
     page.mouse.up()
 
 
-def choose(page: Page, layer: str) -> None:
-    page.locator("input.mantine-Select-input:visible").click()
-    page.get_by_role("option", name=layer).click()
+def choose(page: Page, option: str, dropdown: int = 0) -> None:
+    page.locator("input.mantine-Select-input:visible").nth(dropdown).click()
+    page.get_by_role("option", name=option).click()
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:
@@ -342,8 +343,20 @@ def test_two_clients_and_one_that_vanishes(browser: Browser, server: Server) -> 
     assert server.process.poll() is None and "Traceback" not in server.errors.read_text()
 
 
+def test_another_asset_of_the_scene(browser: Browser, shells_folder: Path, tmp_path: Path) -> None:
+    server = Server(tmp_path / "errors.txt", shells_folder, write_shells(tmp_path / "other", sign=-1))
+    page = opened(browser, server)
+    first = settle(page)
+    choose(page, "other")
+    wait_for(lambda: changed(first, shot(page)) > 0.05, page)
+    choose(page, shells_folder.name)
+    wait_for(lambda: changed(first, shot(page)) < 0.01, page)
+    page.close()
+    assert server.stop() == 130
+
+
 def test_ctrl_c_ends_it(shells_folder: Path, tmp_path: Path) -> None:
-    server = Server(shells_folder, tmp_path / "errors.txt")
+    server = Server(tmp_path / "errors.txt", shells_folder)
     assert server.stop() == 130
     assert server.errors.read_text().endswith("vfr-play: stopped\n")
 

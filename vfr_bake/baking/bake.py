@@ -122,7 +122,9 @@ class _Bake:
         head = self._head(stored, layout, taught)
         arrays = layout.arrays(stored.density, stored.features)
         mesh, removed = self._mesh(layout, arrays, head)
-        if layout.contracted:
+        if not len(mesh.faces):
+            self.left_out["mesh"] = "all of it: nowhere is the field dense enough for a surface"
+        elif layout.contracted:
             self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         figures = {
             "n_vertices": len(layout.densities),
