@@ -60,6 +60,8 @@ def descend(starts, rows, shares, weights, gradient, rate, latent, steepness):
                     continue
                 row = rows[j, corner]
                 steepness[row] += share * share * square
+                if steepness[row] == 0:  # the square of next to nothing is nothing
+                    continue
                 step = rate * share / np.sqrt(steepness[row])
                 for c in range(n_channels):
                     latent[row, c] = min(max(latent[row, c] - step * gradient[i, c], low), high)
@@ -131,6 +133,8 @@ def descend_density(
                     continue
                 row = density_rows[first + j, corner]
                 steepness[row] += slant_of_row * slant_of_row
+                if steepness[row] == 0:  # the square of next to nothing is nothing
+                    continue
                 moved = latent[row] - rate * slant_of_row / np.sqrt(steepness[row])
                 latent[row] = min(max(moved, np.float32(0)), np.float32(255))
 

@@ -33,7 +33,7 @@ from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
-from vfr_bake.kernels.stored_features import descend_density, weigh
+from vfr_bake.kernels.stored_features import descend, descend_density, weigh
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
@@ -244,6 +244,21 @@ def test_density_gradient_is_that_of_the_composite() -> None:
         moved += (density - fresh) * 100
     wanted = latent.grad.numpy()
     np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
+
+
+def test_gradients_whose_squares_underflow_move_nothing() -> None:
+    starts, ones = np.array([0, 1]), np.ones(1, np.float32)
+    rows, shares = np.zeros((1, 8), np.int32), np.full((1, 8), 1 / 8, np.float32)
+    tiny = np.full((1, 2), 1e-30, np.float32)
+    density, values = np.full(1, 100.0, np.float32), np.full((1, 2), 50.0, np.float32)
+    rate = np.float32(1)
+    steep = np.zeros(1, np.float32)
+    descend_density(
+        starts, rows, shares, rows, shares, ones / 2, ones / 2, values, tiny, tiny[0, :1], np.float32(-7),
+        np.float32(0.05), ones, rate, density, steep,
+    )  # fmt: skip
+    descend(starts, rows, shares, ones, np.full((1, 2), 1e-22, np.float32), rate, values, steep)
+    assert density[0] == 100 and (values == 50).all() and steep[0] == 0
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
