@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numba import get_num_threads
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
@@ -21,7 +22,7 @@ from player.march import MAX_TAU
 from player.sparse_grid import SparseGrid
 from vfr_bake.baking.lessons import Lessons, compose_into
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
-from vfr_bake.kernels.stored_features import descend, descend_density, weigh
+from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
 
 BATCH = 2048
 UNIT = 4.0
@@ -70,6 +71,7 @@ def refine(
     head = FoldedHead(stored.head, UNIT * typical)
     features, density = stored.features.copy(), stored.density.copy()
     steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
+    n_parts = get_num_threads()
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in range(n_steps):
         falling = np.float32(0.5 * (1 + np.cos(np.pi * step / n_steps)))
@@ -92,14 +94,17 @@ def refine(
         where = (fetches.starts, fetches.rows, fetches.shares)
         if grid is not None:
             assert composed.grad is not None and opacity.grad is not None
-            descend_density(
-                *where, *of_densities, fetches.weights, of_grid, features,
-                composed.grad.numpy(), opacity.grad.numpy(), grid.density_low, grid.density_slope,
-                fetches.lengths, np.float32(DENSITY_RATE) * falling, density, steep_density,
+            of_fetches = np.empty(len(fetches.weights), np.float32)
+            slants(
+                *where, *of_densities, fetches.weights, of_grid, features, composed.grad.numpy(),
+                opacity.grad.numpy(), grid.density_low, grid.density_slope, fetches.lengths, density,
+                of_fetches,
             )  # fmt: skip
+            rate = np.float32(DENSITY_RATE) * falling
+            descend_density(*of_densities, of_fetches, rate, n_parts, density, steep_density)
         if composed.grad is not None:
             rate = np.float32(code_rate) * falling
-            descend(*where, fetches.weights, composed.grad.numpy(), rate, features, steep)
+            descend(*where, fetches.weights, composed.grad.numpy(), rate, n_parts, features, steep)
         if step % 50 == 49 or step == n_steps - 1:
             progress(step + 1, n_steps)
     return Stored(head.weights(), features, density)

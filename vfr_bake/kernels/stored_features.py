@@ -17,6 +17,8 @@ from numba import njit, prange
 
 BLOCK = 64
 """Rays that a thread takes at a time."""
+OWN = 6
+"""Vertices belong to the parts in turns of 2^OWN: two threads hardly ever write to one line of the cache."""
 
 
 @njit(parallel=True, cache=True)
@@ -37,34 +39,37 @@ def compose(starts, rows, shares, weights, latent, out):
                         out[i, c] += share * np.rint(latent[row, c])
 
 
-@njit(cache=True)
-def descend(starts, rows, shares, weights, gradient, rate, latent, steepness):
+@njit(parallel=True, cache=True)
+def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, steepness):
     """One step of Adagrad on `latent`, in place, codes kept within -127..127.
 
     `gradient` [n, n_channels] is that of the composites; `steepness` [n_vertices] collects the mean square of
     what a vertex has seen, over its channels, so that vertices that few rays meet move as fast as the others.
+    Each of `n_parts` goes through all fetches, in their order, and moves the vertices that are its own: the
+    result does not depend on their number.
     """
     n_channels = latent.shape[1]
     low, high = np.float32(-127), np.float32(127)
-    for i in range(gradient.shape[0]):
-        square = np.float32(0)
-        for c in range(n_channels):
-            square += gradient[i, c] * gradient[i, c]
-        if square == 0:
-            continue
-        square /= np.float32(n_channels)
-        for j in range(starts[i], starts[i + 1]):
-            for corner in range(8):
-                share = weights[j] * shares[j, corner]
-                if share == 0:
-                    continue
-                row = rows[j, corner]
-                steepness[row] += share * share * square
-                if steepness[row] == 0:  # the square of next to nothing is nothing
-                    continue
-                step = rate * share / np.sqrt(steepness[row])
-                for c in range(n_channels):
-                    latent[row, c] = min(max(latent[row, c] - step * gradient[i, c], low), high)
+    for part in prange(n_parts):
+        for i in range(gradient.shape[0]):
+            square = np.float32(0)
+            for c in range(n_channels):
+                square += gradient[i, c] * gradient[i, c]
+            if square == 0:
+                continue
+            square /= np.float32(n_channels)
+            for j in range(starts[i], starts[i + 1]):
+                for corner in range(8):
+                    row = rows[j, corner]
+                    share = weights[j] * shares[j, corner]
+                    if share == 0 or (row >> OWN) % n_parts != part:
+                        continue
+                    steepness[row] += share * share * square
+                    if steepness[row] == 0:  # the square of next to nothing is nothing
+                        continue
+                    step = rate * share / np.sqrt(steepness[row])
+                    for c in range(n_channels):
+                        latent[row, c] = min(max(latent[row, c] - step * gradient[i, c], low), high)
 
 
 @njit(parallel=True, cache=True)
@@ -87,55 +92,64 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
             opacity[i] = -np.expm1(-tau)
 
 
-@njit(cache=True)
-def descend_density(
+@njit(parallel=True, cache=True)
+def slants(
     starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
-    gradient_of_opacity, low, slope, lengths, rate, latent, steepness,
+    gradient_of_opacity, low, slope, lengths, latent, out,
 ):  # fmt: skip
-    """One step of Adagrad on the latent density codes [n_densities], in place, kept within 0..255.
+    """The gradient of each fetch's interpolated density code into `out` [n_fetches].
 
     dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
     n_channels] are the latent feature codes, at `rows` by `shares`; `gradient` [n, n_channels] and
-    `gradient_of_opacity` [n] are those of x and A.
+    `gradient_of_opacity` [n] are those of x and A; `latent` are the density codes [n_densities].
     """
     n_channels = values.shape[1]
-    along = np.zeros(4096, np.float32)
-    for i in range(gradient.shape[0]):
-        first, end = starts[i], starts[i + 1]
-        n = min(end - first, along.shape[0])
-        behind = np.float32(0)
-        for j in range(n):
-            total = np.float32(0)
-            for corner in range(8):
-                row = rows[first + j, corner]
-                dot = np.float32(0)
-                for c in range(n_channels):
-                    dot += gradient[i, c] * np.rint(values[row, c])
-                total += shares[first + j, corner] * dot
-            along[j] = total
-            behind += weights[first + j] * total
-        trans = np.float32(1)
-        left = np.float32(1) - opacity[i]
-        for j in range(n):
-            weight = weights[first + j]
-            if weight == 0:
-                continue
-            code = np.float32(0)
-            for corner in range(8):
-                code += density_shares[first + j, corner] * np.rint(latent[density_rows[first + j, corner]])
-            delta = np.exp(low + slope * code) * lengths[first + j]
-            behind -= weight * along[j]
-            trans -= weight
-            slant = (trans * along[j] - behind + left * gradient_of_opacity[i]) * delta * slope
-            for corner in range(8):
-                slant_of_row = density_shares[first + j, corner] * slant
-                if slant_of_row == 0:
+    for chunk in prange((gradient.shape[0] + BLOCK - 1) // BLOCK):
+        for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
+            behind = np.float32(0)
+            for j in range(starts[i], starts[i + 1]):
+                along = np.float32(0)
+                for corner in range(8):
+                    row = rows[j, corner]
+                    dot = np.float32(0)
+                    for c in range(n_channels):
+                        dot += gradient[i, c] * np.rint(values[row, c])
+                    along += shares[j, corner] * dot
+                out[j] = along
+                behind += weights[j] * along
+            trans = np.float32(1)
+            left = np.float32(1) - opacity[i]
+            for j in range(starts[i], starts[i + 1]):
+                weight, along = weights[j], out[j]
+                if weight == 0:
+                    out[j] = np.float32(0)
                     continue
-                row = density_rows[first + j, corner]
-                steepness[row] += slant_of_row * slant_of_row
+                code = np.float32(0)
+                for corner in range(8):
+                    code += density_shares[j, corner] * np.rint(latent[density_rows[j, corner]])
+                delta = np.exp(low + slope * code) * lengths[j]
+                behind -= weight * along
+                trans -= weight
+                out[j] = (trans * along - behind + left * gradient_of_opacity[i]) * delta * slope
+
+
+@njit(parallel=True, cache=True)
+def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
+    """One step of Adagrad on the latent density codes [n_densities], in place, kept within 0..255, along the
+    gradients `slants` [n_fetches] of what is interpolated from `rows` by `shares`; in parts as `descend`."""
+    for part in prange(n_parts):
+        for j in range(slants.shape[0]):
+            if slants[j] == 0:
+                continue
+            for corner in range(8):
+                row = rows[j, corner]
+                slant = shares[j, corner] * slants[j]
+                if slant == 0 or (row >> OWN) % n_parts != part:
+                    continue
+                steepness[row] += slant * slant
                 if steepness[row] == 0:  # the square of next to nothing is nothing
                     continue
-                moved = latent[row] - rate * slant_of_row / np.sqrt(steepness[row])
+                moved = latent[row] - rate * slant / np.sqrt(steepness[row])
                 latent[row] = min(max(moved, np.float32(0)), np.float32(255))
 
 

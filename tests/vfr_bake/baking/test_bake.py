@@ -33,7 +33,7 @@ from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
-from vfr_bake.kernels.stored_features import descend, descend_density, weigh
+from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
@@ -231,17 +231,15 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     ((x * torch.from_numpy(gx)).sum() + (total * torch.from_numpy(ga)).sum()).backward()
     assert latent.grad is not None
 
-    # One lesson at a time: otherwise later lessons would start from where earlier ones moved the codes to.
-    moved = np.zeros(n_densities)
-    for lesson in range(n):
-        fresh = density.copy()
-        steepness = np.full(n_densities, 1e30, np.float32)
-        one = slice(lesson, lesson + 1)
-        descend_density(
-            starts[lesson : lesson + 2], rows, shares, *of_densities, weights, opacity[one], values, gx[one],
-            ga[one], low, slope, lengths, np.float32(1e13), fresh, steepness,
-        )  # fmt: skip
-        moved += (density - fresh) * 100
+    found = np.empty(n * k, np.float32)
+    slants(
+        starts, rows, shares, *of_densities, weights, opacity, values, gx, ga, low, slope, lengths, density,
+        found,
+    )  # fmt: skip
+    moved = density.copy()
+    steepness = np.full(n_densities, 1e30, np.float32)
+    descend_density(*of_densities, found, np.float32(1e13), 2, moved, steepness)
+    moved = (density - moved) * 100
     wanted = latent.grad.numpy()
     np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
 
@@ -249,16 +247,30 @@ def test_density_gradient_is_that_of_the_composite() -> None:
 def test_gradients_whose_squares_underflow_move_nothing() -> None:
     starts, ones = np.array([0, 1]), np.ones(1, np.float32)
     rows, shares = np.zeros((1, 8), np.int32), np.full((1, 8), 1 / 8, np.float32)
-    tiny = np.full((1, 2), 1e-30, np.float32)
+    tiny = np.full((1, 2), 1e-22, np.float32)
     density, values = np.full(1, 100.0, np.float32), np.full((1, 2), 50.0, np.float32)
-    rate = np.float32(1)
     steep = np.zeros(1, np.float32)
-    descend_density(
-        starts, rows, shares, rows, shares, ones / 2, ones / 2, values, tiny, tiny[0, :1], np.float32(-7),
-        np.float32(0.05), ones, rate, density, steep,
-    )  # fmt: skip
-    descend(starts, rows, shares, ones, np.full((1, 2), 1e-22, np.float32), rate, values, steep)
+    descend_density(rows, shares, tiny[0, :1], np.float32(1), 1, density, steep)
+    descend(starts, rows, shares, ones, tiny, np.float32(1), 1, values, steep)
     assert density[0] == 100 and (values == 50).all() and steep[0] == 0
+
+
+def test_a_step_does_not_depend_on_the_number_of_parts() -> None:
+    random = np.random.default_rng(0)
+    starts = np.arange(0, 601, 6)
+    rows = random.integers(0, 300, (600, 8)).astype(np.int32)
+    shares, weights = random.random((600, 8)).astype(np.float32), random.random(600).astype(np.float32)
+    gradient, found = (random.normal(size=size).astype(np.float32) for size in ((100, 3), 600))
+    results = []
+    rate = np.float32(0.1)
+    for n_parts in (1, 3):
+        values, density = np.full((300, 3), 50.0, np.float32), np.full(300, 100.0, np.float32)
+        steep = np.zeros((2, 300), np.float32)
+        descend(starts, rows, shares, weights, gradient, rate, n_parts, values, steep[0])
+        descend_density(rows, shares, found, rate, n_parts, density, steep[1])
+        results.append((values, density))
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(one, other) and np.ptp(one) > 0
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
