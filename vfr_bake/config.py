@@ -280,9 +280,9 @@ class BakeConfig:
     n_channels: int | None = None
     """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
     few as the preset's loss allows."""
-    n_samples: int | None = None
-    """Feature lookups per ray, k, exactly; 0 looks up every sample. Not given: as few as the preset's loss
-    allows. The player can be asked for another number."""
+    k: int | Literal["auto"] = "auto"
+    """Feature lookups per ray, exactly; 0 looks up every sample. Auto: as few as the preset's loss allows.
+    The player can be asked for another number."""
     weight_floor: float | None = None
     """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
     a few that loses next to nothing on views kept apart, or none."""
@@ -337,7 +337,7 @@ class BakeConfig:
         _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
         choice = self.choice()
         _check(1 <= choice.n_channels <= 64, "n_channels", "1 to 64", choice.n_channels)
-        _check(0 <= choice.n_samples <= 64, "n_samples", "0 to 64", choice.n_samples)
+        _check(self.k == "auto" or 0 <= self.k <= 64, "k", "auto or 0 to 64", self.k)
         _check(7 <= choice.code_levels <= 127, "code_levels", "7 to 127", choice.code_levels)
         _check(
             choice.head_width == 0 or 8 <= choice.head_width <= 256,
@@ -365,7 +365,10 @@ class BakeConfig:
 
         >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
         (5, 64)
+        >>> BakeConfig(k=3).choice().n_samples, BakeConfig(k="auto").choice().n_samples
+        (3, 12)
         """
         preset = PRESETS[self.preset]
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
+        given["n_samples"] = None if self.k == "auto" else self.k
         return replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -287,14 +287,14 @@ class _Bake:
 
         manifest = self._manifest(layout, arrays.features.shape[1], {})
         measure = measured_in_memory(manifest, arrays, head, self.model.cameras[0])
-        fixed = self.config.head_width is not None, self.config.n_samples is not None
+        fixed = self.config.head_width is not None, self.config.k != "auto"
         return keep_to_time(self.choice, target_ms, measure, *fixed)
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
         """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
         each number loses is kept in `lookups`."""
         most = self.choice.n_samples
-        if self.config.n_samples is None:
+        if self.config.k == "auto":
             every = self.held_out.look("all", grid, runner(head), 0).loss_db
             for k in (*(k for k in LOOKUPS if k < most), most):
                 self.n_samples = k

@@ -24,6 +24,8 @@ def bake_command(folder: str, asset: Asset) -> str:
     for name in BakeConfig.__dataclass_fields__:
         if hasattr(usual, name) and settings.get(name, getattr(usual, name)) != getattr(usual, name):
             chosen[name] = settings[name]
+    if settings.get("k", "auto") != "auto":
+        chosen["k"] = settings["k"]
     options = [word for name, value in chosen.items() if value is not None
                for word in (f"--{name.replace('_', '-')}", f"{value:g}")]  # fmt: skip
     if settings.get("no_cull"):

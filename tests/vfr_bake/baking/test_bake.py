@@ -280,7 +280,7 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
         mesh_resolution=64,
         n_channels=16,
         check_views=2,
-        n_samples=5,
+        k=5,
         head_width=0,
         refine_steps=150,
     )

@@ -68,7 +68,7 @@ def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
         head_width=0,
         check_views=1,
         n_channels=10,
-        n_samples=8,
+        k=8,
         weight_floor=0.001,
     )
     bake(model, folder, settings, quiet)
