@@ -11,7 +11,7 @@ import torch
 
 from player.contracted_rays import MAX_SPEED
 from player.errors import TrainingError
-from vfr_bake.baking.views import views_between
+from vfr_bake.baking.views import MARGIN, views_between, widened
 from vfr_bake.baking.visibility import VIEWS_OF_A_CELL, Progress, close_gaps, pixel_footprints
 from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
@@ -52,13 +52,14 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     between them.
 
     `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met HITS times
-    over all views. Raises TrainingError when nothing is seen.
+    over all views. Pictures are taken a little wider than they are: another camera of the scene sees beyond
+    their border, where the model goes on. Raises TrainingError when nothing is seen.
     """
     assert isinstance(model.sampler, ProposalSampler)
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
     cameras = model.model_cameras()
-    cameras += views_between(model, len(cameras), seed=0)
+    cameras = [widened(camera) for camera in cameras + views_between(model, len(cameras), seed=0)]
     random = np.random.default_rng(0)
     share = _share_of_pixels(model, resolution)
     for index, camera in enumerate(cameras):
@@ -79,7 +80,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
 
 def rays_of_contracted_views(model: Model, resolution: int) -> float:
     """Rays that `weighty_cells` sends out."""
-    n_pixels = sum(camera.width * camera.height for camera in model.cameras)
+    n_pixels = (1 + 2 * MARGIN) ** 2 * sum(camera.width * camera.height for camera in model.cameras)
     return 2 * _share_of_pixels(model, resolution) * n_pixels
 
 
