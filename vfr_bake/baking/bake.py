@@ -44,7 +44,7 @@ from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, 
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.unwritten import unwritten_asset
-from vfr_bake.baking.views import views_between, widened
+from vfr_bake.baking.views import views_between
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
@@ -182,10 +182,7 @@ class _Bake:
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
-            between = views_between(model, len(cameras), seed=1)
-            if layout.contracted:
-                between = [widened(camera) for camera in between]
-            views = cameras + between
+            views = cameras + views_between(model, len(cameras), seed=1, wide=layout.contracted)
             taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))

@@ -58,8 +58,8 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     assert isinstance(model.sampler, ProposalSampler)
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
-    cameras = model.model_cameras()
-    cameras = [widened(camera) for camera in cameras + views_between(model, len(cameras), seed=0)]
+    cameras = [widened(camera) for camera in model.model_cameras()]
+    cameras += views_between(model, len(cameras), seed=0, wide=True)
     random = np.random.default_rng(0)
     share = _share_of_pixels(model, resolution)
     for index, camera in enumerate(cameras):

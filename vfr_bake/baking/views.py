@@ -16,10 +16,10 @@ MARGIN = 0.1
 views see there, and what was not stored cost them a decibel and more."""
 
 
-def views_between(model: Model, n_views: int, seed: int) -> list[Camera]:
+def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> list[Camera]:
     """`n_views` training cameras (model frame), spread evenly, each turned around what all cameras look at
-    by up to half the angle to its nearest neighbour. The same seed gives the same views, another one
-    others."""
+    by up to half the angle to its nearest neighbour; `wide` ones see beyond their borders (`widened`). The
+    same seed gives the same views, another one others."""
     cameras = model.model_cameras()
     random = np.random.default_rng(seed)
     focus = focus_point(cameras)
@@ -38,7 +38,7 @@ def views_between(model: Model, n_views: int, seed: int) -> list[Camera]:
         move[:3, 3] = focus - turn @ focus
         camera = cameras[index]
         found.append(replace(camera, name=f"{camera.name} turned", c2w=move @ camera.c2w))
-    return found
+    return [widened(camera) for camera in found] if wide else found
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
