@@ -1,0 +1,83 @@
+"""What moves stored codes: gradients against torch, and steps that do not depend on how work is shared."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
+
+
+def test_density_gradient_is_that_of_the_composite() -> None:
+    # Against torch, on whole codes. Adagrad that has seen very steep slopes moves by rate * gradient / 1e15.
+    random = np.random.default_rng(0)
+    n, n_vertices, n_densities, k = 40, 200, 300, 6
+
+    def corners(n_rows: int) -> tuple[np.ndarray, np.ndarray]:
+        shares = random.random((n * k, 8)).astype(np.float32)
+        return random.integers(0, n_rows, (n * k, 8)).astype(np.int32), shares / shares.sum(1, keepdims=True)
+
+    (rows, shares), of_densities = corners(n_vertices), corners(n_densities)
+    starts = np.arange(0, n * k + 1, k)
+    density = random.integers(100, 200, n_densities).astype(np.float32)
+    values = random.integers(-90, 90, (n_vertices, 3)).astype(np.float32)
+    low, slope = np.float32(-7), np.float32(0.05)
+    lengths = random.uniform(0.02, 0.1, n * k).astype(np.float32)
+    weights, opacity = np.zeros(n * k, np.float32), np.zeros(n, np.float32)
+    opaque = np.float32(1e9)
+    weigh(starts, *of_densities, density, low, slope, lengths, opaque, weights, opacity)
+    gx, ga = random.normal(size=(n, 3)).astype(np.float32), random.normal(size=n).astype(np.float32)
+
+    latent = torch.tensor(density, dtype=torch.float64, requires_grad=True)
+    code = (latent[of_densities[0].astype(int)] * torch.from_numpy(of_densities[1]).double()).sum(dim=1)
+    delta = (torch.exp(float(low) + float(slope) * code) * torch.from_numpy(lengths)).reshape(n, k)
+    before = torch.cumsum(delta, dim=1) - delta
+    w = torch.exp(-before) * -torch.expm1(-delta)
+    np.testing.assert_allclose(weights.reshape(n, k), w.detach().numpy(), atol=1e-6)
+    f = (torch.from_numpy(values)[rows.astype(int)] * torch.from_numpy(shares)[..., None]).sum(dim=1).double()
+    x = (w[..., None] * f.reshape(n, k, 3)).sum(dim=1)
+    total = 1 - torch.exp(-delta.sum(dim=1))
+    np.testing.assert_allclose(opacity, total.detach().numpy(), atol=1e-6)
+    ((x * torch.from_numpy(gx)).sum() + (total * torch.from_numpy(ga)).sum()).backward()
+    assert latent.grad is not None
+
+    found = np.empty(n * k, np.float32)
+    slants(
+        starts, rows, shares, *of_densities, weights, opacity, values, gx, ga, low, slope, lengths, density,
+        found,
+    )  # fmt: skip
+    moved = density.copy()
+    steepness = np.full(n_densities, 1e30, np.float32)
+    descend_density(*of_densities, found, np.float32(1e13), 2, moved, steepness)
+    moved = (density - moved) * 100
+    wanted = latent.grad.numpy()
+    np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
+
+
+def test_gradients_whose_squares_underflow_move_nothing() -> None:
+    starts, ones = np.array([0, 1]), np.ones(1, np.float32)
+    rows, shares = np.zeros((1, 8), np.int32), np.full((1, 8), 1 / 8, np.float32)
+    tiny = np.full((1, 2), 1e-22, np.float32)
+    density, values = np.full(1, 100.0, np.float32), np.full((1, 2), 50.0, np.float32)
+    steep = np.zeros(1, np.float32)
+    descend_density(rows, shares, tiny[0, :1], np.float32(1), 1, density, steep)
+    descend(starts, rows, shares, ones, tiny, np.float32(1), 1, values, steep)
+    assert density[0] == 100 and (values == 50).all() and steep[0] == 0
+
+
+def test_a_step_does_not_depend_on_the_number_of_parts() -> None:
+    random = np.random.default_rng(0)
+    starts = np.arange(0, 601, 6)
+    rows = random.integers(0, 300, (600, 8)).astype(np.int32)
+    shares, weights = random.random((600, 8)).astype(np.float32), random.random(600).astype(np.float32)
+    gradient, found = (random.normal(size=size).astype(np.float32) for size in ((100, 3), 600))
+    results = []
+    rate = np.float32(0.1)
+    for n_parts in (1, 3):
+        values, density = np.full((300, 3), 50.0, np.float32), np.full(300, 100.0, np.float32)
+        steep = np.zeros((2, 300), np.float32)
+        descend(starts, rows, shares, weights, gradient, rate, n_parts, values, steep[0])
+        descend_density(rows, shares, found, rate, n_parts, density, steep[1])
+        results.append((values, density))
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(one, other) and np.ptp(one) > 0
