@@ -152,41 +152,43 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
         s, inside, g = path.place(now, active.get())
         top = grid.last.to_float()
         cell = [x.most(0.0).least(top).to_int() for x in g]
-        bricks = tuple(c >> 3 for c in cell)
+        bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
         number = (bricks[0] * grid.n_per_axis + bricks[1]) * grid.n_per_axis + bricks[2]
         slot = gather(grid.table, number, 4, inside)
         empty = inside & (slot < 0)
+        busy = inside & (slot > -1)
         i.set(now + 1)
-        with b.if_then(empty.any()):
-            i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))  # type: ignore[arg-type]
-        within = [c & 7 for c in cell]
-        column = (slot << 6) + (within[0] << 3) + within[1]
-        word = gather(grid.live, column >> 2, 4, inside & (slot > -1))
-        bit = ((column & 3) << 3) + within[2]
-        lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
-        live = lit.is_not(0)
         active.set(inside)
-        with b.if_then(live.any()):
-            at = slot * 729 + within[0] * 81 + within[1] * 9 + within[2]
-            f = [x - c.to_float() for x, c in zip(g, cell, strict=True)]
-            code = _trilinear(grid.density, at, f, live)
-            optical = (grid.low + grid.slope * code).exp() * path.way()
-            optical = choose(live, optical, zero)
-            before = trans.get()
-            total = tau.get() + optical
-            behind = (-total).exp()
-            series = 1.0 - optical * (1 / 2 - optical * (1 / 6 - optical * (1 / 24)))
-            weight = choose(optical > 0.1, before - behind, before * optical * series)
-            weight = choose(live & (weight > 0), weight, zero)
-            tau.set(total)
-            trans.set(choose(live, behind, before))
-            taken.set(taken.get() + lit)
-            active.set(inside & ~(total > float(MAX_TAU)))
-            row = b.load(n_rows)
-            place = b.mul(row, LONG(LANES))
-            store(samples, place, s)
-            store(samples, b.add(place, pitch), weight)
-            b.store(b.add(row, LONG(1)), n_rows)
+        with b.if_then(empty.any()):
+            i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))
+        with b.if_then(busy.any()):  # a grid without a slot has nothing to read
+            within = [c & 7 for c in cell]
+            column = (slot << 6) + (within[0] << 3) + within[1]
+            word = gather(grid.live, column >> 2, 4, busy)
+            bit = ((column & 3) << 3) + within[2]
+            lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
+            live = lit.is_not(0)
+            with b.if_then(live.any()):
+                at = slot * 729 + within[0] * 81 + within[1] * 9 + within[2]
+                f = [x - c.to_float() for x, c in zip(g, cell, strict=True)]
+                code = _trilinear(grid.density, at, f, live)
+                optical = (grid.low + grid.slope * code).exp() * path.way()
+                optical = choose(live, optical, zero)
+                before = trans.get()
+                total = tau.get() + optical
+                behind = (-total).exp()
+                series = 1.0 - optical * (1 / 2 - optical * (1 / 6 - optical * (1 / 24)))
+                weight = choose(optical > 0.1, before - behind, before * optical * series)
+                weight = choose(live & (weight > 0), weight, zero)
+                tau.set(total)
+                trans.set(choose(live, behind, before))
+                taken.set(taken.get() + lit)
+                active.set(inside & ~(total > float(MAX_TAU)))
+                row = b.load(n_rows)
+                place = b.mul(row, LONG(LANES))
+                store(samples, place, s)
+                store(samples, b.add(place, pitch), weight)
+                b.store(b.add(row, LONG(1)), n_rows)
     store(out, LONG(0), tau.get())
     store(out, LONG(LANES), taken.get().to_float())
     return b.load(n_rows)
