@@ -13,12 +13,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES, ROWS = (16, 12) if binding.get_host_cpu_features().get("avx512f") else (8, 6)
+from player.lanes import EXP, LANES
+
+ROWS = 12 if LANES == 16 else 6
 """32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
 WIDTH = 2 * LANES
 """Outputs of a tile."""
@@ -37,11 +39,6 @@ _ERF_P = (
 _ERF_Q = (
     1.45660718464996e-05, 2.13374055278905e-04, 1.68282697438203e-03, 7.37332916720468e-03,
     1.42647390514189e-02,
-)  # fmt: skip
-# exp(r) for |r| <= log(2) / 2, highest power first
-_EXP = (
-    1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1,
-    1.0, 1.0,
 )  # fmt: skip
 
 
@@ -95,7 +92,7 @@ class _Vectors:
         rest = self.call("fma", power, self.constant(2.12194440e-4), rest)
         bits = self.b.add(self.b.fptosi(power, _INTS), ir.Constant(_INTS, [127] * LANES))
         scale = self.b.bitcast(self.b.shl(bits, ir.Constant(_INTS, [23] * LANES)), _FLOATS)
-        exp = self.b.fmul(self.polynomial(_EXP, rest), scale)
+        exp = self.b.fmul(self.polynomial(EXP, rest), scale)
         value = self.b.fdiv(self.constant(1), self.b.fadd(self.constant(1), exp))
         return self.b.select(self.b.fcmp_unordered("uno", x, x), x, value)  # what is no number stays none
 

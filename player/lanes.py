@@ -21,11 +21,11 @@ LANES = 16 if binding.get_host_cpu_features().get("avx512f") else 8
 FLOAT, INT, LONG, BYTE = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(8)
 _SIZES = {FLOAT: "f32", INT: "i32"}
 
-# exp(r) for |r| <= log(2) / 2, highest power first: Cephes
-_EXP = (
+EXP = (
     1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1,
     1.0, 1.0,
 )  # fmt: skip
+"""exp(r) for |r| <= log(2) / 2, highest power first: the polynomial of Cephes."""
 
 
 def vector(element: Any) -> ir.VectorType:
@@ -148,8 +148,8 @@ class Lanes:
         power = (y * np.log2(np.e)).call("rint")
         rest = power.call("fma", -0.693359375, y)
         rest = power.call("fma", 2.12194440e-4, rest)
-        total = self.like(_EXP[0])
-        for coefficient in _EXP[1:]:
+        total = self.like(EXP[0])
+        for coefficient in EXP[1:]:
             total = total.call("fma", rest, coefficient)
         exponent = power.to_int()
         half = exponent >> 1  # in two parts: 2^-150 is no float32, but what it makes of 1 is
