@@ -3,167 +3,65 @@
 A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold. Its sums
 never leave them before the activation is applied, where a library writes the products, reads them for the
 bias, and reads them again for the GELU. Compiled code alone imports this.
-
-    gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
-    sigmoid(x) = 1 / (1 + exp(-x)), exp by the polynomial of Cephes: to 2e-7
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.lanes import EXP, LANES
+from player.activations import activated
+from player.lanes import BYTE, FLOAT, INT, LANES, LONG, Lanes, load, splat, store, vector
 
 ROWS = 12 if LANES == 16 else 6
 """32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
 WIDTH = 2 * LANES
 """Outputs of a tile."""
-LINEAR, GELU, SIGMOID = range(3)
 
-_FLOATS = ir.VectorType(ir.FloatType(), LANES)
-_INTS = ir.VectorType(ir.IntType(32), LANES)
-_NOTHING = ir.Constant(_FLOATS, ir.Undefined)
-_FIRST_LANE = ir.Constant(_INTS, [0] * LANES)
-
-# erf(z) = z P(z^2) / Q(z^2) for |z| <= 4, highest power first; Q > 0
-_ERF_P = (
-    2.72614225801306e-10, -2.77068142495902e-08, 2.10102402082508e-06, 5.69250639462346e-05,
-    7.34990630326855e-04, 2.95459980854025e-03, 1.60960333262415e-02,
-)  # fmt: skip
-_ERF_Q = (
-    1.45660718464996e-05, 2.13374055278905e-04, 1.68282697438203e-03, 7.37332916720468e-03,
-    1.42647390514189e-02,
-)  # fmt: skip
+QUAD = 4
+"""Products of bytes that the processor adds up at once."""
+_features = binding.get_host_cpu_features()
+MULTIPLIES_BYTES = bool(_features.get("avx512vnni" if LANES == 16 else "avxvnni"))
+"""Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
+_DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
 
 
-class _Vectors:
-    """Arithmetic on vectors, in the order in which it is written."""
-
-    def __init__(self, builder: Any) -> None:
-        self.b = builder
-
-    def constant(self, value: float) -> Any:
-        return ir.Constant(_FLOATS, [float(np.float32(value))] * LANES)
-
-    def call(self, name: str, *values: Any) -> Any:
-        kind = ir.FunctionType(_FLOATS, [_FLOATS] * len(values))
-        name = f"llvm.{name}.v{LANES}f32"
-        return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), values)
-
-    def splat(self, value: Any) -> Any:
-        one = self.b.insert_element(_NOTHING, value, ir.IntType(32)(0))
-        return self.b.shuffle_vector(one, _NOTHING, _FIRST_LANE)
-
-    def polynomial(self, coefficients: tuple[float, ...], x: Any) -> Any:
-        value = self.constant(coefficients[0])
-        for coefficient in coefficients[1:]:
-            value = self.call("fma", value, x, self.constant(coefficient))
-        return value
-
-    def inverse(self, x: Any) -> Any:
-        """1 / x of ordinary numbers, in half the time of a division: a guess from the bits, 5 % wrong, and
-        three steps of Newton, each of which squares what is wrong."""
-        bits = self.b.sub(ir.Constant(_INTS, [0x7EF311C7] * LANES), self.b.bitcast(x, _INTS))
-        guess = self.b.bitcast(bits, _FLOATS)
-        for _ in range(3):
-            wrong = self.call("fma", self.b.fneg(x), guess, self.constant(2))
-            guess = self.b.fmul(guess, wrong)
-        return guess
-
-    def gelu(self, x: Any) -> Any:
-        z = self.b.fmul(x, self.constant(0.5**0.5))
-        z = self.call("minnum", self.call("maxnum", z, self.constant(-4)), self.constant(4))
-        square = self.b.fmul(z, z)
-        below = self.inverse(self.polynomial(_ERF_Q, square))
-        erf = self.b.fmul(self.b.fmul(z, self.polynomial(_ERF_P, square)), below)
-        half = self.b.fmul(x, self.constant(0.5))
-        return self.call("fma", half, erf, half)
-
-    def sigmoid(self, x: Any) -> Any:
-        y = self.call("minnum", self.call("maxnum", self.b.fneg(x), self.constant(-87)), self.constant(87))
-        power = self.call("rint", self.b.fmul(y, self.constant(np.log2(np.e))))
-        rest = self.call("fma", power, self.constant(-0.693359375), y)
-        rest = self.call("fma", power, self.constant(2.12194440e-4), rest)
-        bits = self.b.add(self.b.fptosi(power, _INTS), ir.Constant(_INTS, [127] * LANES))
-        scale = self.b.bitcast(self.b.shl(bits, ir.Constant(_INTS, [23] * LANES)), _FLOATS)
-        exp = self.b.fmul(self.polynomial(EXP, rest), scale)
-        value = self.b.fdiv(self.constant(1), self.b.fadd(self.constant(1), exp))
-        return self.b.select(self.b.fcmp_unordered("uno", x, x), x, value)  # what is no number stays none
-
-
-def _tile(
+def _dense(
     _: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any, act: Any
 ) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        vectors = _Vectors(builder)
-
-        def base(index: int) -> Any:
-            return context.make_array(signature.args[index])(context, builder, arguments[index]).data
-
-        def pair(index: int) -> tuple[Any, Any]:
-            return tuple(builder.extract_value(arguments[index], i) for i in range(2))  # type: ignore[return-value]
-
-        def place(array: Any, at: Any) -> Any:
-            return builder.bitcast(builder.gep(array, [at]), ir.PointerType(_FLOATS))
-
-        here, there = base(0), base(1)
-        (x_at, x_pitch), (w_at, w_pitch), (out_at, out_pitch) = pair(2), pair(3), pair(5)
-        starts_in_memory = builder.icmp_signed(
-            "!=", builder.extract_value(arguments[4], 2), ir.IntType(64)(0)
-        )
-        first = builder.select(starts_in_memory, here, there)
-        start_at, start_pitch = pair(4)
-        size = ir.IntType(64)
-        sums = [[cgutils.alloca_once(builder, _FLOATS) for _ in range(2)] for _ in range(ROWS)]
+        here, there = (_base(context, builder, signature, arguments, index) for index in (0, 1))
+        (x_at, x_pitch), (w_at, w_pitch), out = (_pair(builder, arguments[index]) for index in (2, 3, 5))
+        in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
+        first = builder.select(in_memory, here, there)
+        start_at, start_pitch = _pair(builder, arguments[4])
+        sums = _Sums(builder, FLOAT)
         for row in range(ROWS):
-            at = builder.add(start_at, builder.mul(start_pitch, size(row)))
+            at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
             for half in range(2):
-                value = builder.load(place(first, builder.add(at, size(half * LANES))), align=4)
-                builder.store(value, sums[row][half])
-        x_rows = [builder.gep(here, [builder.add(x_at, builder.mul(x_pitch, size(r)))]) for r in range(ROWS)]
+                sums.set(row, half, load(builder, first, builder.add(at, LONG(half * LANES))))
+        x_rows = _rows(builder, here, x_at, x_pitch)
         with cgutils.for_range(builder, arguments[6]) as loop:
             at = builder.add(w_at, builder.mul(w_pitch, loop.index))
-            columns = [
-                builder.load(place(there, builder.add(at, size(half * LANES))), align=4) for half in range(2)
-            ]
+            columns = [load(builder, there, builder.add(at, LONG(half * LANES))) for half in range(2)]
             for row in range(ROWS):
-                value = vectors.splat(builder.load(builder.gep(x_rows[row], [loop.index])))
+                value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
                 for half in range(2):
-                    total = vectors.call("fma", value, columns[half], builder.load(sums[row][half]))
-                    builder.store(total, sums[row][half])
-
-        def finish(function: Any) -> None:
-            for row in range(ROWS):
-                at = builder.add(out_at, builder.mul(out_pitch, size(row)))
-                for half in range(2):
-                    value = function(builder.load(sums[row][half]))
-                    builder.store(value, place(here, builder.add(at, size(half * LANES))), align=4)
-
-        is_gelu, is_sigmoid = (
-            builder.icmp_signed("==", arguments[7], arguments[7].type(kind)) for kind in (GELU, SIGMOID)
-        )
-        with builder.if_else(is_gelu) as (then, otherwise):
-            with then:
-                finish(vectors.gelu)
-            with otherwise, builder.if_else(is_sigmoid) as (then, otherwise):
-                with then:
-                    finish(vectors.sigmoid)
-                with otherwise:
-                    finish(lambda value: value)
+                    sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
+        activated(builder, arguments[7], lambda function: sums.write(here, out, lambda x, _: function(x)))
         return context.get_dummy_value()
 
     two, three = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
     return types.void(memory, weights, two, two, three, two, types.int64, types.int64), generate
 
 
-dense_tile: Any = intrinsic(_tile)
+dense_tile: Any = intrinsic(_dense)
 """dense_tile(memory, weights, x, w, start, out, depth, activation): ROWS by WIDTH outputs of one layer.
 
 `memory` and `weights` are flat float32. x, w, out: (index of the first number, numbers from row to row), w in
@@ -172,15 +70,115 @@ what the sums begin with, a bias with 0 from row to row. depth: inputs of the la
 """
 
 
+def _dense_bytes(
+    _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any, act: Any
+) -> Any:
+    packed, starts, scales = weights
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
+            return context.get_dummy_value()
+        bytes_here, here = (_base(context, builder, signature, arguments, index) for index in (0, 1))
+        parts = [builder.extract_value(arguments[2], index) for index in range(3)]
+        packed_there, starts_there, scales_there = (
+            context.make_array(kind)(context, builder, part).data
+            for kind, part in zip((packed, starts, scales), parts, strict=True)
+        )
+        (x_at, x_pitch), out = (_pair(builder, arguments[index]) for index in (3, 6))
+        start_at, scale_at = _pair(builder, arguments[5])
+        sums = _Sums(builder, INT)
+        for half in range(2):
+            start = load(builder, starts_there, builder.add(start_at, LONG(half * LANES)), INT)
+            for row in range(ROWS):
+                sums.set(row, half, start)
+        quads = ir.PointerType(INT)
+        x_rows = [builder.bitcast(row, quads) for row in _rows(builder, bytes_here, x_at, x_pitch)]
+        words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
+        lanes, quartets = vector(INT), ir.VectorType(BYTE, QUAD * LANES)
+        dot = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(lanes, [lanes, quartets, quartets]), _DOT
+        )
+        with cgutils.for_range(builder, arguments[7]) as loop:
+            at = builder.mul(loop.index, LONG(WIDTH))
+            columns = [load(builder, words, builder.add(at, LONG(half * LANES)), INT) for half in range(2)]
+            columns = [builder.bitcast(column.value, quartets) for column in columns]
+            for row in range(ROWS):
+                quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
+                for half in range(2):
+                    factors = builder.bitcast(quad.value, quartets), columns[half]
+                    total = builder.call(dot, [sums.get(row, half).value, *factors])
+                    sums.set(row, half, Lanes(builder, total))
+        halves = [
+            load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)
+        ]
+        activated(
+            builder, arguments[8],
+            lambda function: sums.write(here, out, lambda x, half: function(x.to_float() * halves[half])),
+        )  # fmt: skip
+        return context.get_dummy_value()
+
+    two = types.UniTuple(types.int64, 2)
+    return types.void(codes, memory, weights, two, types.int64, two, two, types.int64, types.int64), generate
+
+
+dense_bytes_tile: Any = intrinsic(_dense_bytes)
+"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads, activation): the same of 8-bit codes,
+where MULTIPLIES_BYTES.
+
+`codes` are flat uint8, `memory` flat float32. `weights`: int8 codes, QUAD inputs of one output beside each
+other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 steps of the sums.
+x: as above, in `codes`; w: the first of the tile's codes; places: (first start, first step); out: in
+`memory`.
+"""
+
+
+def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:
+    """The nearest of 256 levels, as a float."""
+    shift = splat(x.b, x.b.sitofp(zero, FLOAT))
+    return ((x * splat(x.b, per_step)).call("rint") + shift).most(0).least(255)
+
+
+def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bytes_here, here = (_base(context, builder, signature, arguments, index) for index in (0, 1))
+        code = _code(load(builder, here, arguments[3]), *arguments[4:])
+        narrow = ir.VectorType(BYTE, LANES)
+        place = builder.bitcast(builder.gep(bytes_here, [arguments[2]]), ir.PointerType(narrow))
+        builder.store(builder.trunc(code.to_int().value, narrow), place, align=1)
+        return context.get_dummy_value()
+
+    long = types.int64
+    return types.void(codes, memory, long, long, long, types.float32), generate
+
+
+quantize_lanes: Any = intrinsic(_quantize)
+"""quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
+
+
+def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any, step: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        here = _base(context, builder, signature, arguments, 0)
+        _, out, x, zero, per_step, step = arguments
+        levels = _code(load(builder, here, x), zero, per_step) - splat(builder, builder.sitofp(zero, FLOAT))
+        store(here, out, levels * splat(builder, step))
+        return context.get_dummy_value()
+
+    long, number = types.int64, types.float32
+    return types.void(memory, long, long, long, number, number), generate
+
+
+round_lanes: Any = intrinsic(_round)
+"""round_lanes(memory, out, x, zero, per_step, step): the numbers that those codes stand for."""
+
+
 def _multiply(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        to, *factors = (
-            builder.bitcast(builder.gep(array, [at]), ir.PointerType(_FLOATS)) for at in arguments[1:]
-        )
-        one, other = (builder.load(factor, align=4) for factor in factors)
-        builder.store(builder.fmul(one, other), to, align=4)
+        array = _base(context, builder, signature, arguments, 0)
+        one, other = (load(builder, array, at) for at in arguments[2:])
+        store(array, arguments[1], one * other)
         return context.get_dummy_value()
 
     return types.void(memory, types.int64, types.int64, types.int64), generate
@@ -191,3 +189,43 @@ multiply_lanes: Any = intrinsic(_multiply)
 
 The compiler does not do so by itself: it cannot know that the three do not overlap.
 """
+
+
+class _Sums:
+    """ROWS by two vectors that a loop adds to."""
+
+    def __init__(self, builder: Any, element: Any) -> None:
+        self._builder = builder
+        self._places = [
+            [cgutils.alloca_once(builder, vector(element)) for _ in range(2)] for _ in range(ROWS)
+        ]
+
+    def get(self, row: int, half: int) -> Lanes:
+        return Lanes(self._builder, self._builder.load(self._places[row][half]))
+
+    def set(self, row: int, half: int, value: Lanes) -> None:
+        self._builder.store(value.value, self._places[row][half])
+
+    def write(self, array: Any, out: tuple[Any, Any], function: Callable[[Lanes, int], Lanes]) -> None:
+        """To `array`, a row at a time, what `function` makes of a sum and which half it is."""
+        at, pitch = out
+        for row in range(ROWS):
+            start = self._builder.add(at, self._builder.mul(pitch, LONG(row)))
+            for half in range(2):
+                place = self._builder.add(start, LONG(half * LANES))
+                store(array, place, function(self.get(row, half), half))
+
+
+def _base(context: Any, builder: Any, signature: Any, arguments: Any, index: int) -> Any:
+    return context.make_array(signature.args[index])(context, builder, arguments[index]).data
+
+
+def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
+    return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
+
+
+def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:
+    """Where each of ROWS rows begins."""
+    return [
+        builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)
+    ]

@@ -13,7 +13,8 @@ import numpy as np
 
 from player.head import _dims, _fields
 
-FLOAT = 1
+KINDS = {1: "<f4", 2: "u1", 3: "i1", 6: "<i4"}
+"""TensorProto's numbers of the types that are read."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """Nodes in the file's order, and the float32 constants by name."""
+    """Nodes in the file's order, and constants by name: float32, int32, and bytes."""
 
     nodes: list[Node]
     constants: dict[str, np.ndarray]
@@ -73,7 +74,8 @@ def _read_constant(data: bytes, constants: dict[str, np.ndarray]) -> None:
     parts = dict(_fields(data))
     name, raw = parts.get(8), parts.get(9)
     shape = list(_dims(data))
-    if not isinstance(name, bytes) or not isinstance(raw, bytes) or parts.get(2) != FLOAT:
+    kind = KINDS.get(number) if isinstance(number := parts.get(2), int) else None
+    if not isinstance(name, bytes) or not isinstance(raw, bytes) or kind is None:
         return
-    if len(raw) == 4 * int(np.prod(shape, dtype=np.int64)):
-        constants[name.decode(errors="replace")] = np.frombuffer(raw, "<f4").reshape(shape)
+    if len(raw) == np.dtype(kind).itemsize * int(np.prod(shape, dtype=np.int64)):
+        constants[name.decode(errors="replace")] = np.frombuffer(raw, kind).reshape(shape)
