@@ -155,6 +155,16 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
     return model.SerializeToString(deterministic=True)
 
 
+def levels(limits: Range) -> tuple[float, int]:
+    """What a step between the 256 levels of a range counts, and the code of 0.
+
+    >>> levels((-0.1, 25.4))
+    (0.1, 1)
+    """
+    scale = max((limits[1] - limits[0]) / 255, 1e-12)
+    return scale, int(np.clip(np.rint(-limits[0] / scale), 0, 255))
+
+
 class _Graph:
     """Nodes and constants collected in order."""
 
@@ -190,8 +200,7 @@ class _Graph:
     def quantized(self, x: str, limits: Range) -> str:
         """`x` rounded to 256 levels between its limits, zero among them; what follows may multiply in 8
         bits."""
-        scale = max((limits[1] - limits[0]) / 255, 1e-12)
-        zero = int(np.clip(np.rint(-limits[0] / scale), 0, 255))
+        scale, zero = levels(limits)
         steps = [
             self.constant(f"{x}_scale", np.array(scale)),
             self.constant(f"{x}_zero", np.array(zero, np.uint8)),

@@ -1,7 +1,13 @@
 """What follows a layer, on vectors of numbers in registers. Compiled code alone imports this.
 
+A pass of its own over numbers that are still in cache: dozens of dependent operations on each, which the
+processor does for many vectors at once if they follow one another in a short loop.
+
     gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
     sigmoid(x) = 1 / (1 + exp(-x))
+
+What is rounded to 8 bits next needs no more than a hundredth of a level: there erf(x / sqrt 2) = x R(x^2), R
+the polynomial of least error for |x| <= 4.4; gelu to 2e-5 there, to 2e-5 |x| beyond, in half the operations.
 """
 
 from __future__ import annotations
@@ -10,8 +16,10 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
-from player.lanes import INT, Lanes, choose, vector
+from player.lanes import BYTE, FLOAT, INT, Lanes, address, choose, load, splat, store, vector
 
 LINEAR, GELU, SIGMOID = range(3)
 
@@ -25,31 +33,34 @@ _ERF_Q = (
     1.42647390514189e-02,
 )  # fmt: skip
 
-
-def activated(builder: Any, kind: Any, write: Callable[[Callable[[Lanes], Lanes]], None]) -> None:
-    """Have `write` write everything as the activation `kind`, a number known when it runs, makes it."""
-    is_gelu, is_sigmoid = (
-        builder.icmp_signed("==", kind, ir.Constant(kind.type, number)) for number in (GELU, SIGMOID)
-    )
-    with builder.if_else(is_gelu) as (then, otherwise):
-        with then:
-            write(gelu)
-        with otherwise, builder.if_else(is_sigmoid) as (then, otherwise):
-            with then:
-                write(sigmoid)
-            with otherwise:
-                write(lambda x: x)
+_COARSE_ERF = (
+    -3.31304235e-12, 3.86883086e-10, -2.02409835e-08, 6.31625785e-07, -1.32439351e-05, 1.99793287e-04,
+    -2.26451886e-03, 1.97172119e-02, -1.32739567e-01, 7.97796237e-01,
+)  # fmt: skip
+_COARSE_END = 4.4
 
 
-def gelu(x: Lanes) -> Lanes:
-    z = (x * 0.5**0.5).most(-4).least(4)
+def _gelu(x: Lanes) -> Lanes:
+    z = _within(x * 0.5**0.5, 4.0)
     square = z * z
     erf = z * _polynomial(_ERF_P, square) * _inverse(_polynomial(_ERF_Q, square))
     half = x * 0.5
     return half.call("fma", erf, half)
 
 
-def sigmoid(x: Lanes) -> Lanes:
+def _coarse_gelu(x: Lanes) -> Lanes:
+    near = _within(x, _COARSE_END)
+    half = x * 0.5
+    return half.call("fma", near * _polynomial(_COARSE_ERF, near * near), half)
+
+
+def _within(x: Lanes, most: float) -> Lanes:
+    """What is no number stays none, which the processor's own least and most do as well."""
+    x = choose(x < -most, x.like(-most), x)
+    return choose(x > most, x.like(most), x)
+
+
+def _sigmoid(x: Lanes) -> Lanes:
     """What is no number stays none."""
     y = (-x).most(-87).least(87)
     return choose(Lanes(x.b, x.b.fcmp_unordered("uno", x.value, x.value)), x, 1.0 / (y.exp() + 1))
@@ -70,3 +81,71 @@ def _inverse(x: Lanes) -> Lanes:
     for _ in range(3):
         guess = guess * (-x).call("fma", guess, 2.0)
     return guess
+
+
+def _in_place(function: Callable[[Lanes], Lanes]) -> Any:
+
+    def typed(_: Any, memory: Any, at: Any) -> Any:
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array = address(context, builder, signature.args[0], arguments[0])
+            store(array, arguments[1], function(load(builder, array, arguments[1])))
+            return context.get_dummy_value()
+
+        return types.void(memory, types.int64), generate
+
+    return intrinsic(typed)
+
+
+gelu_lanes: Any = _in_place(_gelu)
+"""gelu_lanes(memory, at): of LANES numbers in `memory` [n] float32, in place."""
+sigmoid_lanes: Any = _in_place(_sigmoid)
+"""sigmoid_lanes(memory, at): the same."""
+
+
+def _to_codes(function: Callable[[Lanes], Lanes]) -> Any:
+
+    def typed(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            there, here = (address(context, builder, signature.args[n], arguments[n]) for n in range(2))
+            code = _code(function(load(builder, here, arguments[3])), *arguments[4:])
+            narrow = vector(BYTE)
+            place = builder.bitcast(builder.gep(there, [arguments[2]]), ir.PointerType(narrow))
+            builder.store(builder.trunc(code.to_int().value, narrow), place, align=1)
+            return context.get_dummy_value()
+
+        long = types.int64
+        return types.void(codes, memory, long, long, long, types.float32), generate
+
+    return intrinsic(typed)
+
+
+quantize_lanes: Any = _to_codes(lambda x: x)
+"""quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
+gelu_to_codes: Any = _to_codes(_coarse_gelu)
+"""gelu_to_codes(codes, memory, out, x, zero, per_step): of their GELU."""
+
+
+def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any, step: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        here = address(context, builder, signature.args[0], arguments[0])
+        _, out, x, zero, per_step, step = arguments
+        levels = _code(load(builder, here, x), zero, per_step) - splat(builder, builder.sitofp(zero, FLOAT))
+        store(here, out, levels * splat(builder, step))
+        return context.get_dummy_value()
+
+    long, number = types.int64, types.float32
+    return types.void(memory, long, long, long, number, number), generate
+
+
+round_lanes: Any = intrinsic(_round)
+"""round_lanes(memory, out, x, zero, per_step, step): the numbers that the codes of `quantize_lanes` stand
+for."""
+
+
+def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:
+    """The nearest of 256 levels, as a float."""
+    shift = splat(x.b, x.b.sitofp(zero, FLOAT))
+    return ((x * splat(x.b, per_step)).call("rint") + shift).most(0).least(255)

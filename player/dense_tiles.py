@@ -1,8 +1,7 @@
-"""A tile of a dense layer, activation and all, in registers: what `player.head_compiled` is made of.
+"""A tile of a dense layer in registers: what `player.head_compiled` is made of.
 
-A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold. Its sums
-never leave them before the activation is applied, where a library writes the products, reads them for the
-bias, and reads them again for the GELU. Compiled code alone imports this.
+A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold; in float32,
+and in 8 bits where the processor multiplies bytes. Compiled code alone imports this.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.activations import activated
-from player.lanes import BYTE, FLOAT, INT, LANES, LONG, Lanes, load, splat, store, vector
+from player.lanes import BYTE, FLOAT, INT, LANES, LONG, Lanes, address, load, splat, store, vector
 
 ROWS = 12 if LANES == 16 else 6
 """32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
@@ -25,18 +23,19 @@ WIDTH = 2 * LANES
 
 QUAD = 4
 """Products of bytes that the processor adds up at once."""
+MOST_BYTES = 256
+"""Inputs of a layer in 8 bits, at most: bytes from a pixel to the next. A number that the compiler knows
+saves it a register for each row."""
 _features = binding.get_host_cpu_features()
 MULTIPLIES_BYTES = bool(_features.get("avx512vnni" if LANES == 16 else "avxvnni"))
 """Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
 
 
-def _dense(
-    _: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any, act: Any
-) -> Any:
+def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        here, there = (_base(context, builder, signature, arguments, index) for index in (0, 1))
+        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
         (x_at, x_pitch), (w_at, w_pitch), out = (_pair(builder, arguments[index]) for index in (2, 3, 5))
         in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
         first = builder.select(in_memory, here, there)
@@ -54,15 +53,15 @@ def _dense(
                 value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
                 for half in range(2):
                     sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
-        activated(builder, arguments[7], lambda function: sums.write(here, out, lambda x, _: function(x)))
+        sums.write(here, out, lambda x, _: x)
         return context.get_dummy_value()
 
     two, three = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
-    return types.void(memory, weights, two, two, three, two, types.int64, types.int64), generate
+    return types.void(memory, weights, two, two, three, two, types.int64), generate
 
 
 dense_tile: Any = intrinsic(_dense)
-"""dense_tile(memory, weights, x, w, start, out, depth, activation): ROWS by WIDTH outputs of one layer.
+"""dense_tile(memory, weights, x, w, start, out, depth): ROWS by WIDTH outputs of one layer.
 
 `memory` and `weights` are flat float32. x, w, out: (index of the first number, numbers from row to row), w in
 `weights`, the others in `memory`. start: the same, and whether it is in `memory` rather than in `weights`;
@@ -71,20 +70,22 @@ what the sums begin with, a bias with 0 from row to row. depth: inputs of the la
 
 
 def _dense_bytes(
-    _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any, act: Any
+    _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any
 ) -> Any:
     packed, starts, scales = weights
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
             return context.get_dummy_value()
-        bytes_here, here = (_base(context, builder, signature, arguments, index) for index in (0, 1))
+        bytes_here, here = (
+            address(context, builder, signature.args[index], arguments[index]) for index in (0, 1)
+        )
         parts = [builder.extract_value(arguments[2], index) for index in range(3)]
         packed_there, starts_there, scales_there = (
-            context.make_array(kind)(context, builder, part).data
+            address(context, builder, kind, part)
             for kind, part in zip((packed, starts, scales), parts, strict=True)
         )
-        (x_at, x_pitch), out = (_pair(builder, arguments[index]) for index in (3, 6))
+        out = _pair(builder, arguments[6])
         start_at, scale_at = _pair(builder, arguments[5])
         sums = _Sums(builder, INT)
         for half in range(2):
@@ -92,7 +93,8 @@ def _dense_bytes(
             for row in range(ROWS):
                 sums.set(row, half, start)
         quads = ir.PointerType(INT)
-        x_rows = [builder.bitcast(row, quads) for row in _rows(builder, bytes_here, x_at, x_pitch)]
+        x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
+        x_rows = [builder.bitcast(row, quads) for row in x_rows]
         words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
         lanes, quartets = vector(INT), ir.VectorType(BYTE, QUAD * LANES)
         dot = cgutils.get_or_insert_function(
@@ -108,75 +110,29 @@ def _dense_bytes(
                     factors = builder.bitcast(quad.value, quartets), columns[half]
                     total = builder.call(dot, [sums.get(row, half).value, *factors])
                     sums.set(row, half, Lanes(builder, total))
-        halves = [
-            load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)
-        ]
-        activated(
-            builder, arguments[8],
-            lambda function: sums.write(here, out, lambda x, half: function(x.to_float() * halves[half])),
-        )  # fmt: skip
+        halves = [load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)]
+        sums.write(here, out, lambda x, half: x.to_float() * halves[half])
         return context.get_dummy_value()
 
-    two = types.UniTuple(types.int64, 2)
-    return types.void(codes, memory, weights, two, types.int64, two, two, types.int64, types.int64), generate
+    long, two = types.int64, types.UniTuple(types.int64, 2)
+    return types.void(codes, memory, weights, long, long, two, two, long), generate
 
 
 dense_bytes_tile: Any = intrinsic(_dense_bytes)
-"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads, activation): the same of 8-bit codes,
-where MULTIPLIES_BYTES.
+"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): the same of 8-bit codes, where
+MULTIPLIES_BYTES.
 
 `codes` are flat uint8, `memory` flat float32. `weights`: int8 codes, QUAD inputs of one output beside each
 other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 steps of the sums.
-x: as above, in `codes`; w: the first of the tile's codes; places: (first start, first step); out: in
-`memory`.
+x: the first code of the first pixel, MOST_BYTES before the next one's; w: the first of the tile's codes;
+places: (first start, first step); out: in `memory`.
 """
-
-
-def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:
-    """The nearest of 256 levels, as a float."""
-    shift = splat(x.b, x.b.sitofp(zero, FLOAT))
-    return ((x * splat(x.b, per_step)).call("rint") + shift).most(0).least(255)
-
-
-def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bytes_here, here = (_base(context, builder, signature, arguments, index) for index in (0, 1))
-        code = _code(load(builder, here, arguments[3]), *arguments[4:])
-        narrow = ir.VectorType(BYTE, LANES)
-        place = builder.bitcast(builder.gep(bytes_here, [arguments[2]]), ir.PointerType(narrow))
-        builder.store(builder.trunc(code.to_int().value, narrow), place, align=1)
-        return context.get_dummy_value()
-
-    long = types.int64
-    return types.void(codes, memory, long, long, long, types.float32), generate
-
-
-quantize_lanes: Any = intrinsic(_quantize)
-"""quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
-
-
-def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any, step: Any) -> Any:
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        here = _base(context, builder, signature, arguments, 0)
-        _, out, x, zero, per_step, step = arguments
-        levels = _code(load(builder, here, x), zero, per_step) - splat(builder, builder.sitofp(zero, FLOAT))
-        store(here, out, levels * splat(builder, step))
-        return context.get_dummy_value()
-
-    long, number = types.int64, types.float32
-    return types.void(memory, long, long, long, number, number), generate
-
-
-round_lanes: Any = intrinsic(_round)
-"""round_lanes(memory, out, x, zero, per_step, step): the numbers that those codes stand for."""
 
 
 def _multiply(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = _base(context, builder, signature, arguments, 0)
+        array = address(context, builder, signature.args[0], arguments[0])
         one, other = (load(builder, array, at) for at in arguments[2:])
         store(array, arguments[1], one * other)
         return context.get_dummy_value()
@@ -216,16 +172,10 @@ class _Sums:
                 store(array, place, function(self.get(row, half), half))
 
 
-def _base(context: Any, builder: Any, signature: Any, arguments: Any, index: int) -> Any:
-    return context.make_array(signature.args[index])(context, builder, arguments[index]).data
-
-
 def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
     return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
 
 
 def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:
     """Where each of ROWS rows begins."""
-    return [
-        builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)
-    ]
+    return [builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)]

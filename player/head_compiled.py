@@ -1,24 +1,33 @@
 """The head, compiled by numba: the same graph that onnxruntime runs, in blocks whose numbers stay in cache.
 
 A head as `exporters.onnx_head` writes it is a dozen small matrix products with a GELU behind each.
-onnxruntime makes a pass over memory of every operation, and a third of its time goes into GELU alone; here a
-product and what follows it are one pass (`player.dense_tiles`), in float32 and in 8 bits.
+onnxruntime makes a pass over memory of every operation, and a third of its time goes into GELU alone; here
+all operations are done on a block of pixels (`player.dense_tiles`, `player.activations`), in float32 and in
+8 bits.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from player.activations import (
+    GELU,
+    SIGMOID,
+    gelu_lanes,
+    gelu_to_codes,
+    quantize_lanes,
+    round_lanes,
+    sigmoid_lanes,
+)
 from player.compiling import compiled
 from player.dense_tiles import (
     LANES,
+    MOST_BYTES,
     ROWS,
     WIDTH,
     dense_bytes_tile,
     dense_tile,
     multiply_lanes,
-    quantize_lanes,
-    round_lanes,
 )
 from player.head_program import (
     BLOCK,
@@ -77,7 +86,7 @@ def _run(steps, weights, integers, memory, codes, features, dirs, rgb, places):
             elif step[0] == MULTIPLY:
                 _multiply(memory, step[8], step[1], step[3], n * step[2])
             elif step[0] == QUANTIZE:
-                _quantize(codes, memory, weights, step, n * step[2])
+                _quantize(codes, memory, weights, step, n)
             elif step[0] == ROUND:
                 _round(memory, weights, step, n * step[2])
             else:
@@ -96,15 +105,22 @@ def _multiply(memory, out, a, b, n):
 
 @compiled
 def _quantize(codes, memory, weights, step, n):
-    for i in range(0, n, LANES):
-        quantize_lanes(codes, memory, step[8] + i, step[1] + i, step[4], weights[step[3]])
+    x, pitch, zero, per_step, out = step[1], step[2], step[4], weights[step[3]], step[8]
+    for _ in range(n):
+        if step[11] == GELU:
+            for i in range(0, pitch, LANES):
+                gelu_to_codes(codes, memory, out + i, x + i, zero, per_step)
+        else:
+            for i in range(0, pitch, LANES):
+                quantize_lanes(codes, memory, out + i, x + i, zero, per_step)
+        x, out = x + pitch, out + MOST_BYTES
 
 
 @compiled
 def _round(memory, weights, step, n):
-    per_step, of_step = weights[step[3]], weights[step[3] + 1]
+    out, x, zero, per_step, of_step = step[8], step[1], step[4], weights[step[3]], weights[step[3] + 1]
     for i in range(0, n, LANES):
-        round_lanes(memory, step[8] + i, step[1] + i, step[4], per_step, of_step)
+        round_lanes(memory, out + i, x + i, zero, per_step, of_step)
 
 
 @compiled
@@ -130,18 +146,30 @@ def _dense(memory, weights, step, n):
             dense_tile(
                 memory, weights, (x + row * x_pitch, x_pitch), (w + first, w_pitch),
                 (start + first + row * start_pitch, start_pitch, step[7]),
-                (out + first + row * pitch, pitch), step[10], step[11],
+                (out + first + row * pitch, pitch), step[10],
             )  # fmt: skip
+    _activate(memory, out, n * pitch, step[11])
+
+
+@compiled
+def _activate(memory, at, n, kind):
+    if kind == GELU:
+        for i in range(at, at + n, LANES):
+            gelu_lanes(memory, i)
+    elif kind == SIGMOID:
+        for i in range(at, at + n, LANES):
+            sigmoid_lanes(memory, i)
 
 
 @compiled
 def _dense_bytes(codes, memory, packed, starts, weights, step, n):
     """The same of a layer in 8 bits."""
-    x, x_pitch, w, start, scale, out, pitch = step[1], step[2], step[3], step[4], step[5], step[8], step[9]
+    x, w, start, scale, out, pitch = step[1], step[3], step[4], step[5], step[8], step[9]
     for first in range(0, pitch, WIDTH):
         for row in range(0, n, ROWS):
             dense_bytes_tile(
-                codes, memory, (packed, starts, weights), (x + row * x_pitch, x_pitch),
+                codes, memory, (packed, starts, weights), x + row * MOST_BYTES,
                 w + first * QUAD * step[10], (start + first, scale + first),
-                (out + first + row * pitch, pitch), step[10], step[11],
+                (out + first + row * pitch, pitch), step[10],
             )  # fmt: skip
+    _activate(memory, out, n * pitch, step[11])

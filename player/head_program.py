@@ -8,12 +8,13 @@ onnxruntime.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from player.dense_tiles import MULTIPLIES_BYTES, QUAD, ROWS, WIDTH
 from player.activations import GELU, LINEAR, SIGMOID
+from player.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, WIDTH
 from player.onnx_graph import Graph, Node
 
 BLOCK = 4 * ROWS
@@ -79,6 +80,7 @@ class _Compiler:
         self._values: dict[str, Value] = {}
         self._codes: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # constants: codes, steps of the last axis
         self._steps: list[tuple[int, ...]] = []
+        self._readers = Counter(name for node in graph.nodes for name in node.inputs)
         self._add("features", n_channels)
         self._add("dirs", 3)
 
@@ -139,7 +141,7 @@ class _Compiler:
         self._steps.append((*numbers, *[0] * (12 - len(numbers))))
 
     def _dense(self, node: Node, activation: Node | None) -> None:
-        if node.attributes or activation is not None and activation.attributes not in _EXACT:
+        if node.attributes or (activation is not None and activation.attributes not in _EXACT):
             raise NotOursError
         kind = LINEAR if activation is None else _ACTIVATIONS[activation.operator]
         out = (activation or node).outputs[0]
@@ -198,7 +200,7 @@ class _Compiler:
         table = table.reshape(n_quads, QUAD, tiles, WIDTH).transpose(2, 0, 3, 1)
         to = self._add(out, width)
         self._step(
-            DENSE_BYTES, x.place, x.pitch, self._packed.add(table.reshape(1, -1)),
+            DENSE_BYTES, x.place, 0, self._packed.add(table.reshape(1, -1)),
             self._starts.add(starts[None]), self._weights.add(bias_steps[None]), 0, 0, to.place, to.pitch,
             n_quads, kind,
         )  # fmt: skip
@@ -225,15 +227,25 @@ class _Compiler:
             raise NotOursError
         scale, zero = scale.item(), zero.item()
         numbers = self._weights.add(np.array([[1 / scale, scale]], np.float32))
-        if self._in_bytes:
-            place, self._n_bytes = self._n_bytes, self._n_bytes + BLOCK * x.pitch
-        else:
-            place = self._add(node.outputs[0], x.width).place
-        self._values[node.outputs[0]] = Value(
-            place, x.pitch, x.width, np.float32(scale), zero, self._in_bytes
-        )
-        kind = QUANTIZE if self._in_bytes else ROUND
-        self._step(kind, x.place, x.pitch, numbers, zero, 0, 0, 0, place)
+        rounded = np.float32(scale), zero
+        if not self._in_bytes or x.width > MOST_BYTES:
+            out = self._add(node.outputs[0], x.width)
+            self._values[node.outputs[0]] = replace(out, scale=rounded[0], zero=zero)
+            self._step(ROUND, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place)
+            return
+        out = Value(self._n_bytes, MOST_BYTES, x.width, *rounded, in_bytes=True)
+        self._values[node.outputs[0]] = out
+        self._n_bytes += BLOCK * MOST_BYTES
+        kind = self._take_gelu(x) if self._readers[node.inputs[0]] == 1 else LINEAR
+        self._step(QUANTIZE, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place, 0, 0, kind)
+
+    def _take_gelu(self, x: Value) -> int:
+        """The GELU behind the last layer, if that made x: it is done to the one who asks, in its way."""
+        last = self._steps[-1]
+        if last[0] not in (DENSE, DENSE_BYTES) or last[8] != x.place or last[11] != GELU:
+            return LINEAR
+        self._steps[-1] = (*last[:11], LINEAR)
+        return GELU
 
     def _dequantize(self, node: Node) -> None:
         """Codes are kept; only what they count is noted."""

@@ -173,6 +173,11 @@ def choose(condition: Lanes, yes: Lanes, no: Any) -> Lanes:
     return Lanes(condition.b, condition.b.select(condition.value, yes.value, yes._other(no)))
 
 
+def address(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    """Where the numbers of an array begin, an argument of type `kind`."""
+    return context.make_array(kind)(context, builder, array).data
+
+
 def splat(builder: Any, scalar: Any) -> Lanes:
     """LANES of one number."""
     nothing = ir.Constant(vector(scalar.type), ir.Undefined)

@@ -24,6 +24,7 @@ from player.lanes import (
     LONG,
     Lanes,
     Variable,
+    address,
     choose,
     gather,
     load,
@@ -207,14 +208,10 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
     return c0 + (c1 - c0) * f[0]
 
 
-def _address(context: Any, b: Any, kind: Any, array: Any) -> Any:
-    return context.make_array(kind)(context, b, array).data
-
-
 def _grid(context: Any, b: Any, kinds: Any, arrays: Any, numbers: Any) -> _Grid:
     """From (table, live, density) and (resolution, n_per_axis, low, slope)."""
     table, live, density = (
-        _address(context, b, kind, b.extract_value(arrays, n)) for n, kind in enumerate(kinds)
+        address(context, b, kind, b.extract_value(arrays, n)) for n, kind in enumerate(kinds)
     )
     resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(numbers, n), INT)) for n in range(2))
     low, slope = (splat(b, b.extract_value(numbers, n)) for n in (2, 3))
@@ -228,7 +225,7 @@ def _march_box(
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
         grid = _grid(context, b, signature.args[0], arguments[0], arguments[1])
         rows, start, places, found = (
-            _address(context, b, signature.args[n], arguments[n]) for n in range(3, 7)
+            address(context, b, signature.args[n], arguments[n]) for n in range(3, 7)
         )
         pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
         path = _Box(b, rows, splat(b, arguments[2]))
@@ -254,7 +251,7 @@ def _march_space(
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
         grid = _grid(context, b, signature.args[0], arguments[0], arguments[1])
         table, rows, places, found = (
-            _address(context, b, signature.args[n], arguments[n]) for n in (2, 4, 5, 6)
+            address(context, b, signature.args[n], arguments[n]) for n in (2, 4, 5, 6)
         )
         pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
         n = b.udiv(context.make_array(lattice)(context, b, arguments[2]).nitems, LONG(3))
@@ -281,11 +278,11 @@ def _stored_corners(
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
         bricks, of_bricks = (
-            _address(context, b, kind, b.extract_value(arguments[0], n))
+            address(context, b, kind, b.extract_value(arguments[0], n))
             for n, kind in enumerate(signature.args[0])
         )
         at, weight_at, row_at, share_at = (
-            _address(context, b, signature.args[n], arguments[n]) for n in range(2, 6)
+            address(context, b, signature.args[n], arguments[n]) for n in range(2, 6)
         )
         resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(arguments[1], n), INT)) for n in range(2))
         scale = splat(b, b.extract_value(arguments[1], 2))

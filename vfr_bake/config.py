@@ -293,7 +293,8 @@ class BakeConfig:
     head_width: int | None = None
     """Width of a smaller head, which learns from the model's own; 0 keeps that one."""
     head_bits: int | None = None
-    """Bits of the wide layers of the model's own head: 8 is about twice as fast to play as 32 (float32)."""
+    """Bits of the head's wide layers, 8 or 32 (float32): 8 play about twice as fast, and stay only where they
+    lose no more than the preset allows."""
     refine_steps: int | None = None
     """Steps of each round in which head and stored values are adapted to each other, the full model being the
     teacher; 0: none."""

@@ -19,20 +19,21 @@ import numpy as np
 from exporters.asset_mesh import Removed
 from exporters.int8_head import activation_ranges
 from exporters.mesh import TriangleMesh
-from exporters.onnx_head import HeadWeights, head_onnx
+from exporters.onnx_head import HeadWeights, Range, head_onnx
 from exporters.ply import ply_bytes
 from player.asset import Asset, GridArrays, write_asset
 from player.errors import ConfigError, TrainingError
 from player.files import check_target
 from player.head import Head
 from player.manifest import Manifest
-from player.packing import pack_codes, pack_masks
+from player.packing import pack_codes
 from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
-from vfr_bake.baking.budget import channels_that_fit, check_budget
+from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
 from vfr_bake.baking.cells import find_cells
 from vfr_bake.baking.estimate import make_plan
+from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
 from vfr_bake.baking.lessons import Taught, collect_lessons, teach
@@ -41,7 +42,7 @@ from vfr_bake.baking.mesh import bake_mesh, mesh_size
 from vfr_bake.baking.pace import LOOKUPS, frame_ms, keep_to_time, measured_in_memory
 from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
-from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine, runner
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.unwritten import unwritten_asset
 from vfr_bake.baking.views import views_between
@@ -106,6 +107,7 @@ class _Bake:
         self.left_out: dict[str, str] = {}
         self.lookups: dict[str, float] = {}
         self.n_samples = self.choice.n_samples
+        self.ranges: tuple[Range, ...] | None = None  # of the head's activations, if it multiplies in 8 bits
         self.plan = make_plan(model, config)
         self.n_rays: int
         self._report = report
@@ -119,7 +121,7 @@ class _Bake:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
         stored = self._refine(stored, layout, taught)
-        head = self._head(stored, layout, taught)
+        head = head_onnx(stored.head, self.ranges)
         arrays = layout.arrays(stored.density, stored.features)
         mesh, removed = self._mesh(layout, arrays, head)
         if not len(mesh.faces):
@@ -147,7 +149,7 @@ class _Bake:
         last: Stage = result["last"]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
-        n_bytes = sum(_file_sizes(folder).values())
+        n_bytes = sum(file_sizes(folder).values())
         seconds = sum(self.seconds.values())
         return BakeResult(len(layout.densities), n_bytes, seconds, figures, result["missed"])
 
@@ -228,12 +230,10 @@ class _Bake:
             return features.shape[1]
         arrays = layout.arrays(density, features)
         size = self.choice.mesh_resolution or layout.densities.resolution
-        rest = mesh_size(layout.grid(density, features), size)
-        rest += arrays.brick_coords.nbytes + len(pack_masks(arrays.brick_masks))
-        rest += arrays.feature_coords.nbytes + len(pack_masks(arrays.feature_masks))
-        rest += len(pack_codes(arrays.density)) + len(write_cameras(self.model.cameras))
-        if not self.choice.head_width:
-            rest += 4 * sum(array.numel() for array in self.model.field.head.parameters())
+        mesh = mesh_size(layout.grid(density, features), size)
+        n_weights = sum(array.numel() for array in self.model.field.head.parameters())
+        head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
+        rest = bytes_beside_features(arrays, mesh, len(write_cameras(self.model.cameras)), head)
         sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
         return channels_that_fit(self.config.max_mb, rest, sizes)
 
@@ -241,7 +241,9 @@ class _Bake:
         """Head and stored values adapted to each other: at every sample, then at the k that are played."""
         choice, n_steps = self.choice, self.choice.refine_steps
         if n_steps == 0:
-            self._choose_lookups(layout.grid(stored.density, stored.features), stored.head)
+            grid = layout.grid(stored.density, stored.features)
+            self._choose_lookups(grid, stored.head)
+            self._choose_bits(stored, grid, taught)
             return stored
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         with self._part("refinement"):
@@ -261,13 +263,14 @@ class _Bake:
             grid = layout.grid(stored.density, stored.features)
             self.held_out.measure("refined", grid, runner(stored.head), 0)
             self._choose_lookups(grid, stored.head)
+            self._choose_bits(stored, grid, taught)
             if self.n_samples:
                 lessons = collect_lessons(taught, grid, self.n_samples)
                 rates = head_rate / 2, code_rate / 2  # what is left to learn is little
-                before = self.held_out.stages[-1]
-                tuned = refine(stored, lessons, n_steps, self._progress("refinement at k"), *rates)
-                grid = layout.grid(tuned.density, tuned.features)
-                after = self.held_out.measure("refined at k", grid, runner(tuned.head), self.n_samples)
+                before, progress = self.held_out.stages[-1], self._progress("refinement at k")
+                tuned = refine(stored, lessons, n_steps, progress, *rates, ranges=self.ranges)
+                grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
+                after = self.held_out.measure("refined at k", grid, head, self.n_samples)
                 if after.loss_db < before.loss_db:
                     stored = tuned
                 else:
@@ -280,10 +283,10 @@ class _Bake:
         scale = np.ones(arrays.features.shape[1])
 
         def head(width: int) -> bytes:
-            if not width:
-                return head_onnx(stored.head)
             shape = width, self.choice.head_layers, min(self.choice.head_bands, stored.head.sh_degree)
-            return head_onnx(small_head(stored.head, *shape, scale))
+            weights = small_head(stored.head, *shape, scale) if width else stored.head
+            any_ranges = [(0.0, 1.0)] * (1 + len(weights.directional)) if self.choice.head_bits == 8 else None
+            return head_onnx(weights, any_ranges)
 
         manifest = self._manifest(layout, arrays.features.shape[1], {})
         measure = measured_in_memory(manifest, arrays, head, self.model.cameras[0])
@@ -316,18 +319,20 @@ class _Bake:
             self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
         return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
 
-    def _head(self, stored: Stored, layout: Layout, taught: Taught) -> bytes:
-        """The head as ONNX."""
-        if self.choice.head_bits == 32 or self.choice.head_width:
-            return head_onnx(stored.head)
-        grid = layout.grid(stored.density, stored.features)
-        some = Taught(
-            *(column[:: max(len(taught.opacity) // N_CALIBRATION, 1)] for column in vars(taught).values())
-        )
-        lessons = collect_lessons(some, grid, self.n_samples)
+    def _choose_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> None:
+        """Set `ranges`, unless a head in 8 bits alone would lose more than the preset may in all."""
+        if self.choice.head_bits == 32:
+            return
+        lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
         ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
-        self.left_out["head bits"] = "24 of 32 bits of the head's wide layers; part of the loss after 'files'"
-        return head_onnx(stored.head, ranges)
+        before = self.held_out.look("", grid, runner(stored.head), self.n_samples)
+        after = self.held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_samples)
+        lost = after.loss_db - before.loss_db
+        if lost <= self.choice.target_loss_db:
+            self.ranges = ranges
+            self.left_out["head bits"] = f"24 of 32 bits of its wide layers, {lost:.3f} dB before refinement"
+        else:
+            self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost:.3f} dB"
 
     def _manifest(self, layout: Layout, n_channels: int, figures: dict[str, Any]) -> Manifest:
         model = self.model
@@ -358,7 +363,7 @@ class _Bake:
         asset = Asset.open(folder, verify=True)
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.n_samples)
-        n_bytes = _file_sizes(folder)
+        n_bytes = file_sizes(folder)
         if last.loss_db > PLAYS_NOTHING:
             raise TrainingError(
                 f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
@@ -392,9 +397,3 @@ class _Bake:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin
-
-
-def _file_sizes(folder: Path) -> dict[str, int]:
-    """Bytes of each of the asset's files; the report is not among them."""
-    paths = sorted(path for path in folder.iterdir() if path.stem != "report")
-    return {path.name: path.stat().st_size for path in paths}

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from player.asset import GridArrays
 from player.errors import TrainingError
+from player.packing import pack_codes, pack_masks
 from vfr_bake.config import BakeConfig
 
 SMALL_FILES = 200_000
 """Bytes kept for a small head and the manifest where the asset has to fit into a budget."""
 REFINED_GROWTH = 1.1
 """Refined codes are rougher than the field's, and pack less well."""
+
+
+def bytes_beside_features(arrays: GridArrays, mesh: int, cameras: int, head: int) -> int:
+    """Of an asset of these arrays, with a mesh, cameras and a head of so many bytes."""
+    masks = (len(pack_masks(words)) for words in (arrays.brick_masks, arrays.feature_masks))
+    coords = arrays.brick_coords.nbytes + arrays.feature_coords.nbytes
+    return coords + sum(masks) + len(pack_codes(arrays.density)) + mesh + cameras + head
 
 
 def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:
@@ -30,6 +41,12 @@ def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:
             "nothing was written: allow more, or lower --resolution or --mesh-resolution"
         )
     return n_fit
+
+
+def file_sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each of the asset's files; the report is not among them."""
+    paths = sorted(path for path in folder.iterdir() if path.stem != "report")
+    return {path.name: path.stat().st_size for path in paths}
 
 
 def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float | None) -> None:

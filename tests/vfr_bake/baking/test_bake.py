@@ -23,11 +23,12 @@ from player.render import render
 from player.vertex_rows import vertex_rows
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.budget import SMALL_FILES
+from vfr_bake.baking.folded_head import FoldedHead
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
 from vfr_bake.baking.presets import PRESETS
 from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
-from vfr_bake.baking.refinement import FoldedHead, Stored, refine
+from vfr_bake.baking.refinement import Stored, refine
 from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
@@ -116,23 +117,6 @@ def test_folded_head_equals_the_head() -> None:
     codes = (features.numpy() / scales).astype(np.float32)
     (rgb,) = session.run(None, {"features": codes, "dirs": dirs.numpy()})
     np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6)
-
-
-def test_the_trainable_head_is_the_exported_one() -> None:
-    torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
-    weights = fold_head(head, head.first_weights() * 0.01)
-    session = onnxruntime.InferenceSession(head_onnx(weights))
-    codes = (torch.rand(50, 12) * 254 - 127).float()
-    dirs = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
-    trainable = FoldedHead(weights)
-    (rgb,) = session.run(None, {"features": codes.numpy(), "dirs": dirs.numpy()})
-    with torch.no_grad():
-        np.testing.assert_allclose(trainable(codes, dirs).numpy(), rgb, rtol=0, atol=2e-6)
-    (again,) = onnxruntime.InferenceSession(head_onnx(trainable.weights())).run(
-        None, {"features": codes.numpy(), "dirs": dirs.numpy()}
-    )
-    np.testing.assert_allclose(again, rgb, rtol=0, atol=2e-6)
 
 
 def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lessons:

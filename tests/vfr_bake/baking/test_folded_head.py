@@ -1,0 +1,72 @@
+"""The head that is tuned is the head that is exported, in float32 and in 8 bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from exporters.int8_head import activation_ranges
+from exporters.onnx_head import HeadWeights, head_onnx
+from vfr_bake.baking.folded_head import FoldedHead, runner
+from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.refinement import Stored, refine
+from vfr_bake.config import FieldConfig
+from vfr_bake.field.head import Head
+
+from .test_bake import lessons_of
+
+
+def folded() -> HeadWeights:
+    torch.manual_seed(0)
+    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
+    return fold_head(head, head.first_weights() * 0.01)
+
+
+def inputs(n: int) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    dirs = random.normal(size=(n, 3))
+    dirs /= np.linalg.norm(dirs, axis=-1, keepdims=True)
+    return random.uniform(-127, 127, (n, 12)).astype(np.float32), dirs.astype(np.float32)
+
+
+@pytest.mark.parametrize("eight", [False, True], ids=["float32", "8 bits"])
+def test_the_trainable_head_is_the_exported_one(eight: bool) -> None:
+    weights = folded()
+    codes, dirs = inputs(500)
+    ranges = activation_ranges(weights, codes, dirs) if eight else None
+    data = head_onnx(weights, ranges)
+    (rgb,) = onnxruntime.InferenceSession(data).run(None, {"features": codes, "dirs": dirs})
+    off = np.abs(runner(weights, ranges)(codes, dirs) - np.asarray(rgb))
+    if eight:  # a sum that ends beside a level, in another order of additions: seldom
+        assert (off < 1e-4).mean() > 0.98 and off.max() < 0.02
+    else:
+        assert off.max() < 2e-6
+    again = FoldedHead(weights, ranges=ranges).weights()
+    (same,) = onnxruntime.InferenceSession(head_onnx(again, ranges)).run(
+        None, {"features": codes, "dirs": dirs}
+    )
+    assert np.abs(np.asarray(same) - np.asarray(rgb)).max() < (0.02 if eight else 2e-6)
+
+
+def test_refinement_gets_back_what_8_bits_lose() -> None:
+    """Ranges twice too wide, so that there is something to get back."""
+    weights = folded()
+    codes, dirs = inputs(4000)
+    codes = codes.round()
+    wanted = runner(weights)(codes, dirs)
+    ranges = tuple((low, 2 * high) for low, high in activation_ranges(weights, codes, dirs))
+    lessons = lessons_of(codes, dirs, wanted)
+
+    def error(stored: Stored) -> float:
+        composed = lessons.composed(stored.features)
+        return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
+
+    stored = Stored(weights, codes, np.zeros(len(codes), np.float32))
+    tuned = refine(stored, lessons, 400, lambda done, of: None, code_rate=0, ranges=ranges)
+    assert error(tuned) < 0.8 * error(stored)
+    untouched = replace(tuned, head=weights)
+    assert error(untouched) == pytest.approx(error(stored), rel=1e-6)

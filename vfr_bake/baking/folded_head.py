@@ -1,0 +1,121 @@
+"""The exported head in torch, to be tuned: in float32, or as it is played in 8 bits.
+
+Letters as in `exporters.onnx_head`. What 8 bits round, activations to 256 levels of a fixed range and weights
+to 127 on either side of 0 for each output, is rounded in the same places, and learns as if it were not
+(straight through).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import gelu
+
+from exporters.onnx_head import HeadWeights, Layer, Range, levels
+from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+
+
+class FoldedHead(nn.Module):
+    """The exported graph in torch.
+
+    Args:
+        weights: what it begins with.
+        units: [n_channels] what composites are counted in, so that channels of small codes are learned as
+            fast as those of large ones.
+        ranges: of the hidden activations, as `exporters.int8_head` finds them, where the wide layers are to
+            be multiplied in 8 bits.
+    """
+
+    def __init__(
+        self,
+        weights: HeadWeights,
+        units: np.ndarray | None = None,
+        ranges: tuple[Range, ...] | None = None,
+    ) -> None:
+        super().__init__()
+        self._like, self._ranges = weights, ranges
+        self._units = np.ones(weights.n_channels) if units is None else units.astype(np.float64)
+        self.harmonics = SphericalHarmonics(weights.sh_degree)
+        layers = [*weights.spatial, weights.to_sh, *weights.directional, weights.output]
+        d_bottleneck, d_sh, bias = weights.directional_first
+        arrays = [array for layer in layers for array in layer] + [d_bottleneck, d_sh, bias]
+        arrays[0] = arrays[0] * self._units[:, None]
+        self.arrays = nn.ParameterList([torch.tensor(a, dtype=torch.float32) for a in arrays])
+        self._per_unit = torch.tensor(1 / self._units, dtype=torch.float32)
+
+    def forward(self, codes: Tensor, dirs: Tensor) -> Tensor:
+        """Colours [n, 3] from composited codes [n, n_stored] and unit dirs [n, 3]."""
+        layers, (d_bottleneck, d_sh, bias) = self._layers()
+        n_spatial = len(self._like.spatial)
+        h = codes * self._per_unit
+        for weight, b in layers[:n_spatial]:
+            h = gelu(torch.addmm(b, h, weight))
+        h = self._rounded(h, 0)
+        weight, b = layers[n_spatial]
+        basis = self.harmonics(dirs).repeat_interleave(self._like.n_sh_features, dim=-1)
+        encoded = torch.addmm(b, h, self._rounded_weight(weight)) * basis
+        h = gelu(torch.addmm(bias, h, self._rounded_weight(d_bottleneck)) + encoded @ d_sh)
+        for index, (weight, b) in enumerate(layers[n_spatial + 1 : -1], start=1):
+            h = gelu(torch.addmm(b, self._rounded(h, index), self._rounded_weight(weight)))
+        weight, b = layers[-1]
+        return torch.sigmoid(torch.addmm(b, h, weight))
+
+    def _rounded(self, x: Tensor, index: int) -> Tensor:
+        """The activation `index` at its 256 levels."""
+        if self._ranges is None:
+            return x
+        scale, zero = levels(self._ranges[index])
+        codes = (x.detach() / scale).round_().add_(zero).clamp_(0, 255)
+        return x + ((codes - zero) * scale - x.detach())
+
+    def _rounded_weight(self, weight: Tensor) -> Tensor:
+        if self._ranges is None:
+            return weight
+        w = weight.detach()
+        scales = w.abs().amax(dim=0).clamp_min(1e-12) / 127
+        return weight + ((w / scales).round_() * scales - w)
+
+    def _layers(self) -> tuple[list[tuple[Tensor, Tensor]], tuple[Tensor, Tensor, Tensor]]:
+        a = list(self.arrays)
+        return list(zip(a[:-3:2], a[1:-3:2], strict=True)), (a[-3], a[-2], a[-1])
+
+    def weights(self) -> HeadWeights:
+        """Back to numpy, in the form that was given."""
+        layers, first = self._layers()
+
+        def plain(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+            return tuple(t.detach().double().numpy() for t in tensors)
+
+        arrays: list[Layer] = [plain(layer) for layer in layers]  # type: ignore[misc]
+        arrays[0] = (arrays[0][0] / self._units[:, None], arrays[0][1])
+        n_spatial = len(self._like.spatial)
+        return HeadWeights(
+            spatial=tuple(arrays[:n_spatial]),
+            to_sh=arrays[n_spatial],
+            directional_first=plain(first),  # type: ignore[arg-type]
+            directional=tuple(arrays[n_spatial + 1 : -1]),
+            output=arrays[-1],
+            sh_degree=self._like.sh_degree,
+            n_sh_features=self._like.n_sh_features,
+        )
+
+
+def runner(
+    weights: HeadWeights, ranges: tuple[Range, ...] | None = None
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """The head as a function of composited features [n, n_channels] and unit dirs [n, 3]; in 8 bits with
+    `ranges`."""
+    head = FoldedHead(weights, ranges=ranges)
+
+    @torch.no_grad()
+    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+        parts = [
+            head(torch.from_numpy(features[i : i + 8192]), torch.from_numpy(dirs[i : i + 8192])).numpy()
+            for i in range(0, len(features), 8192)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+    return colours
