@@ -12,19 +12,10 @@ import numpy as np
 
 from player.compiling import compiled, inlined
 from player.contracted_rays import MAX_SPEED, MIN_COS, enter_space, lattice
-from player.grid_compiled import (
-    CHANNELS,
-    LANES,
-    add_fetches,
-    choose_fetches,
-    enqueue,
-    opacity_of,
-    queue_arrays,
-    samples_of_ray,
-    scratch_arrays,
-)
+from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, opacity_of
 from player.march import MIN_OPACITY, MarchResult
-from player.packets import SPACE_ROWS, march_space
+from player.packet_fetches import choose_fetches
+from player.packets import SPACE_ROWS, SUMS, march_space
 from player.sparse_grid import SparseGrid
 
 F32 = np.float32
@@ -52,18 +43,18 @@ def march(
         table,
         n_samples,
         np.zeros((SPACE_ROWS + 1, LANES), F32),
-        (np.empty((2, capacity, LANES), F32), np.empty((2, LANES), F32)),
-        scratch_arrays(capacity, n_samples),
-        queue_arrays(),
+        (np.empty((2, capacity, LANES), F32), np.empty((SUMS, LANES), F32)),
+        fetch_arrays(n_samples),
         (opacity, depth, counts, features, hits),
     )  # fmt: skip
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
 
 
 @compiled
-def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, entered, found, scratch, queue, out):
-    """Packets of rays: their samples first, then ray by ray the fetches into the next row of `features`."""
+def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, entered, found, fetches, out):
+    """Packets of rays: their samples first, then a fetch of each ray at a time into its row of `features`."""
     samples, sums = found
+    chosen, masses, into, _, _, _, _ = fetches
     opacity, depth, counts, features, hits = out
     n_rays, n_hits = len(opacity), 0
     for start in range(0, n_rays, LANES):
@@ -72,29 +63,29 @@ def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, entered,
             for lane in range(LANES):
                 entered[row, lane] = rays[row][start + lane] if lane < n_lanes else F32(0.0)
         rows = march_space(lookup, settings, table, steps, entered, samples, sums)
-        n_queued = 0
+        hits_before = n_hits
+        masses[:] = F32(0.0)
         for lane in range(n_lanes):
             ray = start + lane
             counts[ray] = int(sums[1, lane])
-            n, total, moment = samples_of_ray(samples, rows, lane, scratch)
-            if n == 0:
+            if sums[2, lane] == F32(0.0):
                 continue
             mass = F32(opacity_of(sums[0, lane]))
             opacity[ray] = mass
-            cos, sin = _turned(entered, lane, F32(moment / total))
+            cos, sin = _turned(entered, lane, sums[4, lane] / sums[3, lane])
             depth[ray] = entered[SPACE_ROWS, lane] + entered[8, lane] * sin / max(cos, MIN_COS)
-            if mass <= MIN_OPACITY:
-                continue
-            for j in range(choose_fetches(scratch, n, total, mass, k)):
-                place = _place(entered, lane, scratch[0][j], steps[4])
-                enqueue(queue, n_queued, place, scratch[1][j], n_hits, lane, scratch[2][j])
-                n_queued += 1
-                while n_queued == LANES:
-                    n_queued = _fetch(stored, sizes, queue, n_queued, entered, steps[4], features)
-            hits[n_hits] = ray
-            n_hits += 1
-        while n_queued > 0:
-            n_queued = _fetch(stored, sizes, queue, n_queued, entered, steps[4], features)
+            if mass > MIN_OPACITY:
+                masses[lane], into[lane] = mass, n_hits
+                hits[n_hits] = ray
+                n_hits += 1
+        if n_hits == hits_before:
+            continue
+        if k > 0:
+            for j in range(choose_fetches(samples, rows, k, sums, masses, chosen)):
+                _fetch(stored, sizes, entered, steps[4], chosen, j, chosen, fetches, features)
+        else:
+            for j in range(rows):
+                _fetch(stored, sizes, entered, steps[4], samples, j, chosen, fetches, features)
     return n_hits
 
 
@@ -107,28 +98,41 @@ def _turned(entered, lane, s):
 
 
 @inlined
-def _place(entered, lane, s, cells):
-    """Grid coordinates at s on the ray of a lane."""
-    cos, sin = _turned(entered, lane, s)
-    vx = cos * entered[0, lane] + sin * entered[3, lane]
-    vy = cos * entered[1, lane] + sin * entered[4, lane]
-    vz = cos * entered[2, lane] + sin * entered[5, lane]
-    q = F32(math.sqrt(vx * vx + vy * vy + vz * vz))
-    if q <= cos:
-        scale = F32(1) / cos
-    else:
-        scale = (F32(2) - cos / q) / q
-    scale *= cells
-    middle = cells * F32(2)
-    return vx * scale + middle, vy * scale + middle, vz * scale + middle
+def _fetch(stored, sizes, entered, cells, table, j, chosen, fetches, features):
+    """Add fetch j of every ray that has one: s and weights of `table`; where little is stored, the other
+    place."""
+    _, masses, _, _, weights, _, _ = fetches
+    for lane in range(LANES):
+        weights[lane] = table[1, j, lane] if masses[lane] > F32(0.0) else F32(0.0)
+    _place(entered, table, 0, j, cells, fetches)
+    if add_fetches(stored, sizes, fetches, features) > 0 and len(chosen) == len(table):
+        _place(entered, table, 2, j, cells, fetches)
+        add_fetches(stored, sizes, fetches, features)
 
 
 @inlined
-def _fetch(stored, sizes, queue, n, entered, cells, features):
-    """Add the n queued fetches; those that have to be tried elsewhere stay, their number is returned."""
-    n_left = add_fetches(stored, sizes, queue, n, features)
-    places, _, _, lanes, others, _, _ = queue
-    for j in range(n_left):
-        places[0, j], places[1, j], places[2, j] = _place(entered, lanes[j], others[j], cells)
-        others[j] = F32(np.nan)
-    return n_left
+def _place(entered, table, which, j, cells, fetches):
+    """Grid coordinates at s on every ray with a weight."""
+    _, _, _, places, weights, _, _ = fetches
+    middle = cells * F32(2)
+    for lane in range(LANES):
+        s = table[which, j, lane]
+        if math.isnan(s):
+            weights[lane] = F32(0.0)
+        if weights[lane] <= F32(0.0):
+            continue
+        cos, sin = _turned(entered, lane, s)
+        vx = cos * entered[0, lane] + sin * entered[3, lane]
+        vy = cos * entered[1, lane] + sin * entered[4, lane]
+        vz = cos * entered[2, lane] + sin * entered[5, lane]
+        q = F32(math.sqrt(vx * vx + vy * vy + vz * vz))
+        if q <= cos:
+            scale = F32(1) / cos
+        else:
+            scale = (F32(2) - cos / q) / q
+        scale *= cells
+        places[0, lane], places[1, lane], places[2, lane] = (
+            vx * scale + middle,
+            vy * scale + middle,
+            vz * scale + middle,
+        )

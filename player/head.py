@@ -1,6 +1,7 @@
-"""The head: from the composited features of a pixel and its direction to its colour, by onnxruntime.
+"""The head: from the composited features of a pixel and its direction to its colour, by compiled code or
+onnxruntime.
 
-onnxruntime is imported when a head is opened, not before, so that `vfr-play --help` answers at once.
+Either is imported when a head is opened that needs it, so that `vfr-play --help` answers at once.
 """
 
 from __future__ import annotations
@@ -28,6 +29,21 @@ class Head:
 
     def __init__(self, path: Path, n_channels: int, compiled: bool = False) -> None:
         """Open the head; with `compiled`, numba runs the graph where it can (`player.head_compiled`)."""
+        data = path.read_bytes()
+        _check_content(path, data)
+        self._path = path
+        if compiled:
+            from player.head_compiled import compile_head
+            from player.onnx_graph import read_graph
+
+            program = compile_head(read_graph(data), n_channels)
+            if program is not None:  # and onnxruntime need not be loaded
+                self._run = program
+                return
+        self._open_session(data, n_channels)
+        self._run = self._by_onnxruntime
+
+    def _open_session(self, data: bytes, n_channels: int) -> None:
         import onnxruntime as ort
         from onnxruntime.capi import onnxruntime_pybind11_state as state  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -37,10 +53,7 @@ class Head:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4  # fatal alone: what fails is raised as well
-        data = path.read_bytes()
-        _check_content(path, data)
-        self._path = path
-        self._failures = failures = (
+        self._failures = (
             state.Fail,
             state.RuntimeException,
             state.InvalidProtobuf,
@@ -48,19 +61,14 @@ class Head:
             state.InvalidArgument,
             state.NotImplemented,
         )
+        path = self._path
         try:
             session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        except (*failures, RuntimeError, ValueError) as error:
+        except (*self._failures, RuntimeError, ValueError) as error:
             raise FormatError(f"{path}: expected an ONNX graph, got: {_first_line(error)}") from error
         _check_ports(path, "input", session.get_inputs(), {"features": n_channels, "dirs": 3})
         _check_ports(path, "output", session.get_outputs(), {"rgb": 3})
         self._session = session
-        self._run = self._by_onnxruntime
-        if compiled:
-            from player.head_compiled import compile_head
-            from player.onnx_graph import read_graph
-
-            self._run = compile_head(read_graph(data), n_channels) or self._by_onnxruntime
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         """Colours of n pixels.

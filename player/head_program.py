@@ -22,6 +22,8 @@ BLOCK = 4 * ROWS
 DENSE, DENSE_BYTES, MULTIPLY, COPY, QUANTIZE, ROUND = range(6)
 _ACTIVATIONS = {"Gelu": GELU, "Sigmoid": SIGMOID}
 _LARGEST = 2**31 - 1
+_MOST_FLOATS = 1 << 22
+"""Of all values of a graph, 16 MB: a head 256 wide has a 25th of it."""
 
 
 class NotOursError(Exception):
@@ -62,11 +64,15 @@ class Program:
 
 
 def program_of(graph: Graph, n_channels: int, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
-    """Raises NotOursError for a graph that holds anything but a head's layers in float32 or 8 bits.
+    """Raises NotOursError for a graph that holds anything but a head's layers in float32 or 8 bits, or that
+    breaks the rules of ONNX: onnxruntime says which.
 
     `in_bytes`: whether the processor multiplies bytes.
     """
-    return _Compiler(graph, n_channels, in_bytes).program()
+    try:
+        return _Compiler(graph, n_channels, in_bytes).program()
+    except (IndexError, ValueError, TypeError, OverflowError) as error:
+        raise NotOursError from error
 
 
 class _Compiler:
@@ -135,6 +141,8 @@ class _Compiler:
         pitch = _padded(width)
         self._values[name] = Value(self._n_floats, pitch, width)
         self._n_floats += BLOCK * pitch
+        if self._n_floats > _MOST_FLOATS:
+            raise NotOursError
         return self._values[name]
 
     def _step(self, *numbers: int) -> None:

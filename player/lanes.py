@@ -214,6 +214,20 @@ def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT) ->
     return choose(where, Lanes(b, words), 0)
 
 
+def scatter(base: Any, index: Lanes, values: Lanes, where: Lanes) -> None:
+    """Store numbers of four bytes at `index` behind the address `base`, of the lanes that are true in
+    `where`."""
+    b, nothing = where.b, ir.Constant(vector(LONG), ir.Undefined)
+    one = b.insert_element(nothing, b.ptrtoint(base, LONG), INT(0))
+    start = b.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES))
+    numbers = b.mul(b.sext(index.value, vector(LONG)), ir.Constant(vector(LONG), [4] * LANES))
+    places = b.inttoptr(b.add(numbers, start), ir.VectorType(ir.PointerType(values.element), LANES))
+    kind = ir.FunctionType(ir.VoidType(), [values.value.type, places.type, INT, where.value.type])
+    name = f"llvm.masked.scatter.v{LANES}{_SIZES[values.element]}.v{LANES}p0"
+    function = cgutils.get_or_insert_function(b.module, kind, name)
+    b.call(function, [values.value, places, INT(4), where.value])
+
+
 class Variable:
     """A vector that changes."""
 

@@ -11,19 +11,10 @@ import math
 import numpy as np
 
 from player.compiling import compiled, inlined
-from player.grid_compiled import (
-    CHANNELS,
-    LANES,
-    add_fetches,
-    choose_fetches,
-    enqueue,
-    opacity_of,
-    queue_arrays,
-    samples_of_ray,
-    scratch_arrays,
-)
+from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, opacity_of
 from player.march import MIN_OPACITY, MarchResult
-from player.packets import BOX_ROWS, march_box
+from player.packet_fetches import choose_fetches
+from player.packets import BOX_ROWS, SUMS, march_box
 from player.sparse_grid import SparseGrid
 
 F32 = np.float32
@@ -53,20 +44,20 @@ def march(
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
         n_samples,
         (np.zeros((BOX_ROWS + 1, LANES), F32), np.empty(LANES, np.int32)),
-        (np.empty((2, capacity, LANES), F32), np.empty((2, LANES), F32)),
-        scratch_arrays(capacity, n_samples),
-        queue_arrays(),
+        (np.empty((2, capacity, LANES), F32), np.empty((SUMS, LANES), F32)),
+        fetch_arrays(n_samples),
         (opacity, depth, counts, features, hits),
     )  # fmt: skip
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
 
 
 @compiled
-def _march_rays(settings, lookup, stored, sizes, rays, k, packet, found, scratch, queue, out):
-    """Packets of rays: their samples first, then ray by ray the fetches into the next row of `features`."""
+def _march_rays(settings, lookup, stored, sizes, rays, k, packet, found, fetches, out):
+    """Packets of rays: their samples first, then a fetch of each ray at a time into its row of `features`."""
     resolution, n_per_axis, step, low, slope, _, _ = settings
     entered, first = packet
     samples, sums = found
+    chosen, masses, into, _, _, _, _ = fetches
     opacity, depth, counts, features, hits = out
     n_rays, n_hits = len(opacity), 0
     longest = F32(samples.shape[1] - 1) * step  # there is no room for more, whatever the ray
@@ -74,28 +65,28 @@ def _march_rays(settings, lookup, stored, sizes, rays, k, packet, found, scratch
         n_lanes = min(LANES, n_rays - start)
         _enter(settings, rays, start, n_lanes, longest, entered, first)
         rows = march_box(lookup, (resolution, n_per_axis, low, slope), step, entered, first, samples, sums)
-        n_queued = 0
+        hits_before = n_hits
+        masses[:] = F32(0.0)
         for lane in range(n_lanes):
             ray = start + lane
             counts[ray] = int(sums[1, lane])
-            n, total, moment = samples_of_ray(samples, rows, lane, scratch)
-            if n == 0:
+            if sums[2, lane] == F32(0.0):
                 continue
             mass = F32(opacity_of(sums[0, lane]))
             opacity[ray] = mass
-            depth[ray] = entered[BOX_ROWS, lane] + F32(moment / total)
-            if mass <= MIN_OPACITY:
-                continue
-            for j in range(choose_fetches(scratch, n, total, mass, k)):
-                place = _place(entered, lane, scratch[0][j])
-                enqueue(queue, n_queued, place, scratch[1][j], n_hits, lane, scratch[2][j])
-                n_queued += 1
-                while n_queued == LANES:
-                    n_queued = _fetch(stored, sizes, queue, n_queued, entered, features)
-            hits[n_hits] = ray
-            n_hits += 1
-        while n_queued > 0:
-            n_queued = _fetch(stored, sizes, queue, n_queued, entered, features)
+            depth[ray] = entered[BOX_ROWS, lane] + sums[4, lane] / sums[3, lane]
+            if mass > MIN_OPACITY:
+                masses[lane], into[lane] = mass, n_hits
+                hits[n_hits] = ray
+                n_hits += 1
+        if n_hits == hits_before:
+            continue
+        if k > 0:
+            for j in range(choose_fetches(samples, rows, k, sums, masses, chosen)):
+                _fetch(stored, sizes, entered, chosen, j, chosen, fetches, features)
+        else:
+            for j in range(rows):
+                _fetch(stored, sizes, entered, samples, j, chosen, fetches, features)
     return n_hits
 
 
@@ -140,21 +131,26 @@ def _slab(o, d, size, t_in, t_out):
 
 
 @inlined
-def _place(entered, lane, s):
-    """Grid coordinates at s on the ray of a lane."""
-    return (
-        entered[0, lane] + s * entered[3, lane],
-        entered[1, lane] + s * entered[4, lane],
-        entered[2, lane] + s * entered[5, lane],
-    )
+def _fetch(stored, sizes, entered, table, j, chosen, fetches, features):
+    """Add fetch j of every ray that has one: s and weights of `table`; where little is stored, the other
+    place."""
+    _, masses, _, _, weights, _, _ = fetches
+    for lane in range(LANES):
+        weights[lane] = table[1, j, lane] if masses[lane] > F32(0.0) else F32(0.0)
+    _place(entered, table, 0, j, fetches)
+    if add_fetches(stored, sizes, fetches, features) > 0 and len(chosen) == len(table):
+        _place(entered, table, 2, j, fetches)
+        add_fetches(stored, sizes, fetches, features)
 
 
 @inlined
-def _fetch(stored, sizes, queue, n, entered, features):
-    """Add the n queued fetches; those that have to be tried elsewhere stay, their number is returned."""
-    n_left = add_fetches(stored, sizes, queue, n, features)
-    places, _, _, lanes, others, _, _ = queue
-    for j in range(n_left):
-        places[0, j], places[1, j], places[2, j] = _place(entered, lanes[j], others[j])
-        others[j] = F32(np.nan)
-    return n_left
+def _place(entered, table, which, j, fetches):
+    """Grid coordinates at s on every ray."""
+    _, _, _, places, weights, _, _ = fetches
+    for lane in range(LANES):
+        s = table[which, j, lane]
+        if math.isnan(s):
+            weights[lane], s = F32(0.0), F32(0.0)
+        places[0, lane] = entered[0, lane] + s * entered[3, lane]
+        places[1, lane] = entered[1, lane] + s * entered[4, lane]
+        places[2, lane] = entered[2, lane] + s * entered[5, lane]

@@ -1,18 +1,18 @@
-"""The march of LANES rays at a time, in step, each at a place of its own; and LANES fetches at a time.
+"""The march of LANES rays at a time, in step, each at a place of its own.
 
 Rays beside one another meet the same bricks at nearly the same samples, so that a packet takes hardly more
 steps than its longest ray does alone, and every step serves all of them. What `player.march` and
 `player.contracted_march` state is done here in the same order, in float32. Compiled code alone imports this.
 
 A packet's numbers are float32 in rows of LANES, one of each ray. What is found is written in rows, too: s and
-weight of sample j of all rays, the weight 0 where a ray has none.
+weight of sample j of all rays, the weight 0 where a ray has none. Where to fetch features is for
+`player.packet_fetches` to say.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -38,6 +38,10 @@ BOX_ROWS = 7
 """Rows of a packet in a box: point and direction in grid coordinates, length; see `march_box`."""
 SPACE_ROWS = 10
 """Rows of a packet in contracted space: p, w d, cos and sin of phi_0, w, length; see `march_space`."""
+
+SUMS = 5
+"""Rows of what is summed up over a ray: tau, the number of density samples, the number of those with weight,
+the sums of weight and of weight times s."""
 
 Three = tuple[Lanes, Lanes, Lanes]
 
@@ -142,11 +146,12 @@ class _Space:
 
 
 def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch: Any, out: Any) -> Any:
-    """March a packet from the samples `first` on: s into `samples`, weights `pitch` numbers behind; tau and
-    the number of density samples of each ray into `out`. Returns how many rows were written."""
+    """March a packet from the samples `first` on: s into `samples`, weights `pitch` numbers behind; SUMS of
+    each ray into `out`. Returns how many rows were written."""
     zero = grid.low.like(0.0)
     i, taken, active = Variable(first), Variable(first.like(0)), Variable(first >= 0)
-    tau, trans = Variable(zero), Variable(zero.like(1.0))
+    tau, trans, n_weights = Variable(zero), Variable(zero.like(1.0)), Variable(zero)
+    total, moment = _Sum(zero), _Sum(zero)
     n_rows = cgutils.alloca_once_value(b, LONG(0))
     with while_any(b, active):
         now = i.get()
@@ -176,23 +181,43 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
                 optical = (grid.low + grid.slope * code).exp() * path.way()
                 optical = choose(live, optical, zero)
                 before = trans.get()
-                total = tau.get() + optical
-                behind = (-total).exp()
+                depth = tau.get() + optical
+                behind = (-depth).exp()
                 series = 1.0 - optical * (1 / 2 - optical * (1 / 6 - optical * (1 / 24)))
                 weight = choose(optical > 0.1, before - behind, before * optical * series)
                 weight = choose(live & (weight > 0), weight, zero)
-                tau.set(total)
+                tau.set(depth)
                 trans.set(choose(live, behind, before))
                 taken.set(taken.get() + lit)
-                active.set(inside & ~(total > float(MAX_TAU)))
+                n_weights.set(choose(weight > 0, n_weights.get() + 1, n_weights.get()))
+                total.add(weight)
+                moment.add(weight * s)
+                active.set(inside & ~(depth > float(MAX_TAU)))
                 row = b.load(n_rows)
                 place = b.mul(row, LONG(LANES))
                 store(samples, place, s)
                 store(samples, b.add(place, pitch), weight)
                 b.store(b.add(row, LONG(1)), n_rows)
-    store(out, LONG(0), tau.get())
-    store(out, LONG(LANES), taken.get().to_float())
+    sums = tau.get(), taken.get().to_float(), n_weights.get(), total.get(), moment.get()
+    for row, values in enumerate(sums):
+        store(out, LONG(row * LANES), values)
     return b.load(n_rows)
+
+
+class _Sum:
+    """Of many numbers to the rounding of the last: Kahan's."""
+
+    def __init__(self, zero: Lanes) -> None:
+        self._sum, self._lost = Variable(zero), Variable(zero)
+
+    def add(self, number: Lanes) -> None:
+        missing = number - self._lost.get()
+        total = self._sum.get() + missing
+        self._lost.set((total - self._sum.get()) - missing)
+        self._sum.set(total)
+
+    def get(self) -> Lanes:
+        return self._sum.get()
 
 
 def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
@@ -236,11 +261,10 @@ def _march_box(
 
 march_box: Any = intrinsic(_march_box)
 """march_box((table, live, density), (resolution, n_per_axis, low, slope), step, packet [BOX_ROWS, LANES]
-float32, first [LANES] int32, samples [2, n, LANES] float32, out [2, LANES] float32): rows written.
+float32, first [LANES] int32, samples [2, n, LANES] float32, out [SUMS, LANES] float32): rows written.
 
 `packet` has the entry points x, y, z and directions x, y, z in grid coordinates, and lengths; 0 where there
-is no ray. Into `samples` go s and weights, into `out` tau and the number of density samples. `samples` has
-room for the most samples that a ray can have.
+is no ray. Into `samples` go s and weights. `samples` has room for the most samples that a ray can have.
 """
 
 
@@ -264,65 +288,9 @@ def _march_space(
 
 march_space: Any = intrinsic(_march_space)
 """march_space((table, live, density), (resolution, n_per_axis, low, slope), lattice [3, n] float32, steps,
-packet [SPACE_ROWS, LANES] float32, samples [2, n, LANES] float32, out [2, LANES] float32): rows written.
+packet [SPACE_ROWS, LANES] float32, samples [2, n, LANES] float32, out [SUMS, LANES] float32): rows written.
 
 `steps` are five float32: cos and sin of half a step of phi, sin of a step, cells that a step makes at most,
 cells in a contracted unit. `packet` has p, w d, cos and sin of phi_0, w and the length; 0 where there is no
 ray. The rest as in `march_box`.
-"""
-
-
-def _stored_corners(
-    _: Any, stored: Any, sizes: Any, places: Any, weights: Any, rows: Any, shares: Any
-) -> Any:
-
-    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        bricks, of_bricks = (
-            address(context, b, kind, b.extract_value(arguments[0], n))
-            for n, kind in enumerate(signature.args[0])
-        )
-        at, weight_at, row_at, share_at = (
-            address(context, b, signature.args[n], arguments[n]) for n in range(2, 6)
-        )
-        resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(arguments[1], n), INT)) for n in range(2))
-        scale = splat(b, b.extract_value(arguments[1], 2))
-        low, share = [], []
-        for axis in range(3):
-            g = (load(b, at, LONG(axis * LANES)) * scale).most(0.0).least(resolution.to_float())
-            low.append(g.to_int().least(resolution - 1))
-            fraction = g - low[axis].to_float()
-            share.append((1.0 - fraction, fraction))
-        x, y, z = (cell >> 3 for cell in low)
-        held = gather(bricks, (x * n_per_axis + y) * n_per_axis + z, 4, resolution > 0)
-        x, y, z = (cell & 7 for cell in low)
-        first = held * 729 + x * 81 + y * 9 + z
-        total = scale.like(0.0)
-        parts = []
-        for x, y in np.ndindex(2, 2):
-            pair = gather(of_bricks, first + (x * 81 + y * 9), 4, held > -1, LONG).halves()
-            for z, row in enumerate(pair):
-                there = (held > -1) & (row > -1)
-                parts.append(
-                    (choose(there, row, 0), choose(there, share[0][x] * share[1][y] * share[2][z], 0.0))
-                )
-                total = total + parts[-1][1]
-        weight = load(b, weight_at, LONG(0)) / total
-        most = parts[0][0]
-        for corner, (row, part) in enumerate(parts):
-            store(row_at, LONG(corner * LANES), row)
-            store(share_at, LONG(corner * LANES), part * weight)
-            most = most.most(row)
-        store(share_at, LONG(8 * LANES), total)
-        return b.sext(most.greatest(), LONG)
-
-    return types.int64(stored, sizes, places, weights, rows, shares), generate
-
-
-stored_corners: Any = intrinsic(_stored_corners)
-"""stored_corners((bricks, rows), (resolution, n_per_axis, scale), places [3, LANES] float32, weights [LANES]
-float32, rows [8, LANES] int32, shares [9, LANES] float32): the greatest of the rows.
-
-The corners around LANES places, cells of the densities' grid: their rows, and their shares of the weights.
-Of what is not stored the share is 0, and the row. Behind the shares there is how much of the interpolation
-is stored: where that is 0, shares are not numbers.
 """

@@ -66,7 +66,7 @@ def play(arguments: argparse.Namespace, say: Callable[[str], object]) -> tuple[d
     """
     target = Target.of(arguments.output, arguments.format)
     target.check(arguments.force, arguments.resume)
-    import_ahead()
+    import_ahead(scipy=False)
     asset = Asset.open(arguments.asset)
     every = _views(asset, arguments)
     cameras, paths = every[arguments.frames], target.paths(every, arguments.frames)

@@ -8,6 +8,7 @@ on the size of a task.
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -291,15 +292,25 @@ def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType
     return "numpy", contracted_march if contracted else march
 
 
-def import_ahead() -> None:
+def import_ahead(scipy: bool = True) -> None:
     """Begin to import what rendering needs, on a thread of its own, while the caller opens the asset: both
-    take half a second."""
+    take half a second.
+
+    `scipy`: whether anything else in this process may ask for it. If not, numba does not find its linear
+    algebra either, which nothing here uses, and which takes 0.3 s to import.
+    """
 
     def imports() -> None:
         with suppress(ImportError):  # told by whoever needs it
-            import onnxruntime  # noqa: F401
+            if not scipy and "scipy" not in sys.modules:
+                sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
+            if choose_march("auto")[0] == "numpy":
+                import onnxruntime  # noqa: F401
+            else:
+                from player import head_compiled, pixels_compiled  # noqa: F401
 
-            choose_march("auto")
+                camera = Camera("", np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
+                pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
 
     threading.Thread(target=imports, daemon=True).start()
 

@@ -36,7 +36,16 @@ LAZY = {
 TOP_LEVEL_EXCEPTIONS = {
     *(
         (f"player/{name}.py", "numba")
-        for name in ("compiling", "activations", "dense_tiles", "eight_rows", "lanes", "packets", "prefetch")
+        for name in (
+            "compiling",
+            "activations",
+            "dense_tiles",
+            "eight_rows",
+            "lanes",
+            "packet_fetches",
+            "packets",
+            "prefetch",
+        )
     ),
     ("vfr_bake/options.py", "tyro"),
 }
