@@ -46,9 +46,11 @@ FAR_AWAY = 64.0
 origins would be too coarse at the camera, by a sixteenth of a pixel of 8192 here and by everything at 1e8
 units."""
 
-TASK_BLOCKS = {"numba": 96, "numpy": 128}
-"""Blocks a task: enough rays for the head's chunks and, in numpy, for its calls; few enough to share out
-evenly."""
+TASK_BLOCKS = {"numba": 256, "numpy": 128}
+"""Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks; numpy's
+arrays of more blocks do not stay in cache."""
+TASKS_A_THREAD = 8
+"""Tasks at least, where there are blocks enough: shared out evenly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +170,7 @@ class Renderer:
         normals = np.zeros((n_pixels, 3), np.float32) if layers else None
         frame = Frame(rgb, opacity, depth, counts, background, features)
         view = _View.of(self._grid, camera.transformed(self._model_from_world))
-        size = TASK_BLOCKS[self.march]
+        size = min(TASK_BLOCKS[self.march], max(len(view.blocks) // (TASKS_A_THREAD * self.n_threads), 16))
         tasks = [view.blocks[i : i + size] for i in range(0, len(view.blocks), size)]
         futures = [self._pool.submit(self._task, frame, normals, view, blocks, k) for blocks in tasks]
         try:
