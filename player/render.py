@@ -47,8 +47,8 @@ origins would be too coarse at the camera, by a sixteenth of a pixel of 8192 her
 units."""
 
 TASK_BLOCKS = {"numba": 256, "numpy": 128}
-"""Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks; numpy's
-arrays of more blocks do not stay in cache."""
+"""Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks;
+numpy arrays of more blocks do not stay in cache."""
 TASKS_A_THREAD = 8
 """Tasks at least, where there are blocks enough: shared out evenly."""
 
