@@ -75,12 +75,13 @@ class Scene:
             self.asset, points, normals, self.views, lambda done, of: self.report("colours", done, of)
         )
 
-    def surface(self, method: Method, level: float | None) -> tuple[TriangleMesh, Removed]:
+    def surface(self, method: Method, level: float | None, stride: int = 1) -> tuple[TriangleMesh, Removed]:
         """The surface made again, white, and what was removed of it.
 
         Args:
             method: "density", marching cubes on the asset's density; "tsdf", depth pictures fused.
             level: density of the surface in 1/model unit, for "density".
+            stride: of `exporters.asset_surface.extract_asset_surface`, for "density".
 
         Raises:
             ConfigError: a level outside the data.
@@ -97,7 +98,7 @@ class Scene:
             )
         else:
             vertices, faces, normals = extract_asset_surface(
-                self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100)
+                self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100), stride
             )
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
             normals = normals @ matrix[:3, :3].T / self.asset.scale

@@ -23,8 +23,8 @@ def _prefetch(typing_context: Any, array: Any, row: Any) -> Any:
         array_type, row_type = signature.args
         view = context.make_array(array_type)(context, builder, arguments[0])
         index = context.cast(builder, arguments[1], row_type, types.intp)
-        first = context.get_constant(types.intp, 0)
-        address = cgutils.get_item_pointer(context, builder, array_type, view, [index, first])
+        at = [index] + [context.get_constant(types.intp, 0)] * (array_type.ndim - 1)
+        address = cgutils.get_item_pointer(context, builder, array_type, view, at)
         byte, word = ir.PointerType(ir.IntType(8)), ir.IntType(32)
         hint = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(ir.VoidType(), [byte, word, word, word]), "llvm.prefetch.p0i8"
@@ -36,4 +36,4 @@ def _prefetch(typing_context: Any, array: Any, row: Any) -> Any:
 
 
 prefetch: Any = intrinsic(_prefetch)
-"""prefetch(array, row): ask for the start of a row of a two-dimensional array; it changes no value."""
+"""prefetch(array, row): ask for the start of a row of an array; it changes no value."""

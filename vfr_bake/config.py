@@ -361,15 +361,19 @@ class BakeConfig:
             choice.mesh_resolution,
         )
 
-    def choice(self) -> BakeChoice:
-        """The preset, with what is given in its place.
+    def choice(self, unbounded: bool = False) -> BakeChoice:
+        """The preset for an object or an unbounded scene, with what is given in its place.
 
         >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
         (5, 64)
         >>> BakeConfig(k=3).choice().n_samples, BakeConfig(k="auto").choice().n_samples
         (3, 12)
+        >>> BakeConfig().choice(unbounded=True).refine_steps
+        1200
         """
         preset = PRESETS[self.preset]
+        if unbounded:
+            preset = replace(preset, refine_steps=preset.contracted_refine_steps)
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_samples"] = None if self.k == "auto" else self.k
         return replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -42,6 +42,22 @@ def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor
     assert volume == pytest.approx(4 / 3 * math.pi * (BALL_RADIUS + offset_of(level, 72)) ** 3, rel=5e-3)
 
 
+def test_every_second_vertex_gives_the_same_ball_in_a_quarter_of_the_faces(ball_asset: Asset) -> None:
+    """And a wall where nothing is stored any more, inside, which no camera sees."""
+    grid = ball_asset.grid
+    vertices, faces, normals = extract_asset_surface(grid, stride=2)
+    outward = vertices - BALL_CENTRE
+    distance = np.linalg.norm(outward, axis=-1)
+    outside = distance > BALL_RADIUS
+    offset = offset_of(half_opaque(grid), 72)
+    assert np.abs(distance[outside] - BALL_RADIUS - offset).max() < 0.06 * 2 / 72, "on the fine grid's level"
+    shell = faces[outside[faces].all(axis=1)]
+    assert outside[faces].any(axis=1).sum() == len(shell), "and the two do not meet"
+    assert outside.sum() - len(shell) / 2 == 2
+    assert len(shell) == pytest.approx(len(extract_asset_surface(grid)[1]) / 4, rel=0.1)
+    assert (normals * outward)[outside].sum(-1).min() > 0
+
+
 def test_blocks_do_not_show(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     one = extract_asset_surface(ball_asset.grid)
     for size in (16, 128):

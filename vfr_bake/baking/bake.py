@@ -102,7 +102,8 @@ class _Bake:
     """One bake: what its steps share."""
 
     def __init__(self, model: Model, config: BakeConfig, report: Report) -> None:
-        self.model, self.config, self.choice = model, config, config.choice()
+        self.model, self.config = model, config
+        self.choice = config.choice(model.field.config.unbounded)
         self.seconds: dict[str, float] = {}
         self.left_out: dict[str, str] = {}
         self.lookups: dict[str, float] = {}

@@ -86,7 +86,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
 
     Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """
-    choice, field = config.choice(), model.field.config
+    choice, field = config.choice(model.field.config.unbounded), model.field.config
     resolution, coarse = _resolutions(model, config)
     marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
     n_stored = min(choice.n_channels, field.n_channels)
@@ -105,7 +105,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
 
 def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
     """Cells per axis of the densities and of the features."""
-    choice, field = config.choice(), model.field.config
+    choice, field = config.choice(model.field.config.unbounded), model.field.config
     if config.resolution:
         resolution = config.resolution
     elif field.unbounded:
@@ -136,7 +136,7 @@ def _cells(model: Model, resolution: int) -> float:
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     """How long the bake will take, from how long some of the model's own rays take here."""
-    choice, camera = config.choice(), model.model_cameras()[0]
+    choice, camera = config.choice(model.field.config.unbounded), model.model_cameras()[0]
     rays_o, rays_d = camera.rays()
     some = np.arange(N_TIMED) * len(rays_o) // N_TIMED
     rays_o, rays_d = np.ascontiguousarray(rays_o[some]), np.ascontiguousarray(rays_d[some])

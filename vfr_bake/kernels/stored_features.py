@@ -15,10 +15,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from player.prefetch import prefetch
+
 BLOCK = 64
 """Rays that a thread takes at a time."""
 OWN = 6
 """Vertices belong to the parts in turns of 2^OWN: two threads hardly ever write to one line of the cache."""
+AHEAD = 6
+"""Fetches ahead of which memory is asked for: the rows of one lie all over the grid."""
+
+
+@njit(cache=True)
+def _ask(rows, j, table):
+    """For what fetch j will read of `table`; every other corner is the next row of the one before."""
+    if j < rows.shape[0]:
+        for corner in range(0, 8, 2):
+            prefetch(table, rows[j, corner])
 
 
 @njit(parallel=True, cache=True)
@@ -30,6 +42,7 @@ def compose(starts, rows, shares, weights, latent, out):
             for c in range(n_channels):
                 out[i, c] = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
+                _ask(rows, j + AHEAD, latent)
                 for corner in range(8):
                     share = weights[j] * shares[j, corner]
                     if share == 0:
@@ -59,6 +72,8 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                 continue
             square /= np.float32(n_channels)
             for j in range(starts[i], starts[i + 1]):
+                _ask(rows, j + AHEAD, latent)
+                _ask(rows, j + AHEAD, steepness)
                 for corner in range(8):
                     row = rows[j, corner]
                     share = weights[j] * shares[j, corner]
@@ -83,6 +98,7 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
                 if tau > opaque:
                     weights[j] = np.float32(0)
                     continue
+                _ask(rows, j + AHEAD, latent)
                 code = np.float32(0)
                 for corner in range(8):
                     code += shares[j, corner] * np.rint(latent[rows[j, corner]])
@@ -92,7 +108,8 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
             opacity[i] = -np.expm1(-tau)
 
 
-@njit(parallel=True, cache=True)
+# sums over channels in any order: a quarter faster
+@njit(parallel=True, cache=True, fastmath={"reassoc", "nsz", "contract"})
 def slants(
     starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
     gradient_of_opacity, low, slope, lengths, latent, out,
@@ -108,6 +125,8 @@ def slants(
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
             behind = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
+                _ask(rows, j + AHEAD, values)
+                _ask(density_rows, j + AHEAD, latent)
                 along = np.float32(0)
                 for corner in range(8):
                     row = rows[j, corner]
@@ -139,6 +158,8 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
     gradients `slants` [n_fetches] of what is interpolated from `rows` by `shares`; in parts as `descend`."""
     for part in prange(n_parts):
         for j in range(slants.shape[0]):
+            _ask(rows, j + AHEAD, latent)
+            _ask(rows, j + AHEAD, steepness)
             if slants[j] == 0:
                 continue
             for corner in range(8):
