@@ -63,9 +63,9 @@ def _node(data: bytes) -> Node:
             names[field].append(item.decode(errors="replace"))
         elif field == 5 and isinstance(item, bytes):
             parts = dict(_fields(item))
-            name = parts.get(1, b"")
-            assert isinstance(name, bytes)
-            attributes[name.decode(errors="replace")] = parts.get(3, parts.get(4, -1))
+            name = parts.get(1)
+            text = name.decode(errors="replace") if isinstance(name, bytes) else "no name"
+            attributes[text] = parts.get(3, parts.get(4, -1))
     domain = "".join(names[7])
     return Node("".join(names[4]) + (f" of {domain}" if domain else ""), names[1], names[2], attributes)
 

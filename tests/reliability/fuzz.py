@@ -21,17 +21,20 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from exporters.onnx_head import head_onnx
 from player.asset import Asset
 from player.errors import VfrError
 from player.head import Head
 from player.manifest import parse_manifest
 from player.transforms import read_cameras
 from player.views import read_views
+from tests.exporters.test_onnx_head import random_head
 from tests.player.conftest import cameras_bytes, head_bytes, look_at, write_shells
 from tests.reliability.mutations import broken_bytes, broken_json, broken_value
 
@@ -84,11 +87,22 @@ def targets(work: Path) -> list[Target]:
     found = [*_asset_targets(work), *_camera_targets(work), *_colmap_targets(work)]
     head = work / "head.onnx"
 
-    def read_head() -> None:
-        Head(head, 4)(np.zeros((2, 4), np.float32), np.zeros((2, 3), np.float32))
+    def read_head(compiled: bool) -> None:
+        Head(head, 4, compiled)(np.zeros((2, 4), np.float32), np.zeros((2, 3), np.float32))
 
-    whole = head_bytes()
-    found.append(Target("head", lambda random: head.write_bytes(broken_bytes(whole, random)), read_head))
+    weights = random_head(n_channels=4, width=8, sh_degree=2, n_sh_features=2, n_more=1)
+    for name, whole, compiled in (
+        ("head", head_bytes(), False),
+        ("compiled head", head_onnx(weights), True),
+        ("compiled head in 8 bits", head_onnx(weights, [(-0.2, 1.0)] * 2), True),
+    ):
+
+        def spoil(random: np.random.Generator, whole: bytes = whole) -> None:
+            head.write_bytes(broken_bytes(whole, random))
+
+        head.write_bytes(whole)
+        read_head(compiled)  # numba loads what it has compiled, once
+        found.append(Target(name, spoil, partial(read_head, compiled)))
     return [*found, _model_target(work)]
 
 
