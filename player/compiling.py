@@ -18,17 +18,25 @@ def available() -> bool:
     return numba is not None
 
 
-def forget_outdated(folder: Path) -> None:
-    """Remove compiled code that numba kept in `folder` before any of the sources there was last changed.
+def forget_outdated(folder: Path, *others: Path) -> None:
+    """Remove compiled code that numba kept in `folder` if any of the sources there, or in `others` that they
+    take functions from, is not what it was then.
 
     numba looks at the file of a function alone: after an update it would go on with what the function took
-    from other files as they were, and compute something else without a word.
+    from other files as they were, and compute something else without a word. Times are compared for
+    equality: a clock that was wrong does no harm.
     """
-    newest = max((path.stat().st_mtime for path in folder.glob("*.py")), default=0.0)
-    for kept in folder.glob("__pycache__/*.nbi"):
-        with suppress(OSError):  # somebody else removed it, or it is not ours to remove
-            if kept.stat().st_mtime <= newest:
-                kept.unlink()
+    paths = [path for place in (folder, *others) for path in sorted(place.glob("*.py"))]
+    files = [(path.name, path.stat()) for path in paths]
+    sources = "\n".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in files)
+    note = folder / "__pycache__" / "compiled_from.txt"
+    with suppress(OSError):  # nothing kept yet; or somebody else removed it, or it is not ours to remove
+        if note.is_file() and note.read_text() == sources:
+            return
+        for kept in folder.glob("__pycache__/*.nbi"):
+            kept.unlink(missing_ok=True)
+        note.parent.mkdir(exist_ok=True)
+        note.write_text(sources)
 
 
 def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
+
+import pytest
 
 USER = """
 from pathlib import Path
@@ -49,3 +52,17 @@ def test_a_change_in_another_file_is_compiled(tmp_path: Path) -> None:
     assert first and run(tmp_path) == "2" and kept(tmp_path) == first  # nothing is compiled again
     (tmp_path / "other.py").write_text(PART.format(5))
     assert run(tmp_path) == "6"
+
+
+@pytest.mark.parametrize("years", [-1, 1])
+def test_a_clock_that_was_wrong_does_no_harm(years: int, tmp_path: Path) -> None:
+    """Sources from next year are compiled once, not at every start; older ones than what is kept are seen."""
+    (tmp_path / "user.py").write_text(USER)
+    (tmp_path / "other.py").write_text(PART.format(1))
+    assert run(tmp_path) == "2"
+    (tmp_path / "other.py").write_text(PART.format(5))
+    then = time.time() + years * 365 * 86400
+    os.utime(tmp_path / "other.py", (then, then))
+    assert run(tmp_path) == "6"
+    first = kept(tmp_path)
+    assert run(tmp_path) == "6" and kept(tmp_path) == first

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from numba import config
 
+import player
 from player.compiling import forget_outdated
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
 config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore[reportAttributeAccessIssue]
-forget_outdated(Path(__file__).parent)
+forget_outdated(Path(__file__).parent, Path(player.__file__).parent)
