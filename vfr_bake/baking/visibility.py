@@ -11,7 +11,7 @@ from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
-HITS = 16
+HITS = 8
 """Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
 closed."""
 VIEWS_OF_A_CELL = 0.4
