@@ -5,9 +5,6 @@ processor does for many vectors at once if they follow one another in a short lo
 
     gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
     sigmoid(x) = 1 / (1 + exp(-x))
-
-What is rounded to 8 bits next needs no more than a hundredth of a level: there erf(x / sqrt 2) = x R(x^2), R
-the polynomial of least error for |x| <= 4.4; gelu to 2e-5 there, to 2e-5 |x| beyond, in half the operations.
 """
 
 from __future__ import annotations
@@ -33,12 +30,6 @@ _ERF_Q = (
     1.42647390514189e-02,
 )  # fmt: skip
 
-_COARSE_ERF = (
-    -3.31304235e-12, 3.86883086e-10, -2.02409835e-08, 6.31625785e-07, -1.32439351e-05, 1.99793287e-04,
-    -2.26451886e-03, 1.97172119e-02, -1.32739567e-01, 7.97796237e-01,
-)  # fmt: skip
-_COARSE_END = 4.4
-
 
 def _gelu(x: Lanes) -> Lanes:
     z = _within(x * 0.5**0.5, 4.0)
@@ -46,12 +37,6 @@ def _gelu(x: Lanes) -> Lanes:
     erf = z * _polynomial(_ERF_P, square) * _inverse(_polynomial(_ERF_Q, square))
     half = x * 0.5
     return half.call("fma", erf, half)
-
-
-def _coarse_gelu(x: Lanes) -> Lanes:
-    near = _within(x, _COARSE_END)
-    half = x * 0.5
-    return half.call("fma", near * _polynomial(_COARSE_ERF, near * near), half)
 
 
 def _within(x: Lanes, most: float) -> Lanes:
@@ -123,7 +108,7 @@ def _to_codes(function: Callable[[Lanes], Lanes]) -> Any:
 
 quantize_lanes: Any = _to_codes(lambda x: x)
 """quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
-gelu_to_codes: Any = _to_codes(_coarse_gelu)
+gelu_to_codes: Any = _to_codes(_gelu)
 """gelu_to_codes(codes, memory, out, x, zero, per_step): of their GELU."""
 
 

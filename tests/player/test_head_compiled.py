@@ -86,7 +86,7 @@ def test_what_is_no_number_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("width", [64, 40])
 @pytest.mark.parametrize("in_bytes", [MULTIPLIES_BYTES, False], ids=["bytes", "floats"])
 def test_compiled_head_in_8_bits_is_onnxruntimes(width: int, in_bytes: bool, tmp_path: Path) -> None:
-    """But for a GELU on the other side of a level, one in three thousand; measured 6e-4 and 1e-4."""
+    """But for a sum beside the border of two levels, which another order of additions takes across it."""
     weights = random_head(n_channels=8, width=width, n_more=2, sh_degree=4)
     seen = inputs(2000)
     data = head_onnx(weights, activation_ranges(weights, *seen))
@@ -100,8 +100,8 @@ def test_compiled_head_in_8_bits_is_onnxruntimes(width: int, in_bytes: bool, tmp
         difference = np.abs(CompiledHead(program)(features, dirs) - expected)
         assert difference.shape == (n, 3)
         if n == 2000:
-            assert np.sqrt((difference**2).mean()) < 1e-3 and difference.max() < 0.03
-            assert (difference < TOLERANCE).mean() > 0.8
+            assert np.sqrt((difference**2).mean()) < 2e-4 and difference.max() < 0.02
+            assert (difference < TOLERANCE).mean() > 0.9
 
 
 def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
