@@ -298,21 +298,26 @@ def import_ahead(scipy: bool = True) -> None:
     """Begin to import what rendering needs, on a thread of its own, while the caller opens the asset: both
     take half a second.
 
-    `scipy`: whether anything else in this process may ask for it. If not, numba does not find its linear
-    algebra either, which nothing here uses, and which takes 0.3 s to import.
+    `scipy`: whether anything else in this process may ask for it meanwhile. If not, numba does not find its
+    linear algebra either, which nothing here uses, and which takes 0.3 s to import.
     """
 
     def imports() -> None:
-        with suppress(ImportError):  # told by whoever needs it
-            if not scipy and "scipy" not in sys.modules:
-                sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
-            if choose_march("auto")[0] == "numpy":
-                import onnxruntime  # noqa: F401
-            else:
-                from player import head_compiled, pixels_compiled  # noqa: F401
+        hidden = not scipy and not {"scipy.linalg", "numba.np.arraymath"} & set(sys.modules)
+        if hidden:
+            sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
+        try:
+            with suppress(ImportError):  # told by whoever needs it
+                if choose_march("auto")[0] == "numpy":
+                    import onnxruntime  # noqa: F401
+                else:
+                    from player import head_compiled, pixels_compiled  # noqa: F401
 
-                camera = Camera("", np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
-                pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
+                    camera = Camera("", np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
+                    pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
+        finally:
+            if hidden:
+                del sys.modules["scipy.linalg"]
 
     threading.Thread(target=imports, daemon=True).start()
 

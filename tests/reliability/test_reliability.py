@@ -22,7 +22,7 @@ def run(module: str, *arguments: str) -> dict[str, Any]:
 def test_broken_inputs_are_refused_or_read() -> None:
     result = run("tests.reliability.fuzz", "--inputs", "390", "--seed", "7")
     assert result["failures"] == []
-    assert len(result["targets"]) == 13
+    assert len(result["targets"]) == 15
     for counts in result["targets"].values():
         assert counts["inputs"] == counts["refused"] + counts["read"] == 30
         assert counts["refused"] > 5, "inputs that break nothing test nothing"
