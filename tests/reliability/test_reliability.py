@@ -20,7 +20,7 @@ def run(module: str, *arguments: str) -> dict[str, Any]:
 
 
 def test_broken_inputs_are_refused_or_read() -> None:
-    result = run("tests.reliability.fuzz", "--inputs", "390", "--seed", "7")
+    result = run("tests.reliability.fuzz", "--inputs", "450", "--seed", "7")
     assert result["failures"] == []
     assert len(result["targets"]) == 15
     for counts in result["targets"].values():
