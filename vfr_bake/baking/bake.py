@@ -213,10 +213,8 @@ class _Bake:
     def _projection(self, taught: Taught) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
-        some = slice(None, None, max(len(taught.opacity) // N_SENSITIVITY, 1))
-        sensitivity = head_sensitivity(
-            head, taught.features[some], taught.rays_d[some], taught.opacity[some]
-        )  # fmt: skip
+        some = taught.some(N_SENSITIVITY)
+        sensitivity = head_sensitivity(head, some.features, some.rays_d, some.opacity)
         if self.config.n_channels is not None:
             return project(sensitivity, taught.features, most)
         for n_stored in range(1, most):
@@ -243,8 +241,7 @@ class _Bake:
         choice, n_steps = self.choice, self.choice.refine_steps
         if n_steps == 0:
             grid = layout.grid(stored.density, stored.features)
-            self._choose_lookups(grid, stored.head)
-            self._choose_bits(stored, grid, taught)
+            self._choose_lookups_and_bits(stored, grid, taught)
             return stored
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         with self._part("refinement"):
@@ -256,27 +253,31 @@ class _Bake:
                 stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
                 self.held_out.measure("small head", grid, runner(stored.head), 0)
                 head_rate = NEW_HEAD_RATE / 2
-                width = self.model.field.config.head_width
-                self.left_out["head"] = f"a head {width} wide: this one is {choice.head_width} wide"
-            stored = refine(
-                stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid
-            )
+                self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
+            progress = self._progress("refinement")
+            tuned = refine(stored, lessons, n_steps, progress, head_rate, code_rate, grid)
+            grid = layout.grid(tuned.density, tuned.features)
+            self.held_out.measure("refined", grid, runner(tuned.head), 0)
+            stored = self._better("refinement", stored, tuned)
             grid = layout.grid(stored.density, stored.features)
-            self.held_out.measure("refined", grid, runner(stored.head), 0)
-            self._choose_lookups(grid, stored.head)
-            self._choose_bits(stored, grid, taught)
+            self._choose_lookups_and_bits(stored, grid, taught)
             if self.n_samples:
                 lessons = collect_lessons(taught, grid, self.n_samples)
                 rates = head_rate / 2, code_rate / 2  # what is left to learn is little
-                before, progress = self.held_out.stages[-1], self._progress("refinement at k")
+                progress = self._progress("refinement at k")
                 tuned = refine(stored, lessons, n_steps, progress, *rates, ranges=self.ranges)
                 grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
-                after = self.held_out.measure("refined at k", grid, head, self.n_samples)
-                if after.loss_db < before.loss_db:
-                    stored = tuned
-                else:
-                    self.left_out["refinement at k"] = "all of it: it lost more on views that it has not seen"
+                self.held_out.measure("refined at k", grid, head, self.n_samples)
+                stored = self._better("refinement at k", stored, tuned)
         return stored
+
+    def _better(self, name: str, old: Stored, new: Stored) -> Stored:
+        """The one that lost less in the last two stages, on views that neither has seen."""
+        before, after = self.held_out.stages[-2:]
+        if after.loss_db < before.loss_db:
+            return new
+        self.left_out[name] = "all of it: it lost more on views that it has not seen"
+        return old
 
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
@@ -320,8 +321,9 @@ class _Bake:
             self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
         return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
 
-    def _choose_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> None:
-        """Set `ranges`, unless a head in 8 bits alone would lose more than the preset may in all."""
+    def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> None:
+        """The lookups; and `ranges`, unless a head in 8 bits alone would lose more than the preset may."""
+        self._choose_lookups(grid, stored.head)
         if self.choice.head_bits == 32:
             return
         lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
