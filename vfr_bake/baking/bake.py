@@ -150,8 +150,7 @@ class _Bake:
         last: Stage = result["last"]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
-        n_bytes = sum(file_sizes(folder).values())
-        seconds = sum(self.seconds.values())
+        n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
         return BakeResult(len(layout.densities), n_bytes, seconds, figures, result["missed"])
 
     def _cells(self) -> Layout:
@@ -254,8 +253,7 @@ class _Bake:
                 self.held_out.measure("small head", grid, runner(stored.head), 0)
                 head_rate = NEW_HEAD_RATE / 2
                 self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-            progress = self._progress("refinement")
-            tuned = refine(stored, lessons, n_steps, progress, head_rate, code_rate, grid)
+            tuned = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid)
             grid = layout.grid(tuned.density, tuned.features)
             self.held_out.measure("refined", grid, runner(tuned.head), 0)
             stored = self._better("refinement", stored, tuned)
