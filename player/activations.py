@@ -88,28 +88,22 @@ sigmoid_lanes: Any = _in_place(_sigmoid)
 """sigmoid_lanes(memory, at): the same."""
 
 
-def _to_codes(function: Callable[[Lanes], Lanes]) -> Any:
+def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
 
-    def typed(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        there, here = (address(context, builder, signature.args[n], arguments[n]) for n in range(2))
+        code = _code(load(builder, here, arguments[3]), *arguments[4:])
+        narrow = vector(BYTE)
+        place = builder.bitcast(builder.gep(there, [arguments[2]]), ir.PointerType(narrow))
+        builder.store(builder.trunc(code.to_int().value, narrow), place, align=1)
+        return context.get_dummy_value()
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            there, here = (address(context, builder, signature.args[n], arguments[n]) for n in range(2))
-            code = _code(function(load(builder, here, arguments[3])), *arguments[4:])
-            narrow = vector(BYTE)
-            place = builder.bitcast(builder.gep(there, [arguments[2]]), ir.PointerType(narrow))
-            builder.store(builder.trunc(code.to_int().value, narrow), place, align=1)
-            return context.get_dummy_value()
-
-        long = types.int64
-        return types.void(codes, memory, long, long, long, types.float32), generate
-
-    return intrinsic(typed)
+    long = types.int64
+    return types.void(codes, memory, long, long, long, types.float32), generate
 
 
-quantize_lanes: Any = _to_codes(lambda x: x)
+quantize_lanes: Any = intrinsic(_quantize)
 """quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
-gelu_to_codes: Any = _to_codes(_gelu)
-"""gelu_to_codes(codes, memory, out, x, zero, per_step): of their GELU."""
 
 
 def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any, step: Any) -> Any:

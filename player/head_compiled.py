@@ -14,7 +14,6 @@ from player.activations import (
     GELU,
     SIGMOID,
     gelu_lanes,
-    gelu_to_codes,
     quantize_lanes,
     round_lanes,
     sigmoid_lanes,
@@ -107,12 +106,8 @@ def _multiply(memory, out, a, b, n):
 def _quantize(codes, memory, weights, step, n):
     x, pitch, zero, per_step, out = step[1], step[2], step[4], weights[step[3]], step[8]
     for _ in range(n):
-        if step[11] == GELU:
-            for i in range(0, pitch, LANES):
-                gelu_to_codes(codes, memory, out + i, x + i, zero, per_step)
-        else:
-            for i in range(0, pitch, LANES):
-                quantize_lanes(codes, memory, out + i, x + i, zero, per_step)
+        for i in range(0, pitch, LANES):
+            quantize_lanes(codes, memory, out + i, x + i, zero, per_step)
         x, out = x + pitch, out + MOST_BYTES
 
 

@@ -8,7 +8,6 @@ onnxruntime.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,7 +85,6 @@ class _Compiler:
         self._values: dict[str, Value] = {}
         self._codes: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # constants: codes, steps of the last axis
         self._steps: list[tuple[int, ...]] = []
-        self._readers = Counter(name for node in graph.nodes for name in node.inputs)
         self._add("features", n_channels)
         self._add("dirs", 3)
 
@@ -235,25 +233,13 @@ class _Compiler:
             raise NotOursError
         scale, zero = scale.item(), zero.item()
         numbers = self._weights.add(np.array([[1 / scale, scale]], np.float32))
-        rounded = np.float32(scale), zero
-        if not self._in_bytes or x.width > MOST_BYTES:
-            out = self._add(node.outputs[0], x.width)
-            self._values[node.outputs[0]] = replace(out, scale=rounded[0], zero=zero)
-            self._step(ROUND, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place)
-            return
-        out = Value(self._n_bytes, MOST_BYTES, x.width, *rounded, in_bytes=True)
-        self._values[node.outputs[0]] = out
-        self._n_bytes += BLOCK * MOST_BYTES
-        kind = self._take_gelu(x) if self._readers[node.inputs[0]] == 1 else LINEAR
-        self._step(QUANTIZE, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place, 0, 0, kind)
-
-    def _take_gelu(self, x: Value) -> int:
-        """The GELU behind the last layer, if that made x: it is done to the one who asks, in its way."""
-        last = self._steps[-1]
-        if last[0] not in (DENSE, DENSE_BYTES) or last[8] != x.place or last[11] != GELU:
-            return LINEAR
-        self._steps[-1] = (*last[:11], LINEAR)
-        return GELU
+        if self._in_bytes and x.width <= MOST_BYTES:
+            kind, out = QUANTIZE, Value(self._n_bytes, MOST_BYTES, x.width, in_bytes=True)
+            self._n_bytes += BLOCK * MOST_BYTES
+        else:
+            kind, out = ROUND, self._add(node.outputs[0], x.width)
+        self._values[node.outputs[0]] = replace(out, scale=np.float32(scale), zero=zero)
+        self._step(kind, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place)
 
     def _dequantize(self, node: Node) -> None:
         """Codes are kept; only what they count is noted."""
