@@ -20,7 +20,7 @@ def bake_command(folder: str, asset: Asset) -> str:
     if preset not in PRESETS:
         return ""
     chosen: dict[str, Any] = {name: settings.get(name) for name in GIVEN}
-    usual = PRESETS[preset]
+    usual = BakeConfig(preset=preset).choice(asset.manifest.contracted)
     for name in BakeConfig.__dataclass_fields__:
         if hasattr(usual, name) and settings.get(name, getattr(usual, name)) != getattr(usual, name):
             chosen[name] = settings[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,18 @@ import pytest
 from PIL import Image
 
 from player.asset import Asset
+from player.manifest import CONTRACTED_AABB
 from player.render import render
 from player.transforms import read_cameras, write_cameras
+from vfr_bake.baking.presets import PRESETS
+from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import MAX_PSNR
 from vfr_bake.bench.timing import Times, lookup_slope, measure_times
 from vfr_bake.bench.worst import APART, worst_pixels
 from vfr_bake.cli import bench_main
-from vfr_bake.config import FieldConfig
+from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import Model, save_model
@@ -85,6 +88,23 @@ def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder:
             )
         assert row["peak_mb"] > 20 and row["first_picture_ms"] > 10
         assert row["commands"][1].startswith(f"vfr-play {shells_folder} --samples {row['samples']} ")
+
+
+@pytest.mark.parametrize("contracted", [False, True], ids=["object", "unbounded"])
+def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, shells_folder: Path) -> None:
+    """A preset takes fewer steps for an unbounded scene: those are its own, and an object's would not be."""
+    asset = Asset.open(shells_folder)
+
+    def command(config: BakeConfig) -> str:
+        remembered = {"bake": asdict(config) | asdict(config.choice(contracted))}
+        aabb = CONTRACTED_AABB if contracted else asset.manifest.aabb
+        manifest = replace(asset.manifest, contracted=contracted, aabb=aabb, provenance=remembered)
+        return bake_command("out", replace(asset, manifest=manifest))
+
+    other = PRESETS["balanced"].refine_steps if contracted else PRESETS["balanced"].contracted_refine_steps
+    plain = "vfr-bake model.pt out --preset balanced"
+    assert command(BakeConfig()) == plain
+    assert command(BakeConfig(refine_steps=other, k=3)) == f"{plain} --refine-steps {other} --k 3"
 
 
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
