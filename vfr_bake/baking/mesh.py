@@ -31,14 +31,13 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
             all where Open3D, which takes faces away, is not to be had.
         report: called with (stage, done, of).
     """
-    stride = _stride(asset.grid, resolution)
     try:
         scene = Scene(inner_region(asset), report, PIXELS)
-        mesh, removed = scene.surface("density", None, stride)
+        mesh, removed = scene.surface("density", None, _stride(asset.grid, resolution))
     except (ConfigError, DataError):  # nowhere as dense as a level, everywhere, or seen by nobody
         none = np.zeros((0, 3))
         return TriangleMesh(none, none.astype(np.int32), none, np.zeros((0, 4), np.uint8)), Removed(0, 0, 0)
-    n_faces = max(round(len(mesh.faces) * _share(asset.grid, resolution, stride)), 1)
+    n_faces = max(round(len(mesh.faces) * _share(asset.grid, resolution)), 1)
     try:
         mesh = simplify_mesh(mesh, n_faces)
     except MissingExtraError:
@@ -48,12 +47,11 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
 
 def mesh_size(grid: SparseGrid, resolution: int) -> int:
     """Bytes that the mesh will take at most: for a budget that is shared out before there is one."""
-    stride = _stride(grid, resolution)
     try:
-        _, faces, _ = extract_asset_surface(grid, stride=stride)
+        _, faces, _ = extract_asset_surface(grid, stride=_stride(grid, resolution))
     except (ConfigError, DataError):
         return 0
-    return round(len(faces) * _share(grid, resolution, stride) * BYTES_A_FACE)
+    return round(len(faces) * _share(grid, resolution) * BYTES_A_FACE)
 
 
 def _stride(grid: SparseGrid, resolution: int) -> int:
@@ -61,5 +59,6 @@ def _stride(grid: SparseGrid, resolution: int) -> int:
     return 2 if grid.resolution >= 4 * resolution else 1
 
 
-def _share(grid: SparseGrid, resolution: int, stride: int) -> float:
-    return min(resolution * stride / grid.resolution, 1.0) ** 2
+def _share(grid: SparseGrid, resolution: int) -> float:
+    """Of the faces that are made, how many are wanted."""
+    return min(resolution * _stride(grid, resolution) / grid.resolution, 1.0) ** 2
