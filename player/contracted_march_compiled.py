@@ -12,8 +12,8 @@ import numpy as np
 
 from player.compiling import compiled, inlined
 from player.contracted_rays import MAX_SPEED, MIN_COS, enter_space, lattice
-from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, opacity_of
-from player.march import MIN_OPACITY, MarchResult
+from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, take_hits
+from player.march import MarchResult
 from player.packet_fetches import choose_fetches
 from player.packets import SPACE_ROWS, SUMS, march_space
 from player.sparse_grid import SparseGrid
@@ -54,9 +54,9 @@ def march(
 def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, entered, found, fetches, out):
     """Packets of rays: their samples first, then a fetch of each ray at a time into its row of `features`."""
     samples, sums = found
-    chosen, masses, into, _, _, _, _ = fetches
-    opacity, depth, counts, features, hits = out
-    n_rays, n_hits = len(opacity), 0
+    chosen, masses, _, _, _, _, _ = fetches
+    _, depth, _, features, _ = out
+    n_rays, n_hits = len(depth), 0
     for start in range(0, n_rays, LANES):
         n_lanes = min(LANES, n_rays - start)
         for row in range(len(rays)):
@@ -64,28 +64,18 @@ def _march_rays(settings, steps, lookup, stored, sizes, rays, table, k, entered,
                 entered[row, lane] = rays[row][start + lane] if lane < n_lanes else F32(0.0)
         rows = march_space(lookup, settings, table, steps, entered, samples, sums)
         hits_before = n_hits
-        masses[:] = F32(0.0)
+        n_hits = take_hits(start, n_lanes, sums, fetches, out, n_hits)
         for lane in range(n_lanes):
-            ray = start + lane
-            counts[ray] = int(sums[1, lane])
-            if sums[2, lane] == F32(0.0):
-                continue
-            mass = F32(opacity_of(sums[0, lane]))
-            opacity[ray] = mass
-            cos, sin = _turned(entered, lane, sums[4, lane] / sums[3, lane])
-            depth[ray] = entered[SPACE_ROWS, lane] + entered[8, lane] * sin / max(cos, MIN_COS)
-            if mass > MIN_OPACITY:
-                masses[lane], into[lane] = mass, n_hits
-                hits[n_hits] = ray
-                n_hits += 1
+            if sums[2, lane] > F32(0.0):
+                cos, sin = _turned(entered, lane, sums[4, lane] / sums[3, lane])
+                depth[start + lane] = entered[SPACE_ROWS, lane] + entered[8, lane] * sin / max(cos, MIN_COS)
         if n_hits == hits_before:
             continue
         if k > 0:
-            for j in range(choose_fetches(samples, rows, k, sums, masses, chosen)):
-                _fetch(stored, sizes, entered, steps[4], chosen, j, chosen, fetches, features)
-        else:
-            for j in range(rows):
-                _fetch(stored, sizes, entered, steps[4], samples, j, chosen, fetches, features)
+            rows = choose_fetches(samples, rows, sums, masses, chosen)
+        wanted = chosen if k > 0 else samples
+        for j in range(rows):
+            _fetch(stored, sizes, entered, steps[4], wanted, j, k > 0, fetches, features)
     return n_hits
 
 
@@ -98,14 +88,14 @@ def _turned(entered, lane, s):
 
 
 @inlined
-def _fetch(stored, sizes, entered, cells, table, j, chosen, fetches, features):
-    """Add fetch j of every ray that has one: s and weights of `table`; where little is stored, the other
-    place."""
+def _fetch(stored, sizes, entered, cells, table, j, again, fetches, features):
+    """Add fetch j of every ray that has one: s and weights of `table`; `again` at the other place where
+    little is stored."""
     _, masses, _, _, weights, _, _ = fetches
     for lane in range(LANES):
         weights[lane] = table[1, j, lane] if masses[lane] > F32(0.0) else F32(0.0)
     _place(entered, table, 0, j, cells, fetches)
-    if add_fetches(stored, sizes, fetches, features) > 0 and len(chosen) == len(table):
+    if add_fetches(stored, sizes, fetches, features) > 0 and again:
         _place(entered, table, 2, j, cells, fetches)
         add_fetches(stored, sizes, fetches, features)
 

@@ -1,4 +1,4 @@
-"""Fetches of features in compiled code: LANES of them, one of each ray of a packet.
+"""What both compiled marches do with a packet's samples: hits, and fetches, one of each ray at a time.
 
 Every function has its readable twin in `player.few_samples`.
 """
@@ -13,6 +13,7 @@ from player.compiling import inlined
 from player.eight_rows import CHANNELS, add_rows
 from player.few_samples import MIN_TOTAL
 from player.lanes import LANES
+from player.march import MIN_OPACITY
 from player.packet_fetches import stored_corners
 from player.prefetch import prefetch
 
@@ -40,6 +41,26 @@ def fetch_arrays(k: int) -> tuple[np.ndarray, ...]:
         np.empty(LANES, F32),
         *corners,
     )
+
+
+@inlined
+def take_hits(start, n_lanes, sums, fetches, out, n_hits):
+    """Counts and opacities of the packet's rays, those from `start` on; a visible one is a hit, with a mass
+    and a row of the features. Returns how many hits there are now."""
+    _, masses, into, _, _, _, _ = fetches
+    opacity, _, counts, _, hits = out
+    masses[:] = F32(0.0)
+    for lane in range(n_lanes):
+        ray = start + lane
+        counts[ray] = int(sums[1, lane])
+        if sums[2, lane] == F32(0.0):
+            continue
+        opacity[ray] = opacity_of(sums[0, lane])
+        if opacity[ray] > MIN_OPACITY:
+            masses[lane], into[lane] = opacity[ray], n_hits
+            hits[n_hits] = ray
+            n_hits += 1
+    return n_hits
 
 
 @inlined

@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from player.compiling import compiled, inlined
-from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, opacity_of
-from player.march import MIN_OPACITY, MarchResult
+from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, take_hits
+from player.march import MarchResult
 from player.packet_fetches import choose_fetches
 from player.packets import BOX_ROWS, SUMS, march_box
 from player.sparse_grid import SparseGrid
@@ -57,36 +57,26 @@ def _march_rays(settings, lookup, stored, sizes, rays, k, packet, found, fetches
     resolution, n_per_axis, step, low, slope, _, _ = settings
     entered, first = packet
     samples, sums = found
-    chosen, masses, into, _, _, _, _ = fetches
-    opacity, depth, counts, features, hits = out
-    n_rays, n_hits = len(opacity), 0
+    chosen, masses, _, _, _, _, _ = fetches
+    _, depth, _, features, _ = out
+    n_rays, n_hits = len(depth), 0
     longest = F32(samples.shape[1] - 1) * step  # there is no room for more, whatever the ray
     for start in range(0, n_rays, LANES):
         n_lanes = min(LANES, n_rays - start)
         _enter(settings, rays, start, n_lanes, longest, entered, first)
         rows = march_box(lookup, (resolution, n_per_axis, low, slope), step, entered, first, samples, sums)
         hits_before = n_hits
-        masses[:] = F32(0.0)
+        n_hits = take_hits(start, n_lanes, sums, fetches, out, n_hits)
         for lane in range(n_lanes):
-            ray = start + lane
-            counts[ray] = int(sums[1, lane])
-            if sums[2, lane] == F32(0.0):
-                continue
-            mass = F32(opacity_of(sums[0, lane]))
-            opacity[ray] = mass
-            depth[ray] = entered[BOX_ROWS, lane] + sums[4, lane] / sums[3, lane]
-            if mass > MIN_OPACITY:
-                masses[lane], into[lane] = mass, n_hits
-                hits[n_hits] = ray
-                n_hits += 1
+            if sums[2, lane] > F32(0.0):
+                depth[start + lane] = entered[BOX_ROWS, lane] + sums[4, lane] / sums[3, lane]
         if n_hits == hits_before:
             continue
         if k > 0:
-            for j in range(choose_fetches(samples, rows, k, sums, masses, chosen)):
-                _fetch(stored, sizes, entered, chosen, j, chosen, fetches, features)
-        else:
-            for j in range(rows):
-                _fetch(stored, sizes, entered, samples, j, chosen, fetches, features)
+            rows = choose_fetches(samples, rows, sums, masses, chosen)
+        wanted = chosen if k > 0 else samples
+        for j in range(rows):
+            _fetch(stored, sizes, entered, wanted, j, k > 0, fetches, features)
     return n_hits
 
 
@@ -131,14 +121,14 @@ def _slab(o, d, size, t_in, t_out):
 
 
 @inlined
-def _fetch(stored, sizes, entered, table, j, chosen, fetches, features):
-    """Add fetch j of every ray that has one: s and weights of `table`; where little is stored, the other
-    place."""
+def _fetch(stored, sizes, entered, table, j, again, fetches, features):
+    """Add fetch j of every ray that has one: s and weights of `table`; `again` at the other place where
+    little is stored."""
     _, masses, _, _, weights, _, _ = fetches
     for lane in range(LANES):
         weights[lane] = table[1, j, lane] if masses[lane] > F32(0.0) else F32(0.0)
     _place(entered, table, 0, j, fetches)
-    if add_fetches(stored, sizes, fetches, features) > 0 and len(chosen) == len(table):
+    if add_fetches(stored, sizes, fetches, features) > 0 and again:
         _place(entered, table, 2, j, fetches)
         add_fetches(stored, sizes, fetches, features)
 

@@ -47,18 +47,18 @@ class _Chosen:
         self.n.set(choose(where, n + 1, n))
 
 
-def _choose_fetches(_: Any, samples: Any, n_rows: Any, k: Any, sums: Any, mass: Any, chosen: Any) -> Any:
+def _choose_fetches(_: Any, samples: Any, n_rows: Any, sums: Any, mass: Any, chosen: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
         places, summed, opacity, table = (
-            address(context, b, signature.args[n], arguments[n]) for n in (0, 3, 4, 5)
+            address(context, b, signature.args[n], arguments[n]) for n in (0, 2, 3, 4)
         )
         pitch = b.udiv(context.make_array(samples)(context, b, arguments[0]).nitems, LONG(2))
-        most = b.udiv(context.make_array(chosen)(context, b, arguments[5]).nitems, LONG(3 * LANES))
+        most = b.udiv(context.make_array(chosen)(context, b, arguments[4]).nitems, LONG(3 * LANES))
         room = splat(b, b.trunc(most, INT))
         one_each = Lanes(b, ir.Constant(ir.VectorType(INT, LANES), list(range(LANES))))
         n_weights, total = load(b, summed, LONG(2 * LANES)), load(b, summed, LONG(3 * LANES))
-        bins = splat(b, b.trunc(arguments[2], INT)).to_float()
+        bins = room.to_float()
         visible = load(b, opacity, LONG(0))
         zero = total.like(0.0)
         out = _Chosen(table, room * LANES, one_each, room.like(0))
@@ -105,17 +105,17 @@ def _choose_fetches(_: Any, samples: Any, n_rows: Any, k: Any, sums: Any, mass: 
                 store(table, row, choose(beyond, zero, load(b, table, row)))
         return b.sext(longest, LONG)
 
-    return types.int64(samples, types.int64, types.int64, sums, mass, chosen), generate
+    return types.int64(samples, types.int64, sums, mass, chosen), generate
 
 
 choose_fetches: Any = intrinsic(_choose_fetches)
-"""choose_fetches(samples [2, n, LANES] float32, n_rows, k, sums [SUMS, LANES] float32, mass [LANES] float32,
-chosen [3, m, LANES] float32): rows of `chosen` that were written.
+"""choose_fetches(samples [2, n, LANES] float32, n_rows, sums [SUMS, LANES] float32, mass [LANES] float32,
+chosen [3, k, LANES] float32): rows of `chosen` that were written.
 
 `samples` and `sums` are what a march of `player.packets` has found, `mass` the opacity of each ray, 0 where
 nothing is to be fetched. Into `chosen` go s and weight of each fetch, and another s, where to fetch if
 little is stored at the first, not a number for none. A ray with fewer fetches than others has weight 0
-there. k is at least 1, and m k; of every sample, `samples` are the fetches as they are.
+there. k is at least 1; of every sample, `samples` are the fetches as they are.
 """
 
 
