@@ -184,7 +184,7 @@ class _Bake:
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
-            views = cameras + views_between(model, len(cameras), seed=1, wide=layout.contracted)
+            views = cameras + views_between(model, 2 * len(cameras), seed=1, wide=layout.contracted)
             taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
@@ -293,9 +293,9 @@ class _Bake:
         fixed = self.config.head_width is not None, self.config.k != "auto"
         return keep_to_time(self.choice, target_ms, measure, *fixed)
 
-    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> None:
+    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
         """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
-        each number loses is kept in `lookups`."""
+        each number loses is kept in `lookups`. Returns how it looks with them."""
         most = self.choice.n_samples
         if self.config.k == "auto":
             every = self.held_out.look("all", grid, runner(head), 0).loss_db
@@ -304,9 +304,10 @@ class _Bake:
                 self.lookups[str(k)] = self.held_out.look(str(k), grid, runner(head), k).loss_db - every
                 if self.lookups[str(k)] <= self.choice.sample_loss_db:
                     break
-        if self.n_samples:
-            self.held_out.measure("k", grid, runner(head), self.n_samples)
-            self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
+        if not self.n_samples:
+            return self.held_out.look("all", grid, runner(head), 0)
+        self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
+        return self.held_out.measure("k", grid, runner(head), self.n_samples)
 
     def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
         """A small head that has not learned yet; without directions where the colours do not need them."""
@@ -321,12 +322,11 @@ class _Bake:
 
     def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> None:
         """The lookups; and `ranges`, unless a head in 8 bits alone would lose more than the preset may."""
-        self._choose_lookups(grid, stored.head)
+        before = self._choose_lookups(grid, stored.head)
         if self.choice.head_bits == 32:
             return
         lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
         ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
-        before = self.held_out.look("", grid, runner(stored.head), self.n_samples)
         after = self.held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_samples)
         lost = after.loss_db - before.loss_db
         if lost <= self.choice.target_loss_db:

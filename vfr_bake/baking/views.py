@@ -7,36 +7,45 @@ from dataclasses import replace
 import numpy as np
 
 from player.cameras import Camera, focus_point
+from player.keyframes import smooth_path
 from vfr_bake.training.model_file import Model
 
 LARGEST_TURN = np.deg2rad(15.0)
 """Farther from a training camera than this nobody has taught the model anything."""
+NEIGHBOURS = 3
+"""Training cameras that count as beside one: on a walk the next, the last and one more."""
+PLACES = 64
+"""On the way between two cameras, one of which is taken."""
 MARGIN = 0.1
 """Of a picture of an unbounded scene, on every side: what the bake looks at beyond its border. Fox's held-out
 views see there, and what was not stored cost them a decibel and more."""
 
 
 def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> list[Camera]:
-    """`n_views` training cameras (model frame), spread evenly, each turned around what all cameras look at
-    by up to half the angle to its nearest neighbour; `wide` ones see beyond their borders (`widened`). The
-    same seed gives the same views, another one others."""
+    """`n_views` cameras (model frame), each between a training camera, of which all have their turn, and one
+    of its nearest: a quarter to half of the way there, and turned around what all cameras look at by up to a
+    quarter of the angle between the two. `wide` ones see beyond their borders (`widened`). The same seed
+    gives the same views, another one others."""
     cameras = model.model_cameras()
     random = np.random.default_rng(seed)
     focus = focus_point(cameras)
-    places = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
-    places /= np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
+    places = np.stack([camera.c2w[:3, 3] for camera in cameras])
+    sides = (places - focus) / np.maximum(np.linalg.norm(places - focus, axis=1, keepdims=True), 1e-9)
     first = random.integers(0, len(cameras))
     chosen = (first + np.linspace(0, len(cameras), n_views, endpoint=False).astype(int)) % len(cameras)
     found = []
     for index in chosen:
-        to_others = np.arccos(np.clip(places @ places[index], -1, 1))
-        nearest = float(np.partition(to_others, 1)[1]) if len(cameras) > 1 else 0.0
+        nearest = np.argsort(np.linalg.norm(places - places[index], axis=1))[1 : NEIGHBOURS + 1]
+        other = random.choice(nearest) if len(nearest) else index
+        angle = float(np.arccos(np.clip(sides[index] @ sides[other], -1, 1)))
+        share = min(random.uniform(0.25, 0.5), LARGEST_TURN / max(angle, 1e-9))
+        path = smooth_path([cameras[index], cameras[other]], PLACES)
         axis = random.normal(size=3)
-        turn = _turn(axis / np.linalg.norm(axis), min(nearest / 2, LARGEST_TURN) * random.uniform(0.5, 1))
+        turn = _turn(axis / np.linalg.norm(axis), min(angle, LARGEST_TURN) / 4 * random.uniform(0.5, 1))
         move = np.eye(4)
         move[:3, :3] = turn
         move[:3, 3] = focus - turn @ focus
-        camera = cameras[index]
+        camera = path[round(share * PLACES)]
         found.append(replace(camera, name=f"{camera.name} turned", c2w=move @ camera.c2w))
     return [widened(camera) for camera in found] if wide else found
 

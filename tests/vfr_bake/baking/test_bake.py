@@ -17,6 +17,7 @@ from exporters.onnx_head import head_onnx
 from exporters.ply import read_ply
 from player.asset import Asset
 from player.bricks import pack_vertices
+from player.cameras import orbit
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march import march
 from player.render import render
@@ -280,6 +281,18 @@ def test_views_between_lie_between(model: Model) -> None:
     again, other = views_between(model, 10, seed=0), views_between(model, 10, seed=1)
     assert all(np.array_equal(a.c2w, b.c2w) for a, b in zip(views, again, strict=True))
     assert not any(np.array_equal(a.c2w, b.c2w) for a, b in zip(views, other, strict=True))
+
+
+def test_views_between_come_near_to_what_lies_halfway_on_a_walk(model: Model) -> None:
+    # As held-out views of a capture do: every eighth view of a walk around something.
+    walk = replace(model, cameras=orbit(model.cameras, 36))
+    halfway = [
+        camera.c2w[:3, 3] for camera in replace(walk, cameras=orbit(model.cameras, 72)).model_cameras()
+    ]
+    views = np.stack([camera.c2w[:3, 3] for camera in views_between(walk, 72, seed=0)])
+    apart = np.stack([np.linalg.norm(views - place, axis=1).min() for place in halfway[1::2]])
+    step = np.linalg.norm(halfway[0] - halfway[1])
+    assert (apart < step / 2).mean() > 0.5
 
 
 def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:
