@@ -66,8 +66,11 @@ class Head:
             session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
         except (*self._failures, RuntimeError, ValueError) as error:
             raise FormatError(f"{path}: expected an ONNX graph, got: {_first_line(error)}") from error
-        _check_ports(path, "input", session.get_inputs(), {"features": n_channels, "dirs": 3})
-        _check_ports(path, "output", session.get_outputs(), {"rgb": 3})
+        try:
+            _check_ports(path, "input", session.get_inputs(), {"features": n_channels, "dirs": 3})
+            _check_ports(path, "output", session.get_outputs(), {"rgb": 3})
+        except UnicodeDecodeError as error:
+            raise FormatError(f"{path}: expected names in UTF-8, got: {_first_line(error)}") from error
         self._session = session
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ FIELD_BY_DEVICE = {"cpu": {}, "cuda": {"log2_table_size": 19}}
 
 def _check(condition: bool, name: str, expected: str, got: Any) -> None:
     if not condition:
-        raise ConfigError(f"{name}: expected {expected}, got {got}")
+        raise ConfigError(f"{name}: expected {expected}, got {brief(got)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,17 +7,31 @@ import math
 import struct
 import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from player.asset import _map_array
 from player.errors import ConfigError, FormatError
+from player.head import Head
 from player.manifest import NAME, parse_manifest
 from player.transforms import parse_transforms, transforms_cameras
-from tests.player.conftest import cameras_bytes
-from vfr_bake.config import field_config_from
-from vfr_bake.training.model_file import FORMAT, load_model
+from tests.player.conftest import cameras_bytes, head_bytes
+from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.field.field import VfrField
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.training.model_file import FORMAT, Model, load_model, save_model
+
+
+@pytest.fixture(scope="module")
+def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "model.pt"
+    field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
+    cameras = transforms_cameras(parse_transforms(cameras_bytes(), "cameras"), "cameras")
+    save_model(path, Model(field, OccupancyGrid(8, 0.2, seed=0), np.eye(4), cameras, False, {}, {}))
+    return path
 
 
 def test_a_npy_header_that_never_ends(tmp_path: Path) -> None:
@@ -55,3 +69,34 @@ def test_an_angle_below_every_number() -> None:
         warnings.simplefilter("error")
         cameras = transforms_cameras(parse_transforms(json.dumps(document).encode(), "t"), "t")
     assert all(math.isfinite(camera.fx) and camera.fx > 1e300 for camera in cameras)
+
+
+def test_a_dimension_whose_name_is_no_text(tmp_path: Path) -> None:
+    """onnxruntime loads it, and decodes the name when it is asked for."""
+    data = head_bytes(4)
+    assert data.count(b"\x12\x01n") > 0  # dim_param "n"
+    path = tmp_path / "head.onnx"
+    path.write_bytes(data.replace(b"\x12\x01n", b"\x12\x01\xee"))
+    with pytest.raises(FormatError, match="expected names in UTF-8"):
+        Head(path, 4)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("sampler", {"occupied": torch.zeros(64)}, "occupied: expected a plain tensor of bytes, got float32"),
+        ("sampler", {"occupied": torch.zeros(64, dtype=torch.uint8).to_sparse()}, "got uint8, sparse_coo"),
+        ("field", {"compositing": "a" * 5000}, "expected one of features, colour, got aaa"),
+        ("cameras", "\ud800", "expected JSON"),
+    ],
+)
+def test_values_of_a_model_that_are_none_of_ours(
+    key: str, value: Any, message: str, small_model: Path, tmp_path: Path
+) -> None:
+    content = torch.load(small_model, weights_only=True)
+    content[key] = content[key] | value if isinstance(value, dict) else value
+    path = tmp_path / "model.pt"
+    torch.save(content, path)
+    with pytest.raises(FormatError, match=message) as caught:
+        load_model(path)
+    assert len(str(caught.value)) < 300 and "\n" not in str(caught.value)

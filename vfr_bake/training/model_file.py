@@ -100,8 +100,7 @@ def load_model(path: Path) -> Model:
     restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
     sampler = restore_sampler(content["sampler"], f"{path}: sampler")
     matrix = content["world_from_model"]
-    if not matrix.is_floating_point() or matrix.layout is not torch.strided:
-        raise FormatError(f"{path}: world_from_model: expected a plain tensor of floats, got {matrix.dtype}")
+    _check_plain(matrix, matrix.is_floating_point(), "floats", f"{path}: world_from_model")
     world_from_model = matrix.double().numpy()
     if world_from_model.shape != (4, 4) or not np.isfinite(world_from_model).all():
         raise FormatError(
@@ -112,7 +111,7 @@ def load_model(path: Path) -> Model:
         field=field,
         sampler=sampler,
         world_from_model=world_from_model,
-        cameras=transforms_cameras(parse_transforms(content["cameras"].encode(), where), where),
+        cameras=transforms_cameras(parse_transforms(_bytes(content["cameras"]), where), where),
         has_alpha=bool(content["has_alpha"]),
         train=content["train"],
         figures=content["figures"],
@@ -153,7 +152,9 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
         raise FormatError(f"{where}: step: expected a number between 0 and 1, got {step}")
     if not 8 <= resolution <= 512:
         raise FormatError(f"{where}: resolution: expected 8 to 512, got {resolution}")
-    bits = np.unpackbits(content["occupied"].numpy())[: resolution**3]
+    packed = content["occupied"]
+    _check_plain(packed, packed.dtype == torch.uint8, "bytes", f"{where}: occupied")
+    bits = np.unpackbits(packed.numpy())[: resolution**3]
     if len(bits) != resolution**3:
         raise FormatError(f"{where}: occupied: expected {resolution**3} bits, got {len(bits)}")
     occupancy = OccupancyGrid(resolution, step, seed=0)
@@ -180,6 +181,17 @@ def _restore(module: nn.Module, state: dict[str, Any], where: str) -> None:
     for name, tensor in module.state_dict().items():
         if not torch.isfinite(tensor).all():
             raise FormatError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
+
+
+def _check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> None:
+    if not fits or tensor.layout is not torch.strided:
+        got = f"{tensor.dtype}, {tensor.layout}".replace("torch.", "")
+        raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
+
+
+def _bytes(text: str) -> bytes:
+    """UTF-8, but for halves of characters, whose bytes are for a reader of UTF-8 to refuse."""
+    return text.encode(errors="surrogatepass")
 
 
 def _check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
