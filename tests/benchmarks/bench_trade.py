@@ -1,10 +1,12 @@
 """docs/trade.md: trains, bakes, plays and measures whole scenes, by the commands that a user has.
 
-    python tests/benchmarks/bench_trade.py demo ../shared/data/lego_400 ../shared/data/fox \\
-        ../shared/data/can --output /tmp/trade > docs/trade.md
+    python tests/benchmarks/bench_trade.py demo ../shared/data/lego_400 --output /tmp/trade
+    python tests/benchmarks/bench_trade.py ../shared/data/fox --output /tmp/trade --downscale 2 \\
+        --minutes 2 5 12 --presets balanced
 
-Each scene is trained for each of `--minutes`; from the last model every preset is baked, and `vfr-bench`
-measures them all. What is in the output folder already is used as it is, so that an interrupted run goes on.
+prints the tables of docs/trade.md. Each scene is trained for each of `--minutes`; from the last model every
+preset is baked, and `vfr-bench` measures them all. What is in the output folder already is used as it is, so
+that an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -20,14 +22,6 @@ COMMANDS = {
     name: f"import sys, vfr_bake.cli as c; sys.exit(c.{name[4:]}_main())"
     for name in ("vfr-train", "vfr-bake", "vfr-eval", "vfr-bench")
 }
-INTRODUCTION = """# Speed against accuracy
-
-Made by `python tests/benchmarks/bench_trade.py {arguments}`,
-which trains, bakes and plays each scene by the commands `vfr-train`, `vfr-bake` and `vfr-bench`. PSNR is
-against the test photographs, 8 bits; losses are against the full model; times are medians of frames at the
-photographs' size, ± the interval in which two medians do not differ. A row is on the front if no other one is
-better, faster and smaller at once.
-"""
 TITLES = (
     *("setting", "PSNR", "loss, dB", "SSIM", "dB to the model", "ms a frame", "march", "lookups", "head"),
     *("MB", "front"),
@@ -40,26 +34,26 @@ def run(name: str, *arguments: str) -> None:
         raise SystemExit(f"{name} failed")
 
 
-def measure(
-    data: str, out: Path, minutes: list[float], presets: list[str], extra: list[str]
-) -> dict[str, Any]:
+def measure(data: str, out: Path, options: argparse.Namespace) -> dict[str, Any]:
     """The trade of one scene, and PSNR by minutes of training."""
+    training = ["--eval-views", "0", "--downscale", options.downscale]
     out.mkdir(parents=True, exist_ok=True)
     learned = {}
-    for some in minutes:
+    for some in options.minutes:
         model, report = out / f"model_{some:g}.pt", out / f"eval_{some:g}.json"
         if not model.exists():
-            run("vfr-train", data, str(model), "--minutes", str(some), "--eval-views", "0")
+            run("vfr-train", data, str(model), "--minutes", str(some), *training)
         if not report.exists():
             run("vfr-eval", str(model), data, "--json", str(report))
         learned[some] = json.loads(report.read_text())["psnr"]
-    assets = [out / preset for preset in presets]
+    assets = [out / preset for preset in options.presets]
     for asset in assets:
         if not asset.exists():
             run("vfr-bake", str(model), str(asset), "--preset", asset.name)
     if not (out / "trade.json").exists():
         page = ["--html", str(out / "trade.html"), "--json", str(out / "trade.json"), "--force"]
         folders = [str(asset) for asset in assets]
+        extra = ["--views", options.views, "--frames", options.frames]
         run("vfr-bench", *folders, "--data", data, "--model", str(model), *page, *extra)
     return {"learned": learned, **json.loads((out / "trade.json").read_text())}
 
@@ -119,18 +113,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", help="data sets, or demo")
     parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--downscale", default="1", help="of vfr-train")
     parser.add_argument("--minutes", type=float, nargs="+", default=[1, 2, 5, 10])
     parser.add_argument("--presets", nargs="+", default=["fidelity", "balanced", "fast"])
     parser.add_argument("--views", default="8", help="of vfr-bench")
     parser.add_argument("--frames", default="20", help="of vfr-bench")
     options = parser.parse_args()
-    extra = ["--views", options.views, "--frames", options.frames]
     lines = []
     for data in options.scenes:
         out = options.output / Path(data).name
-        trade = measure(data, out, options.minutes, options.presets, extra)
+        trade = measure(data, out, options)
         lines += section(Path(data).name, trade, out)
-    sys.stdout.write(INTRODUCTION.format(arguments=" ".join(sys.argv[1:])) + "\n".join(lines) + "\n")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
