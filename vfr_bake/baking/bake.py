@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from exporters.asset_mesh import Removed
-from exporters.int8_head import activation_ranges
 from exporters.mesh import TriangleMesh
-from exporters.onnx_head import HeadWeights, Range, head_onnx
+from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
 from player.asset import Asset, GridArrays, write_asset
 from player.errors import ConfigError, TrainingError
@@ -27,7 +26,6 @@ from player.files import check_target
 from player.head import Head
 from player.manifest import Manifest
 from player.packing import pack_codes
-from player.sparse_grid import SparseGrid
 from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
@@ -36,14 +34,15 @@ from vfr_bake.baking.estimate import make_plan
 from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
-from vfr_bake.baking.lessons import Taught, collect_lessons, teach
+from vfr_bake.baking.lessons import Taught, teach
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.mesh import bake_mesh, mesh_size
-from vfr_bake.baking.pace import LOOKUPS, frame_ms, keep_to_time, measured_in_memory
+from vfr_bake.baking.pace import frame_ms, keep_to_time, measured_in_memory
 from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
-from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Stored, refine
+from vfr_bake.baking.refinement import Stored
 from vfr_bake.baking.report import BakeReport, side_by_side
+from vfr_bake.baking.tuning import Tuning
 from vfr_bake.baking.unwritten import unwritten_asset
 from vfr_bake.baking.views import views_between
 from vfr_bake.config import BakeConfig
@@ -51,14 +50,8 @@ from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
-N_CALIBRATION = 20_000
-"""Rays that decide the ranges of the head's activations."""
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
-NEW_HEAD_RATE = 3e-3
-"""Adam's learning rate for a small head that knows nothing; it is lowered once it has learned."""
-DIRECTION_SHARE = 0.1
-"""Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 
@@ -108,7 +101,6 @@ class _Bake:
         self.left_out: dict[str, str] = {}
         self.lookups: dict[str, float] = {}
         self.n_samples = self.choice.n_samples
-        self.ranges: tuple[Range, ...] | None = None  # of the head's activations, if it multiplies in 8 bits
         self.plan = make_plan(model, config)
         self.n_rays: int
         self._report = report
@@ -121,8 +113,12 @@ class _Bake:
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
-        stored = self._refine(stored, layout, taught)
-        head = head_onnx(stored.head, self.ranges)
+        tuning = Tuning(self.model, self.config, self.choice, self.held_out, self._progress)
+        with self._part("refinement"):
+            stored = tuning.run(stored, layout, taught)
+        self.n_samples, self.lookups = tuning.n_samples, tuning.lookups
+        self.left_out |= tuning.left_out
+        head = head_onnx(stored.head, tuning.ranges)
         arrays = layout.arrays(stored.density, stored.features)
         mesh, removed = self._mesh(layout, arrays, head)
         if not len(mesh.faces):
@@ -235,48 +231,6 @@ class _Bake:
         sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
         return channels_that_fit(self.config.max_mb, rest, sizes)
 
-    def _refine(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
-        """Head and stored values adapted to each other: at every sample, then at the k that are played."""
-        choice, n_steps = self.choice, self.choice.refine_steps
-        if n_steps == 0:
-            grid = layout.grid(stored.density, stored.features)
-            self._choose_lookups_and_bits(stored, grid, taught)
-            return stored
-        head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
-        with self._part("refinement"):
-            grid = layout.grid(stored.density, stored.features)
-            lessons = collect_lessons(taught, grid, 0, layout.densities.rows())
-            if choice.head_width:
-                new = self._new_head(stored.head, lessons.typical(stored.features))
-                stored = replace(stored, head=new)
-                stored = refine(stored, lessons, n_steps, self._progress("small head"), NEW_HEAD_RATE, 0.0)
-                self.held_out.measure("small head", grid, runner(stored.head), 0)
-                head_rate = NEW_HEAD_RATE / 2
-                self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-            tuned = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid)
-            grid = layout.grid(tuned.density, tuned.features)
-            self.held_out.measure("refined", grid, runner(tuned.head), 0)
-            stored = self._better("refinement", stored, tuned)
-            grid = layout.grid(stored.density, stored.features)
-            self._choose_lookups_and_bits(stored, grid, taught)
-            if self.n_samples:
-                lessons = collect_lessons(taught, grid, self.n_samples)
-                rates = head_rate / 2, code_rate / 2  # what is left to learn is little
-                progress = self._progress("refinement at k")
-                tuned = refine(stored, lessons, n_steps, progress, *rates, ranges=self.ranges)
-                grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
-                self.held_out.measure("refined at k", grid, head, self.n_samples)
-                stored = self._better("refinement at k", stored, tuned)
-        return stored
-
-    def _better(self, name: str, old: Stored, new: Stored) -> Stored:
-        """The one that lost less in the last two stages, on views that neither has seen."""
-        before, after = self.held_out.stages[-2:]
-        if after.loss_db < before.loss_db:
-            return new
-        self.left_out[name] = "all of it: it lost more on views that it has not seen"
-        return old
-
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
         arrays = layout.arrays(stored.density, stored.features)
@@ -292,48 +246,6 @@ class _Bake:
         measure = measured_in_memory(manifest, arrays, head, self.model.cameras[0])
         fixed = self.config.head_width is not None, self.config.k != "auto"
         return keep_to_time(self.choice, target_ms, measure, *fixed)
-
-    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
-        """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
-        each number loses is kept in `lookups`. Returns how it looks with them."""
-        most = self.choice.n_samples
-        if self.config.k == "auto":
-            every = self.held_out.look("all", grid, runner(head), 0).loss_db
-            for k in (*(k for k in LOOKUPS if k < most), most):
-                self.n_samples = k
-                self.lookups[str(k)] = self.held_out.look(str(k), grid, runner(head), k).loss_db - every
-                if self.lookups[str(k)] <= self.choice.sample_loss_db:
-                    break
-        if not self.n_samples:
-            return self.held_out.look("all", grid, runner(head), 0)
-        self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
-        return self.held_out.measure("k", grid, runner(head), self.n_samples)
-
-    def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
-        """A small head that has not learned yet; without directions where the colours do not need them."""
-        choice, n_bands = self.choice, min(self.choice.head_bands, own.sh_degree)
-        lost = self.held_out.direction_loss()
-        if lost < DIRECTION_SHARE * choice.target_loss_db:
-            n_bands = 1
-            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
-        elif n_bands < own.sh_degree:
-            self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
-        return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
-
-    def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> None:
-        """The lookups; and `ranges`, unless a head in 8 bits alone would lose more than the preset may."""
-        before = self._choose_lookups(grid, stored.head)
-        if self.choice.head_bits == 32:
-            return
-        lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
-        ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
-        after = self.held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_samples)
-        lost = after.loss_db - before.loss_db
-        if lost <= self.choice.target_loss_db:
-            self.ranges = ranges
-            self.left_out["head bits"] = f"24 of 32 bits of its wide layers, {lost:.3f} dB before refinement"
-        else:
-            self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost:.3f} dB"
 
     def _manifest(self, layout: Layout, n_channels: int, figures: dict[str, Any]) -> Manifest:
         model = self.model

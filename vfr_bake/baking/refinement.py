@@ -49,6 +49,27 @@ class Stored:
     """[n_densities] float32 within 0..255."""
 
 
+def learn_head(
+    stored: Stored, lessons: Lessons, n_steps: int, progress: Progress, rate: float
+) -> HeadWeights:
+    """The head after `n_steps` on the squared error of the colours over random backgrounds, with everything
+    else as it is stored: what the rays compose is found once."""
+    random = np.random.default_rng(0)
+    torch.manual_seed(0)
+    head = FoldedHead(stored.head, UNIT * lessons.typical(stored.features))
+    adam = torch.optim.Adam(head.parameters(), lr=rate, fused=True)
+    composed = lessons.composed(stored.features)
+    for step in range(n_steps):
+        adam.param_groups[0]["lr"] = rate * _falling(step, n_steps)
+        some = random.integers(0, len(lessons), BATCH)
+        shown, opacity = torch.from_numpy(composed[some]), torch.from_numpy(lessons.opacity[some])
+        adam.zero_grad(set_to_none=True)
+        _loss(head, shown, opacity, lessons, some).backward()
+        adam.step()
+        _tell(progress, step, n_steps)
+    return head.weights()
+
+
 def refine(
     stored: Stored,
     lessons: Lessons,
@@ -59,24 +80,23 @@ def refine(
     grid: SparseGrid | None = None,
     ranges: tuple[Range, ...] | None = None,
 ) -> Stored:
-    """Head and codes after `n_steps` on the squared error of the colours over random backgrounds.
+    """Head and codes after `n_steps` of the same kind.
 
     Codes are rounded wherever they are composed, and returned as they stand, not rounded; `stored` is left
-    alone. With `code_rate` 0 only the head learns. With a `grid`, whose lookups and densities `lessons` must
-    hold at every sample, the densities learn too, and the weights of the lessons follow them. With `ranges`
-    the head learns to live with 8 bits (`vfr_bake.baking.folded_head`).
+    alone. With a `grid`, whose lookups and densities `lessons` must hold at every sample, the densities learn
+    too, and the weights of the lessons follow them. With `ranges` the head learns to live with 8 bits
+    (`vfr_bake.baking.folded_head`).
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
-    typical = lessons.typical(stored.features)
-    head = FoldedHead(stored.head, UNIT * typical, ranges)
+    head = FoldedHead(stored.head, UNIT * lessons.typical(stored.features), ranges)
     features, density = stored.features.copy(), stored.density.copy()
     steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     n_parts = get_num_threads()
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in range(n_steps):
-        falling = np.float32(0.5 * (1 + np.cos(np.pi * step / n_steps)))
-        adam.param_groups[0]["lr"] = float(head_rate * falling)
+        falling = _falling(step, n_steps)
+        adam.param_groups[0]["lr"] = head_rate * falling
         some = random.integers(0, len(lessons), BATCH)
         fetches, of_grid = lessons.fetches(some), lessons.opacity[some]
         of_densities = (fetches.density_rows, fetches.density_shares)
@@ -87,28 +107,39 @@ def refine(
             )  # fmt: skip
         codes = np.empty((BATCH, features.shape[1]), np.float32)
         compose_into(fetches, features, codes)
-        composed = torch.from_numpy(codes).requires_grad_(code_rate > 0)
+        composed = torch.from_numpy(codes).requires_grad_()
         opacity = torch.from_numpy(of_grid).requires_grad_(grid is not None)
         adam.zero_grad(set_to_none=True)
         _loss(head, composed, opacity, lessons, some).backward()
         adam.step()
+        assert composed.grad is not None
+        of_composed = composed.grad.numpy()
         where = (fetches.starts, fetches.rows, fetches.shares)
         if grid is not None:
-            assert composed.grad is not None and opacity.grad is not None
+            assert opacity.grad is not None
             of_fetches = np.empty(len(fetches.weights), np.float32)
             slants(
-                *where, *of_densities, fetches.weights, of_grid, features, composed.grad.numpy(),
+                *where, *of_densities, fetches.weights, of_grid, features, of_composed,
                 opacity.grad.numpy(), grid.density_low, grid.density_slope, fetches.lengths, density,
                 of_fetches,
             )  # fmt: skip
-            rate = np.float32(DENSITY_RATE) * falling
+            rate = np.float32(DENSITY_RATE * falling)
             descend_density(*of_densities, of_fetches, rate, n_parts, density, steep_density)
-        if composed.grad is not None:
-            rate = np.float32(code_rate) * falling
-            descend(*where, fetches.weights, composed.grad.numpy(), rate, n_parts, features, steep)
-        if step % 50 == 49 or step == n_steps - 1:
-            progress(step + 1, n_steps)
+        descend(
+            *where, fetches.weights, of_composed, np.float32(code_rate * falling), n_parts, features, steep
+        )
+        _tell(progress, step, n_steps)
     return Stored(head.weights(), features, density)
+
+
+def _falling(step: int, n_steps: int) -> float:
+    """Share of a learning rate, along a cosine from 1 to 0."""
+    return float(0.5 * (1 + np.cos(np.pi * step / n_steps)))
+
+
+def _tell(progress: Progress, step: int, n_steps: int) -> None:
+    if step % 50 == 49 or step == n_steps - 1:
+        progress(step + 1, n_steps)
 
 
 def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray) -> Tensor:

@@ -1,0 +1,140 @@
+"""Head, stored features and densities tuned to the model, and what they are tuned for: how many lookups a
+ray, and a head in 8 bits or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from exporters.int8_head import activation_ranges
+from exporters.onnx_head import HeadWeights, Range
+from player.sparse_grid import SparseGrid
+from vfr_bake.baking.folded_head import runner
+from vfr_bake.baking.grids import Layout
+from vfr_bake.baking.head_weights import small_head
+from vfr_bake.baking.lessons import Taught, collect_lessons
+from vfr_bake.baking.loss import HeldOut, Stage
+from vfr_bake.baking.pace import LOOKUPS
+from vfr_bake.baking.presets import BakeChoice
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Progress, Stored, learn_head, refine
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
+
+N_CALIBRATION = 20_000
+"""Rays that decide the ranges of the head's activations."""
+NEW_HEAD_RATE = 3e-3
+"""Adam's learning rate of a head that has not learned yet."""
+DIRECTION_SHARE = 0.1
+"""Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
+ROUNDING_LEFT = 0.5
+"""Of what a head loses by 8 bits, after it was tuned with them (docs/baking.md)."""
+
+
+class Tuning:
+    """What the rounds of refinement share, and what they find out."""
+
+    def __init__(
+        self,
+        model: Model,
+        config: BakeConfig,
+        choice: BakeChoice,
+        held_out: HeldOut,
+        progress: Callable[[str], Progress],
+    ) -> None:
+        self.n_samples = choice.n_samples
+        """Lookups a ray, 0 for all."""
+        self.ranges: tuple[Range, ...] | None = None
+        """Of the head's activations, if it multiplies in 8 bits."""
+        self.lookups: dict[str, float] = {}
+        """Expected loss in dB by the lookups that were tried."""
+        self.left_out: dict[str, str] = {}
+        """What the scene does not need, and what that changed."""
+        self._model, self._config, self._choice = model, config, choice
+        self._held_out, self._progress = held_out, progress
+
+    def run(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
+        """Head and stored values adapted to each other: at every sample, then at the k that are played."""
+        choice, n_steps = self._choice, self._choice.refine_steps
+        grid = layout.grid(stored.density, stored.features)
+        if n_steps == 0:
+            self._choose_lookups_and_bits(stored, grid, taught)
+            return stored
+        head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
+        before = self._held_out.stages[-1]
+        lessons = collect_lessons(taught, grid, 0, layout.densities.rows())
+        if choice.head_width:
+            new = self._new_head(stored.head, lessons.typical(stored.features))
+            stored = replace(stored, head=new)
+            progress = self._progress("small head")
+            stored = replace(stored, head=learn_head(stored, lessons, n_steps, progress, NEW_HEAD_RATE))
+            before = self._held_out.measure("small head", grid, runner(stored.head), 0)
+            head_rate = NEW_HEAD_RATE / 2
+            self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
+        tuned = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid)
+        grid = layout.grid(tuned.density, tuned.features)
+        after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
+        stored = tuned if self._gained("refinement", before, after) else stored
+        grid = layout.grid(stored.density, stored.features)
+        before = self._choose_lookups_and_bits(stored, grid, taught)
+        if self.n_samples:
+            lessons = collect_lessons(taught, grid, self.n_samples)
+            rates = head_rate / 2, code_rate / 2  # what is left to learn is little
+            progress = self._progress("refinement at k")
+            tuned = refine(stored, lessons, n_steps, progress, *rates, ranges=self.ranges)
+            grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
+            after = self._held_out.measure("refined at k", grid, head, self.n_samples)
+            stored = tuned if self._gained("refinement at k", before, after) else stored
+        return stored
+
+    def _gained(self, name: str, before: Stage, after: Stage) -> bool:
+        """Whether less is lost than before, on views that nothing has learned from."""
+        if after.loss_db < before.loss_db:
+            return True
+        self.left_out[name] = "all of it: it lost more on views that it has not seen"
+        return False
+
+    def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
+        """A small head that has not learned yet; without directions where the colours do not need them."""
+        choice, n_bands = self._choice, min(self._choice.head_bands, own.sh_degree)
+        lost = self._held_out.direction_loss()
+        if lost < DIRECTION_SHARE * choice.target_loss_db:
+            n_bands = 1
+            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
+        elif n_bands < own.sh_degree:
+            self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
+        return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
+
+    def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, taught: Taught) -> Stage:
+        """The lookups; and `ranges`, unless a head in 8 bits would lose more than the preset may even after
+        it was tuned. Returns how it looks then."""
+        before = self._choose_lookups(grid, stored.head)
+        if self._choice.head_bits == 32:
+            return before
+        lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
+        ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
+        after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_samples)
+        lost = after.loss_db - before.loss_db
+        if lost * ROUNDING_LEFT > self._choice.target_loss_db:
+            self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost:.3f} dB"
+            return before
+        self.ranges = ranges
+        self.left_out["head bits"] = f"24 of 32 bits of its wide layers, {lost:.3f} dB before refinement"
+        return after
+
+    def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
+        """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
+        each number loses is kept in `lookups`. Returns how it looks with them."""
+        most = self._choice.n_samples
+        if self._config.k == "auto":
+            every = self._held_out.look("all", grid, runner(head), 0).loss_db
+            for k in (*(k for k in LOOKUPS if k < most), most):
+                self.n_samples = k
+                self.lookups[str(k)] = self._held_out.look(str(k), grid, runner(head), k).loss_db - every
+                if self.lookups[str(k)] <= self._choice.sample_loss_db:
+                    break
+        if not self.n_samples:
+            return self._held_out.look("all", grid, runner(head), 0)
+        self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
+        return self._held_out.measure("k", grid, runner(head), self.n_samples)
