@@ -297,7 +297,7 @@ class BakeConfig:
     lose no more than the preset allows."""
     refine_steps: int | None = None
     """Steps of each round in which head and stored values are adapted to each other, the full model being the
-    teacher; 0: none."""
+    teacher; 0: none. If not given, the preset's, or as many as there is time for."""
     mesh_resolution: int | None = None
     """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
     max_loss_db: float | None = None
@@ -369,7 +369,7 @@ class BakeConfig:
         >>> BakeConfig(k=3).choice().n_samples, BakeConfig(k="auto").choice().n_samples
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
-        1200
+        2500
         """
         preset = PRESETS[self.preset]
         if unbounded:

@@ -52,6 +52,8 @@ Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
+REFINED_BY = 0.85
+"""Of a bake's time: then come the mesh, and what is written is played."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 
@@ -104,6 +106,7 @@ class _Bake:
         self.plan = make_plan(model, config)
         self.n_rays: int
         self._report = report
+        self._begun = time.monotonic()
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)
 
@@ -113,7 +116,8 @@ class _Bake:
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
-        tuning = Tuning(self.model, self.config, self.choice, self.held_out, self._progress)
+        left = REFINED_BY * 60 * self.choice.minutes - (time.monotonic() - self._begun)
+        tuning = Tuning(self.model, self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, taught)
         self.n_samples, self.lookups = tuning.n_samples, tuning.lookups

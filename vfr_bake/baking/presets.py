@@ -41,6 +41,9 @@ class BakeChoice:
     refine_steps: int
     contracted_refine_steps: int
     """Of an unbounded scene, whose rays have several times as many fetches."""
+    minutes: float
+    """Wall-clock minutes of a bake, roughly: refinement takes fewer steps where the machine is too slow for
+    all of them, unless their number was asked for."""
     mesh_resolution: int
     target_loss_db: float
     """Expected loss that the preset aims at, dB."""
@@ -51,18 +54,18 @@ PRESETS: dict[Preset, BakeChoice] = {
         cells_per_pixel=1.95, contracted_resolution=1024, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005, code_levels=127,
         head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=350,
-        contracted_refine_steps=300, mesh_resolution=128, target_loss_db=0.05,
+        contracted_refine_steps=300, minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=832, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_samples=12, sample_loss_db=0.05, code_levels=64,
-        head_width=64, head_layers=3, head_bands=4, head_bits=8, refine_steps=2300,
-        contracted_refine_steps=1200, mesh_resolution=128, target_loss_db=0.4,
+        head_width=64, head_layers=3, head_bands=4, head_bits=8, refine_steps=4000,
+        contracted_refine_steps=2500, minutes=8, mesh_resolution=128, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
         n_channels=10, channel_loss_db=0.8, n_samples=4, sample_loss_db=0.15, code_levels=50,
-        head_width=32, head_layers=1, head_bands=3, head_bits=8, refine_steps=2000,
-        contracted_refine_steps=1200, mesh_resolution=112, target_loss_db=1.0,
+        head_width=32, head_layers=1, head_bands=3, head_bits=8, refine_steps=5000,
+        contracted_refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
     ),
 }  # fmt: skip

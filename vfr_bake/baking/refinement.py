@@ -8,7 +8,8 @@ rounded where they are composed, and move as if they were not (straight through)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,9 @@ CODE_RATE = 0.25
 
 DENSITY_RATE = 1.0
 """The same of the density's codes."""
+N_WARM, N_TIMED = 10, 40
+"""Steps of a round that are not timed, because something may be compiled for the first time, and steps that
+are."""
 
 Progress = Callable[[int, int], object]
 
@@ -49,38 +53,66 @@ class Stored:
     """[n_densities] float32 within 0..255."""
 
 
-def learn_head(
-    stored: Stored, lessons: Lessons, n_steps: int, progress: Progress, rate: float
-) -> HeadWeights:
-    """The head after `n_steps` on the squared error of the colours over random backgrounds, with everything
+class Steps:
+    """The steps of a round of refinement: as many as are asked for, or fewer where there is no time for them,
+    which the first ones tell.
+
+    >>> steps = Steps(40, lambda done, of: None)
+    >>> [round(steps.falling(step), 3) for step in steps][::10]
+    [1.0, 0.854, 0.5, 0.146]
+    """
+
+    def __init__(self, n_steps: int, progress: Progress, seconds: float = float("inf")) -> None:
+        """`seconds`: what they may take."""
+        self.n = n_steps
+        self._progress, self._seconds = progress, seconds
+
+    def __iter__(self) -> Iterator[int]:
+        step, begin = 0, 0.0
+        while step < self.n:
+            yield step
+            step += 1
+            if step == N_WARM:
+                begin = time.monotonic()
+            elif step == N_WARM + N_TIMED:
+                pace = (time.monotonic() - begin) / N_TIMED
+                self.n = max(min(self.n, int(self._seconds / pace)), step)
+            if step % 50 == 0 or step == self.n:
+                self._progress(step, self.n)
+
+    def falling(self, step: int) -> float:
+        """Share of a learning rate, along a cosine from 1 to 0."""
+        return float(0.5 * (1 + np.cos(np.pi * step / self.n)))
+
+
+def learn_head(stored: Stored, lessons: Lessons, steps: Steps, rate: float) -> HeadWeights:
+    """The head after `steps` on the squared error of the colours over random backgrounds, with everything
     else as it is stored: what the rays compose is found once."""
     random = np.random.default_rng(0)
     torch.manual_seed(0)
     head = FoldedHead(stored.head, UNIT * lessons.typical(stored.features))
     adam = torch.optim.Adam(head.parameters(), lr=rate, fused=True)
     composed = lessons.composed(stored.features)
-    for step in range(n_steps):
-        adam.param_groups[0]["lr"] = rate * _falling(step, n_steps)
+    for step in steps:
+        adam.param_groups[0]["lr"] = rate * steps.falling(step)
         some = random.integers(0, len(lessons), BATCH)
         shown, opacity = torch.from_numpy(composed[some]), torch.from_numpy(lessons.opacity[some])
         adam.zero_grad(set_to_none=True)
         _loss(head, shown, opacity, lessons, some).backward()
         adam.step()
-        _tell(progress, step, n_steps)
     return head.weights()
 
 
 def refine(
     stored: Stored,
     lessons: Lessons,
-    n_steps: int,
-    progress: Progress,
+    steps: Steps,
     head_rate: float = HEAD_RATE,
     code_rate: float = CODE_RATE,
     grid: SparseGrid | None = None,
     ranges: tuple[Range, ...] | None = None,
 ) -> Stored:
-    """Head and codes after `n_steps` of the same kind.
+    """Head and codes after `steps` of the same kind.
 
     Codes are rounded wherever they are composed, and returned as they stand, not rounded; `stored` is left
     alone. With a `grid`, whose lookups and densities `lessons` must hold at every sample, the densities learn
@@ -94,8 +126,8 @@ def refine(
     steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     n_parts = get_num_threads()
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
-    for step in range(n_steps):
-        falling = _falling(step, n_steps)
+    for step in steps:
+        falling = steps.falling(step)
         adam.param_groups[0]["lr"] = head_rate * falling
         some = random.integers(0, len(lessons), BATCH)
         fetches, of_grid = lessons.fetches(some), lessons.opacity[some]
@@ -128,18 +160,7 @@ def refine(
         descend(
             *where, fetches.weights, of_composed, np.float32(code_rate * falling), n_parts, features, steep
         )
-        _tell(progress, step, n_steps)
     return Stored(head.weights(), features, density)
-
-
-def _falling(step: int, n_steps: int) -> float:
-    """Share of a learning rate, along a cosine from 1 to 0."""
-    return float(0.5 * (1 + np.cos(np.pi * step / n_steps)))
-
-
-def _tell(progress: Progress, step: int, n_steps: int) -> None:
-    if step % 50 == 49 or step == n_steps - 1:
-        progress(step + 1, n_steps)
 
 
 def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray) -> Tensor:

@@ -3,7 +3,9 @@ ray, and a head in 8 bits or not."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +20,7 @@ from vfr_bake.baking.lessons import Taught, collect_lessons
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.pace import LOOKUPS
 from vfr_bake.baking.presets import BakeChoice
-from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Progress, Stored, learn_head, refine
+from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Progress, Steps, Stored, learn_head, refine
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
@@ -42,7 +44,9 @@ class Tuning:
         choice: BakeChoice,
         held_out: HeldOut,
         progress: Callable[[str], Progress],
+        seconds: float,
     ) -> None:
+        """`seconds`: what all rounds may take, if the number of their steps was not asked for."""
         self.n_samples = choice.n_samples
         """Lookups a ray, 0 for all."""
         self.ranges: tuple[Range, ...] | None = None
@@ -53,12 +57,14 @@ class Tuning:
         """What the scene does not need, and what that changed."""
         self._model, self._config, self._choice = model, config, choice
         self._held_out, self._progress = held_out, progress
+        self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
+        self._rounds_left = 3 if choice.head_width else 2
 
     def run(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
         """Head and stored values adapted to each other: at every sample, then at the k that are played."""
-        choice, n_steps = self._choice, self._choice.refine_steps
+        choice = self._choice
         grid = layout.grid(stored.density, stored.features)
-        if n_steps == 0:
+        if choice.refine_steps == 0:
             self._choose_lookups_and_bits(stored, grid, taught)
             return stored
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
@@ -67,12 +73,13 @@ class Tuning:
         if choice.head_width:
             new = self._new_head(stored.head, lessons.typical(stored.features))
             stored = replace(stored, head=new)
-            progress = self._progress("small head")
-            stored = replace(stored, head=learn_head(stored, lessons, n_steps, progress, NEW_HEAD_RATE))
+            with self._steps("small head") as steps:
+                stored = replace(stored, head=learn_head(stored, lessons, steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-        tuned = refine(stored, lessons, n_steps, self._progress("refinement"), head_rate, code_rate, grid)
+        with self._steps("refinement") as steps:
+            tuned = refine(stored, lessons, steps, head_rate, code_rate, grid)
         grid = layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
         stored = tuned if self._gained("refinement", before, after) else stored
@@ -81,12 +88,24 @@ class Tuning:
         if self.n_samples:
             lessons = collect_lessons(taught, grid, self.n_samples)
             rates = head_rate / 2, code_rate / 2  # what is left to learn is little
-            progress = self._progress("refinement at k")
-            tuned = refine(stored, lessons, n_steps, progress, *rates, ranges=self.ranges)
+            with self._steps("refinement at k") as steps:
+                tuned = refine(stored, lessons, steps, *rates, ranges=self.ranges)
             grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
             after = self._held_out.measure("refined at k", grid, head, self.n_samples)
             stored = tuned if self._gained("refinement at k", before, after) else stored
         return stored
+
+    @contextmanager
+    def _steps(self, name: str) -> Iterator[Steps]:
+        """Of the next round, which takes its share of the time that is left."""
+        asked = self._choice.refine_steps
+        seconds = (self._until - time.monotonic()) / self._rounds_left
+        self._rounds_left -= 1
+        yield (steps := Steps(asked, self._progress(name), seconds))
+        if steps.n < asked:
+            self.left_out[f"steps of {name!r}"] = (
+                f"{asked - steps.n:,} of {asked:,}: they would take too long"
+            )
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
         """Whether less is lost than before, on views that nothing has learned from."""

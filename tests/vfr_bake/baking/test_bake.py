@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
 from vfr_bake.baking.presets import PRESETS
 from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
-from vfr_bake.baking.refinement import HEAD_RATE, Stored, learn_head, refine
+from vfr_bake.baking.refinement import HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, learn_head, refine
 from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
@@ -151,17 +152,30 @@ def test_refinement_brings_the_head_back_to_its_teacher() -> None:
         return float(np.mean((shown - wanted) ** 2))
 
     before = error(stored)
-    nothing = refine(stored, lessons, 0, lambda done, of: None)
+    nothing = refine(stored, lessons, Steps(0, lambda *_: None))
     assert error(nothing) == pytest.approx(before, rel=1e-3)
-    learned = learn_head(stored, lessons, 200, lambda done, of: None, HEAD_RATE)
+    learned = learn_head(stored, lessons, Steps(200, lambda *_: None), HEAD_RATE)
     head_alone = replace(stored, head=learned)
     assert error(head_alone) < before / 5
-    same = refine(stored, lessons, 200, lambda done, of: None, code_rate=0)
+    same = refine(stored, lessons, Steps(200, lambda *_: None), code_rate=0)
     assert np.array_equal(same.features, baked), "left alone"
     assert error(same) == pytest.approx(error(head_alone), rel=1e-3)
-    both = refine(stored, lessons, 200, lambda done, of: None, code_rate=4)
+    both = refine(stored, lessons, Steps(200, lambda *_: None), code_rate=4)
     assert error(both) < error(head_alone)
     assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
+
+
+def test_a_round_takes_fewer_steps_where_there_is_no_time() -> None:
+    told: list[tuple[int, int]] = []
+    steps = Steps(100_000, lambda done, of: told.append((done, of)), seconds=0.5)
+    taken = []
+    for step in steps:
+        taken.append(steps.falling(step))
+        time.sleep(0.002)
+    assert N_WARM + N_TIMED < len(taken) == steps.n < 300 and told[-1] == (steps.n, steps.n)
+    assert taken[0] == 1 and taken[-1] < 0.01 and (np.diff(taken) < 0).all(), "it falls to 0 all the same"
+    hasty = Steps(100_000, lambda *_: None, seconds=-1.0)
+    assert len(list(hasty)) == N_WARM + N_TIMED
 
 
 @pytest.mark.parametrize("n_samples", [0, 1, 3, 5])

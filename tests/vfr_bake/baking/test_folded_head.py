@@ -13,7 +13,7 @@ from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, head_onnx
 from vfr_bake.baking.folded_head import FoldedHead, runner
 from vfr_bake.baking.head_weights import fold_head
-from vfr_bake.baking.refinement import Stored, refine
+from vfr_bake.baking.refinement import Steps, Stored, refine
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.head import Head
 
@@ -66,7 +66,7 @@ def test_refinement_gets_back_what_8_bits_lose() -> None:
         return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
 
     stored = Stored(weights, codes, np.zeros(len(codes), np.float32))
-    tuned = refine(stored, lessons, 400, lambda done, of: None, code_rate=0, ranges=ranges)
+    tuned = refine(stored, lessons, Steps(400, lambda done, of: None), code_rate=0, ranges=ranges)
     assert error(tuned) < 0.8 * error(stored)
     untouched = replace(tuned, head=weights)
     assert error(untouched) == pytest.approx(error(stored), rel=1e-6)
