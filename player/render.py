@@ -111,6 +111,7 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else n_threads
         if self.n_threads < 1:
             raise ConfigError(f"threads: expected at least 1, got {n_threads}")
+        self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
         self.march, self._module = choose_march(march, asset.manifest.contracted)
         self._write_pixels, self._directions = write_pixels, None
         if self.march == "numba":
@@ -119,7 +120,6 @@ class Renderer:
             self._write_pixels = pixels_compiled.write_pixels
             self._directions = pixels_compiled.directions
         self.asset = asset
-        self._grid = asset.grid
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels, self.march == "numba")
         self._model_from_world = np.linalg.inv(asset.world_from_model)
         self._pool = ThreadPoolExecutor(self.n_threads, thread_name_prefix="vfr-play")

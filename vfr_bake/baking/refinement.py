@@ -76,7 +76,7 @@ class Steps:
                 begin = time.monotonic()
             elif step == N_WARM + N_TIMED:
                 pace = (time.monotonic() - begin) / N_TIMED
-                self.n = max(min(self.n, int(self._seconds / pace)), step)
+                self.n = max(int(min(self.n, self._seconds / pace)), step)
             if step % 50 == 0 or step == self.n:
                 self._progress(step, self.n)
 

@@ -28,6 +28,10 @@ N_CALIBRATION = 20_000
 """Rays that decide the ranges of the head's activations."""
 NEW_HEAD_RATE = 3e-3
 """Adam's learning rate of a head that has not learned yet."""
+NEW_HEAD_STEPS = 2
+"""Its steps for each of another round: they take a third of the time."""
+AT_K = 0.5
+"""Of the rate of the round before."""
 DIRECTION_SHARE = 0.1
 """Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
 ROUNDING_LEFT = 0.5
@@ -73,12 +77,12 @@ class Tuning:
         if choice.head_width:
             new = self._new_head(stored.head, lessons.typical(stored.features))
             stored = replace(stored, head=new)
-            with self._steps("small head") as steps:
+            with self._steps("small head", NEW_HEAD_STEPS * choice.refine_steps) as steps:
                 stored = replace(stored, head=learn_head(stored, lessons, steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-        with self._steps("refinement") as steps:
+        with self._steps("refinement", choice.refine_steps) as steps:
             tuned = refine(stored, lessons, steps, head_rate, code_rate, grid)
         grid = layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
@@ -87,8 +91,8 @@ class Tuning:
         before = self._choose_lookups_and_bits(stored, grid, taught)
         if self.n_samples:
             lessons = collect_lessons(taught, grid, self.n_samples)
-            rates = head_rate / 2, code_rate / 2  # what is left to learn is little
-            with self._steps("refinement at k") as steps:
+            rates = head_rate * AT_K, code_rate / 2  # what is left to learn is little
+            with self._steps("refinement at k", choice.refine_steps) as steps:
                 tuned = refine(stored, lessons, steps, *rates, ranges=self.ranges)
             grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
             after = self._held_out.measure("refined at k", grid, head, self.n_samples)
@@ -96,9 +100,8 @@ class Tuning:
         return stored
 
     @contextmanager
-    def _steps(self, name: str) -> Iterator[Steps]:
+    def _steps(self, name: str, asked: int) -> Iterator[Steps]:
         """Of the next round, which takes its share of the time that is left."""
-        asked = self._choice.refine_steps
         seconds = (self._until - time.monotonic()) / self._rounds_left
         self._rounds_left -= 1
         yield (steps := Steps(asked, self._progress(name), seconds))

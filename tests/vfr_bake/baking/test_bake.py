@@ -174,6 +174,7 @@ def test_a_round_takes_fewer_steps_where_there_is_no_time() -> None:
         time.sleep(0.002)
     assert N_WARM + N_TIMED < len(taken) == steps.n < 300 and told[-1] == (steps.n, steps.n)
     assert taken[0] == 1 and taken[-1] < 0.01 and (np.diff(taken) < 0).all(), "it falls to 0 all the same"
+    assert len(list(Steps(100, lambda *_: None))) == 100
     hasty = Steps(100_000, lambda *_: None, seconds=-1.0)
     assert len(list(hasty)) == N_WARM + N_TIMED
 
