@@ -53,7 +53,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=1.95, contracted_resolution=1024, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005, code_levels=127,
-        head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=350,
+        head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=600,
         contracted_refine_steps=300, minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
@@ -64,7 +64,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
-        n_channels=10, channel_loss_db=0.8, n_samples=4, sample_loss_db=0.15, code_levels=50,
+        n_channels=12, channel_loss_db=0.5, n_samples=4, sample_loss_db=0.15, code_levels=50,
         head_width=32, head_layers=1, head_bands=3, head_bits=8, refine_steps=5000,
         contracted_refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
     ),

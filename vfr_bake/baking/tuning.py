@@ -30,8 +30,8 @@ NEW_HEAD_RATE = 3e-3
 """Adam's learning rate of a head that has not learned yet."""
 NEW_HEAD_STEPS = 2
 """Its steps for each of another round: they take a third of the time."""
-AT_K = 0.5
-"""Of the rate of the round before."""
+AT_K = {False: 0.1, True: 0.5}
+"""Of the rate of the round before, by whether the head is a new one: the model's own has less to learn."""
 DIRECTION_SHARE = 0.1
 """Of the loss that a preset aims at: a small head leaves the direction out where that loses no more."""
 ROUNDING_LEFT = 0.5
@@ -91,7 +91,7 @@ class Tuning:
         before = self._choose_lookups_and_bits(stored, grid, taught)
         if self.n_samples:
             lessons = collect_lessons(taught, grid, self.n_samples)
-            rates = head_rate * AT_K, code_rate / 2  # what is left to learn is little
+            rates = head_rate * AT_K[choice.head_width > 0], code_rate / 2  # what is left to learn is little
             with self._steps("refinement at k", choice.refine_steps) as steps:
                 tuned = refine(stored, lessons, steps, *rates, ranges=self.ranges)
             grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
