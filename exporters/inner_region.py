@@ -36,7 +36,7 @@ def inner_region(asset: Asset) -> Asset:
             f"{asset.folder}: expected an unbounded scene with something in its unit ball, got all "
             f"{len(a.density)} vertices outside: surroundings without end are not exported"
         )
-    return Asset(asset.folder, replace(m, contracted=False), GridArrays(*densities, *features))
+    return Asset(asset.folder, replace(m, contracted=False, near=0.0), GridArrays(*densities, *features))
 
 
 def _inside(

@@ -162,6 +162,7 @@ class Asset:
             m.step,
             (low, high),
             m.contracted,
+            m.near,
         )
 
     @cached_property

@@ -1,9 +1,9 @@
 """Rays through contracted space: a lattice on them that depends on the ray alone and reaches infinity.
 
 Letters: (o, d) a ray in the model frame, d of unit length; p its point nearest to the origin, at t = t_p; b =
-|p|; w = max(1, b). A place on the ray is an angle: t = t_p + w tan(phi), from phi_0 at t = 0 to almost pi/2.
-The point is (p cos(phi) + w d sin(phi)) / cos(phi), which `player.contraction` takes as it is: nothing is
-divided by a cosine that is nearly 0. s = phi - phi_0, so that the samples are at s_n = (n + 1/2) dphi.
+|p|; w = max(1, b). A place on the ray is an angle: t = t_p + w tan(phi), from phi_0 at t = near to almost
+pi/2. The point is (p cos(phi) + w d sin(phi)) / cos(phi), which `player.contraction` takes as it is: nothing
+is divided by a cosine that is nearly 0. s = phi - phi_0, so that the samples are at s_n = (n + 1/2) dphi.
 
 In contracted space a ray is never faster than MAX_SPEED for a step of phi: inside the unit ball dt/dphi = w +
 (t - t_p)^2 / w <= 2; far out it approaches sqrt(4 b^2 + w^2) / w <= sqrt(5). So pi / dphi samples reach from
@@ -101,12 +101,13 @@ class ContractedRays(NamedTuple):
 
 
 def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> ContractedRays:
-    """Rays [n, 3] (model frame, unit directions) from where they begin to where they end."""
+    """Rays [n, 3] (model frame, unit directions) from where they begin, `grid.near` from their origins, to
+    where they end."""
     o, d = rays_o.astype(np.float64), rays_d.astype(np.float64)
     t_nearest = -np.sum(o * d, axis=-1)
     nearest = o + t_nearest[:, None] * d
     width = np.maximum(1.0, np.linalg.norm(nearest, axis=-1))
-    start = np.arctan2(-t_nearest, width)
+    start = np.arctan2(grid.near - t_nearest, width)
     return ContractedRays(
         nearest=np.ascontiguousarray(nearest.T, np.float32),
         along=np.ascontiguousarray((width[:, None] * d).T, np.float32),

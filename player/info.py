@@ -17,7 +17,7 @@ from player.transforms import read_cameras
 
 MANIFEST_KEYS = (
     "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
-    "step", "n_samples", "density_range", "n_channels", "background", "colour_space", "view_size",
+    "near", "step", "n_samples", "density_range", "n_channels", "background", "colour_space", "view_size",
     "provenance",
 )  # fmt: skip
 
@@ -69,7 +69,8 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         *_section("scene", [
             ("inner region" if m.contracted else "world box",
              f"{size} units, from {_numbers(low)} to {_numbers(high)}"),
-            *([("around it", "the rest of space, contracted")] if m.contracted else []),
+            *([("around it", "the rest of space, contracted"),
+               ("shown", f"{m.near * scale:.3g} units before a camera and beyond")] if m.contracted else []),
             ("world units", f"{scale:.5g} in a model unit"),
             ("colours", f"{m.colour_space}, over {_numbers(m.background)}"),
         ]),

@@ -1,4 +1,4 @@
-"""The format `vfr-asset`, version 3.0: this docstring is its specification, the module parses and writes
+"""The format `vfr-asset`, version 3.1: this docstring is its specification, the module parses and writes
 the manifest.
 
 An asset is a folder. It holds no absolute path and plays wherever it is moved. What is packed is so as
@@ -25,7 +25,8 @@ have a grid of their own over the same box, of `feature_resolution` cells: where
 more finely than what colour it has.
 
 CONTRACTED. Where `contracted` is true the box is [-2, 2]^3 of contracted coordinates (`player.contraction`),
-which are those of the model frame inside its unit ball and hold the rest of space around it.
+which are those of the model frame inside its unit ball and hold the rest of space around it. Rays begin
+`near` model units from the camera: the model has been taught nothing that is nearer to one.
 
 DENSITY. `log sigma = lo + (hi - lo) code / 255` with `density_range`; the code is interpolated, sigma is
 per model unit.
@@ -41,13 +42,14 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [3, 0]; unknown keys of a newer minor are ignored |
+| `version` | [major, minor] | [3, 1]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
 | `resolution` | integer, 1..2048 | cells per axis of the density |
 | `feature_resolution` | integer, 1..2048 | cells per axis of the features |
 | `aabb` | 2 x 3 numbers | box, model frame |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
 | `contracted` | true or false | |
+| `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted; 0 in 3.0, which lacks it |
 | `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
 | `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
@@ -60,7 +62,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 
 Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
 History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports; 2.1,
-contracted; 3.0, features have a grid of their own.
+contracted; 3.0, features have a grid of their own; 3.1, near.
 """
 
 from __future__ import annotations
@@ -75,7 +77,7 @@ from typing import Any
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
-VERSION = (3, 0)
+VERSION = (3, 1)
 NAME = "manifest.json"
 FILES = (
     "brick_coords.npy",
@@ -125,6 +127,7 @@ class Manifest:
     aabb: tuple[Vector, ...] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     world_from_model: tuple[Vector, ...] = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
     contracted: bool = False
+    near: float = 0.0
     n_samples: int = 5
     background: Vector = (1.0, 1.0, 1.0)
     colour_space: str = "srgb"
@@ -159,6 +162,8 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
+    if version < (3, 1):
+        document.setdefault("near", 0.0)
     known = {f.name for f in fields(Manifest)}
     missing = sorted(known - set(document))
     if missing:
@@ -336,6 +341,8 @@ def _check_together(manifest: Manifest) -> None:
         raise FormatError(f"manifest: density_range: expected low < high, got {manifest.density_range}")
     if manifest.contracted and manifest.aabb != CONTRACTED_AABB:
         raise FormatError(f"manifest: aabb: expected {CONTRACTED_AABB} where contracted, got {manifest.aabb}")
+    if manifest.near and not manifest.contracted:
+        raise FormatError(f"manifest: near: expected 0 unless contracted, got {manifest.near}")
     if math.dist(low, high) > MAX_STEPS * manifest.step:
         raise FormatError(
             f"manifest: step: expected at most {MAX_STEPS} steps along the diagonal, got {manifest.step}"
@@ -351,6 +358,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "world_from_model": _similarity,
     "step": _number(1e-9, 1e9),
     "contracted": _boolean,
+    "near": _number(0, 1e6),
     "n_samples": _integer(0, 1024),
     "density_range": _numbers(2, -80, 80),
     "n_channels": _integer(1, 1024),

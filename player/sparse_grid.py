@@ -52,6 +52,8 @@ class SparseGrid:
     features: np.ndarray
     contracted: bool = False
     """Whether the box is all of space, contracted."""
+    near: float = 0.0
+    """Where rays begin, model units, if contracted."""
 
     @property
     def n_channels(self) -> int:
@@ -83,6 +85,7 @@ def build_grid(
     step: float,
     density_range: tuple[float, float],
     contracted: bool = False,
+    near: float = 0.0,
 ) -> SparseGrid:
     """Arrange the arrays of an asset for marching.
 
@@ -94,6 +97,7 @@ def build_grid(
         step: distance between lattice samples, model units; dphi if contracted.
         density_range: log sigma at codes 0 and 255.
         contracted: whether the box is all of space, contracted.
+        near: where rays begin, model units, if contracted.
 
     >>> from player.bricks import pack_vertices
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((5, 5, 5))))
@@ -129,6 +133,7 @@ def build_grid(
         rows=vertex_rows(*features[:2], feature_resolution),
         features=np.ascontiguousarray(features[2], np.int8),
         contracted=contracted,
+        near=near,
     )
 
 

@@ -53,6 +53,10 @@ def _run(name: str, command: Callable[[], int]) -> int:
     except VfrError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return 1
+    except OSError as error:  # a full disk, wherever it is met: a temporary folder, numba's cache
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"{name}: error: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130

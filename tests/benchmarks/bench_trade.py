@@ -53,7 +53,7 @@ def measure(data: str, out: Path, options: argparse.Namespace) -> dict[str, Any]
     if not (out / "trade.json").exists():
         page = ["--html", str(out / "trade.html"), "--json", str(out / "trade.json"), "--force"]
         folders = [str(asset) for asset in assets]
-        extra = ["--views", options.views, "--frames", options.frames]
+        extra = ["--views", options.views, "--frames", options.frames, "--sizes", *options.sizes]
         run("vfr-bench", *folders, "--data", data, "--model", str(model), *page, *extra)
     return {"learned": learned, **json.loads((out / "trade.json").read_text())}
 
@@ -118,6 +118,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=["fidelity", "balanced", "fast"])
     parser.add_argument("--views", default="8", help="of vfr-bench")
     parser.add_argument("--frames", default="20", help="of vfr-bench")
+    parser.add_argument("--sizes", nargs="*", default=[], help="of vfr-bench")
     options = parser.parse_args()
     lines = []
     for data in options.scenes:

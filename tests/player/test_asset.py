@@ -274,6 +274,16 @@ def test_versions(asset: Asset) -> None:
             parse_manifest(json.dumps(document | {"version": version}).encode(), "m.json")
 
 
+def test_rays_begin_at_the_camera_in_a_box_and_in_older_assets(asset: Asset) -> None:
+    with pytest.raises(FormatError, match=r"near: expected 0 unless contracted, got 0\.2"):
+        replace(asset.manifest, near=0.2)
+    document = json.loads(manifest_bytes(asset.manifest))
+    del document["near"]
+    with pytest.raises(FormatError, match="near: expected this key"):
+        parse_manifest(json.dumps(document).encode(), "m")
+    assert parse_manifest(json.dumps(document | {"version": [3, 0]}).encode(), "m").near == 0
+
+
 def test_contracted_space_has_one_box(asset: Asset) -> None:
     space = ((-2, -2, -2), (2, 2, 2))
     assert replace(asset.manifest, contracted=True, aabb=space).contracted
@@ -301,8 +311,8 @@ def test_golden_manifest() -> None:
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
-        '"contracted":false,"density_range":[0.0,1.0],"feature_resolution":4,"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,'
-        '"provenance":{},"resolution":6,"step":0.5,"version":[3,0],"view_size":[4,3],'
+        '"contracted":false,"density_range":[0.0,1.0],"feature_resolution":4,"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,"near":0.0,'
+        '"provenance":{},"resolution":6,"step":0.5,"version":[3,1],"view_size":[4,3],'
         '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'
     )
 

@@ -54,6 +54,20 @@ def test_march_is_that_of_a_loop_that_skips_nothing(module: ModuleType) -> None:
     assert hit.sum() > 30
 
 
+@pytest.mark.parametrize("module", MODULES)
+def test_rays_begin_where_they_are_told(module: ModuleType) -> None:
+    """As if the camera stood there, but for the depth, which is counted from the camera."""
+    grid, near = contracted_grid(bumps, shells), 0.3
+    rays_o, rays_d = some_rays()
+    later = module.march(replace(grid, near=near), rays_o, rays_d, 0)
+    there = module.march(grid, rays_o + np.float32(near) * rays_d, rays_d, 0)
+    np.testing.assert_allclose(later.opacity, there.opacity, atol=2e-5)
+    met = there.depth > 0
+    assert met.sum() > 30 and (later.depth[met] > near).all()
+    np.testing.assert_allclose(later.depth[met], there.depth[met] + near, rtol=1e-3, atol=1e-4)
+    assert (module.march(grid, rays_o, rays_d, 0).opacity > later.opacity + 0.1).any()
+
+
 @pytest.mark.parametrize("k", [0, 1, 3, 8])
 def test_the_compiled_march_does_the_same(k: int) -> None:
     grid = contracted_grid(bumps, shells)

@@ -302,3 +302,16 @@ def test_photographs_without_cameras_have_them_estimated(
     assert train_main([str(photos), str(tmp_path / "model.pt")]) == 1
     one_error(capsys, "found none")
     assert calls == [photos]
+
+
+def test_a_disk_that_fills_in_a_temporary_folder_is_one_line(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/tmp/head.onnx")
+
+    monkeypatch.setattr("vfr_bake.baking.bake.unwritten_asset", full)
+    settings = ["--resolution", "24", "--refine-steps", "0", "--check-views", "1"]
+    assert bake_main([str(model), str(tmp_path / "asset"), *settings]) == 1
+    one_error(capsys, "vfr-bake: error: /tmp/head.onnx: No space left on device")
+    assert not (tmp_path / "asset").exists()

@@ -46,6 +46,7 @@ from vfr_bake.baking.tuning import Tuning
 from vfr_bake.baking.unwritten import unwritten_asset
 from vfr_bake.baking.views import views_between
 from vfr_bake.config import BakeConfig
+from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
@@ -168,7 +169,8 @@ class _Bake:
                 "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
         self.n_rays = plan.n_rays(n_cells)
-        return make_layout(visible, step, plan.resolution, model.field.config.unbounded)
+        near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
+        return make_layout(visible, step, plan.resolution, model.field.config.unbounded, near)
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
         """The mesh of what is about to be written."""
@@ -261,6 +263,7 @@ class _Bake:
             step=layout.step,
             aabb=layout.aabb,
             contracted=layout.contracted,
+            near=layout.near,
             density_range=layout.density_range,
             n_channels=n_channels,
             view_size=(camera.width, camera.height),

@@ -60,6 +60,8 @@ class Layout:
     step: float
     density_range: tuple[float, float]
     contracted: bool = False
+    near: float = 0.0
+    """Where rays begin, model units, if contracted."""
 
     @property
     def aabb(self) -> tuple[tuple[float, ...], ...]:
@@ -85,6 +87,7 @@ class Layout:
             self.step,
             self.density_range,
             self.contracted,
+            self.near,
         )
 
     def float_grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
@@ -93,13 +96,16 @@ class Layout:
         return replace(self.grid(density, empty), features=features)
 
 
-def make_layout(visible: np.ndarray, step: float, resolution: int, contracted: bool = False) -> Layout:
+def make_layout(
+    visible: np.ndarray, step: float, resolution: int, contracted: bool = False, near: float = 0.0
+) -> Layout:
     """What is stored of the cells `visible` [n, n, n] bool: features at their corners, densities at those of
-    the finer cells in them, of which there are `resolution` along each axis; for march steps of `step`."""
+    the finer cells in them, of which there are `resolution` along each axis; for march steps of `step`, from
+    `near` on."""
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
     densities = _corners(subdivided(visible, resolution))
-    return Layout(densities, _corners(visible), step, density_range, contracted)
+    return Layout(densities, _corners(visible), step, density_range, contracted, near)
 
 
 def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
