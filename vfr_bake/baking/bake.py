@@ -216,13 +216,13 @@ class _Bake:
         head, most = self.model.field.head, self.choice.n_channels
         some = taught.some(N_SENSITIVITY)
         sensitivity = head_sensitivity(head, some.features, some.rays_d, some.opacity)
+        every = project(sensitivity, taught.features, most)
         if self.config.n_channels is not None:
-            return project(sensitivity, taught.features, most)
-        for n_stored in range(1, most):
-            projection = project(sensitivity, taught.features, n_stored)
+            return every
+        for projection in map(every.first, range(1, most)):
             if self.held_out.channel_loss(projection.back @ projection.matrix) <= self.choice.channel_loss_db:
                 return projection
-        return project(sensitivity, taught.features, most)
+        return every
 
     def _channels_that_fit(self, layout: Layout, density: np.ndarray, features: np.ndarray) -> int:
         """How many of the channels, the most important of which come first, fit into the budget."""

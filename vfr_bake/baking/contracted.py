@@ -48,8 +48,8 @@ def lattice_step(resolution: int) -> float:
 
 def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
     """[resolution]^3 bool: blocks of cells of contracted space in which some ray of a view has at least the
-    weight `weight_floor`, and the gaps of one block between them. Views are the training cameras and as many
-    between them.
+    weight `weight_floor`, and the gaps of one block between them. Views are the training cameras and twice as
+    many between them.
 
     `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met HITS times
     over all views. Pictures are taken a little wider than they are: another camera of the scene sees beyond
@@ -59,7 +59,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
     cameras = [widened(camera) for camera in model.model_cameras()]
-    cameras += views_between(model, len(cameras), seed=0, wide=True)
+    cameras += views_between(model, 2 * len(cameras), seed=0, wide=True)
     random = np.random.default_rng(0)
     share = _share_of_pixels(model, resolution)
     for index, camera in enumerate(cameras):
@@ -81,11 +81,11 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
 def rays_of_contracted_views(model: Model, resolution: int) -> float:
     """Rays that `weighty_cells` sends out."""
     n_pixels = (1 + 2 * MARGIN) ** 2 * sum(camera.width * camera.height for camera in model.cameras)
-    return 2 * _share_of_pixels(model, resolution) * n_pixels
+    return 3 * _share_of_pixels(model, resolution) * n_pixels
 
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
-    footprints = np.tile(pixel_footprints(model), 2)
+    footprints = np.tile(pixel_footprints(model), 3)
     return min(HITS / (VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))), 1.0)
 
 

@@ -31,8 +31,6 @@ its samples, 20 bytes each; of an object a third meets something, at about 10 sa
 and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
-FINE_MARKS = 4
-"""Bytes of a cell of the densities' grid while it is decided which are stored."""
 DENSITY_BYTES = 40
 """Of a density, of which each cell of the features has as many as finer cells."""
 N_TIMED = 8192
@@ -88,7 +86,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
     resolution, coarse = _resolutions(model, config)
-    marks = max(_marks_bytes(model, config) * coarse**3, FINE_MARKS * resolution**3)
+    marks = _marks_bytes(model, config) * coarse**3
     n_stored = min(choice.n_channels, field.n_channels)
     cell_bytes = max(4 * (field.n_channels + n_stored), 13 * n_stored) + 60
     cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
@@ -114,7 +112,7 @@ def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
     room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
     if not config.resolution:
-        resolution = min(resolution, int(np.cbrt(room / FINE_MARKS)))
+        resolution = min(resolution, int(np.cbrt(room / _marks_bytes(model, config)) / choice.feature_share))
     resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
     coarse = config.feature_resolution or round(choice.feature_share * resolution)
     coarse = int(np.clip(coarse, 8, min(field.max_resolution, resolution)))

@@ -21,6 +21,8 @@ from vfr_bake.baking.projection import encode_features
 from vfr_bake.baking.visibility import corners_of, subdivided
 from vfr_bake.training.model_file import Model
 
+SLAB = 64
+"""Planes of vertices that are looked at together."""
 VERTEX_CHUNK = 1 << 18
 """Vertices evaluated at once: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
@@ -104,8 +106,8 @@ def make_layout(
     `near` on."""
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
-    densities = _corners(subdivided(visible, resolution))
-    return Layout(densities, _corners(visible), step, density_range, contracted, near)
+    densities, features = (_corners(visible, n) for n in (resolution, len(visible)))
+    return Layout(densities, features, step, density_range, contracted, near)
 
 
 def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
@@ -134,10 +136,20 @@ def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.nd
         yield rows, unit_points(vertices.index[rows], vertices.resolution, contracted)
 
 
-def _corners(cells: np.ndarray) -> Vertices:
-    index = np.argwhere(corners_of(cells)).astype(np.int16)
+def _corners(cells: np.ndarray, resolution: int) -> Vertices:
+    """Those of the cells, `resolution` along each axis, that lie in `cells` [n, n, n] bool: slab by slab,
+    because a fine grid as a whole takes gigabytes."""
+    parts = []
+    for first in range(0, resolution + 1, SLAB):
+        last = min(first + SLAB, resolution + 1)
+        before = max(first - 1, 0)  # a vertex is a corner of the cells on both its sides
+        corners = corners_of(subdivided(cells, resolution, slice(before, last)))
+        index = np.argwhere(corners[first - before : last - before]).astype(np.int16)
+        index[:, 0] += first
+        parts.append(index)
+    index = np.concatenate(parts)
     coords, masks, order = pack_vertices(index)
-    return Vertices(coords, masks, index[order], len(cells))
+    return Vertices(coords, masks, index[order], resolution)
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:

@@ -57,7 +57,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         contracted_refine_steps=300, minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.55, contracted_resolution=832, feature_share=0.71, culled_loss_db=0.04,
+        cells_per_pixel=1.55, contracted_resolution=1088, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_samples=12, sample_loss_db=0.05, code_levels=64,
         head_width=64, head_layers=3, head_bands=4, head_bits=8, refine_steps=4000,
         contracted_refine_steps=2500, minutes=8, mesh_resolution=128, target_loss_db=0.4,

@@ -29,6 +29,10 @@ class Projection:
     back: np.ndarray
     """Q [n_channels, n_stored]."""
 
+    def first(self, n: int) -> Projection:
+        """The best projection to the first n of its channels: the most important come first."""
+        return Projection(self.matrix[:n], self.back[:, :n])
+
 
 def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Projection:
     """The best projection to `n_stored` channels, or to all where there are no more.

@@ -125,12 +125,12 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
     return corners
 
 
-def subdivided(cells: np.ndarray, resolution: int) -> np.ndarray:
-    """[resolution]^3 bool: cells of a finer grid over the same box whose middle is in one of `cells`
-    [n, n, n] bool.
+def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) -> np.ndarray:
+    """[n_planes, resolution, resolution] bool: cells of a grid of `resolution` over the same box whose middle
+    is in one of `cells` [n, n, n] bool, in some of its planes along x.
 
     >>> subdivided(np.array([True, False]).reshape(2, 1, 1).repeat(2, 1).repeat(2, 2), 5)[:, 0, 0].tolist()
     [True, True, False, False, False]
     """
     which = (2 * np.arange(resolution) + 1) * len(cells) // (2 * resolution)
-    return cells[np.ix_(which, which, which)]
+    return cells[np.ix_(which[planes], which, which)]

@@ -33,6 +33,7 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
     assert (layout.densities.resolution, layout.features.resolution) == (resolution, COARSE)
     for vertices, cells in ((layout.densities, subdivided(visible, resolution)), (layout.features, visible)):
         assert len(vertices) == corners_of(cells).sum()
+        assert corners_of(cells)[tuple(vertices.index.T)].all()
         assert (unpack_vertices(vertices.coords, vertices.masks) == vertices.index).all()
     codes = evaluate_densities(model, layout, quiet)
     decoded = np.exp(layout.density_range[0] + np.diff(layout.density_range)[0] / 255 * codes) * step
