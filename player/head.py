@@ -60,6 +60,7 @@ class Head:
             state.InvalidGraph,
             state.InvalidArgument,
             state.NotImplemented,
+            UnicodeDecodeError,  # of a message that repeats a name which is no UTF-8
         )
         path = self._path
         try:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -100,3 +101,22 @@ def test_values_of_a_model_that_are_none_of_ours(
     with pytest.raises(FormatError, match=message) as caught:
         load_model(path)
     assert len(str(caught.value)) < 300 and "\n" not in str(caught.value)
+
+
+def test_a_failure_whose_message_is_no_text(tmp_path: Path) -> None:
+    """onnxruntime repeats the name of the node in its message."""
+    model = onnx.load_from_string(head_bytes(4))
+    for node in model.graph.node:
+        node.output[:] = ["rgb_" if name == "rgb" else name for name in node.output]
+    model.graph.node.extend(
+        [
+            onnx.helper.make_node("Shape", ["dirs"], ["n_by_3"]),
+            onnx.helper.make_node("Add", ["n_by_3", "one"], ["larger"]),
+            onnx.helper.make_node("Reshape", ["rgb_", "larger"], ["rgb"], name="node"),
+        ]
+    )
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([1]), "one"))
+    path = tmp_path / "head.onnx"
+    path.write_bytes(model.SerializeToString().replace(b"node", b"nod\xff"))
+    with pytest.raises(FormatError, match="expected a head that runs"):
+        Head(path, 4)(np.zeros((2, 4), np.float32), np.zeros((2, 3), np.float32))

@@ -51,7 +51,7 @@ class BakeChoice:
 
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
-        cells_per_pixel=1.95, contracted_resolution=1024, feature_share=0.68, culled_loss_db=0.02,
+        cells_per_pixel=1.95, contracted_resolution=1216, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005, code_levels=127,
         head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=600,
         contracted_refine_steps=300, minutes=5, mesh_resolution=128, target_loss_db=0.05,
