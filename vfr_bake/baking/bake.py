@@ -44,7 +44,7 @@ from vfr_bake.baking.refinement import Stored
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.tuning import Tuning
 from vfr_bake.baking.unwritten import unwritten_asset
-from vfr_bake.baking.views import views_between
+from vfr_bake.baking.views import BETWEEN, views_between
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.training.model_file import Model
@@ -186,7 +186,7 @@ class _Bake:
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
-            views = cameras + views_between(model, 2 * len(cameras), seed=1, wide=layout.contracted)
+            views = cameras + views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
             taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))

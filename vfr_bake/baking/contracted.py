@@ -11,7 +11,7 @@ import torch
 
 from player.contracted_rays import MAX_SPEED
 from player.errors import TrainingError
-from vfr_bake.baking.views import MARGIN, views_between, widened
+from vfr_bake.baking.views import BETWEEN, MARGIN, views_between, widened
 from vfr_bake.baking.visibility import VIEWS_OF_A_CELL, Progress, close_gaps, pixel_footprints
 from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
@@ -48,8 +48,8 @@ def lattice_step(resolution: int) -> float:
 
 def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
     """[resolution]^3 bool: blocks of cells of contracted space in which some ray of a view has at least the
-    weight `weight_floor`, and the gaps of one block between them. Views are the training cameras and twice as
-    many between them.
+    weight `weight_floor`, and the gaps of one block between them. Views are the training cameras and BETWEEN
+    times as many between them.
 
     `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met HITS times
     over all views. Pictures are taken a little wider than they are: another camera of the scene sees beyond
@@ -59,7 +59,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
     cameras = [widened(camera) for camera in model.model_cameras()]
-    cameras += views_between(model, 2 * len(cameras), seed=0, wide=True)
+    cameras += views_between(model, BETWEEN * len(cameras), seed=0, wide=True)
     random = np.random.default_rng(0)
     share = _share_of_pixels(model, resolution)
     for index, camera in enumerate(cameras):
@@ -81,11 +81,11 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
 def rays_of_contracted_views(model: Model, resolution: int) -> float:
     """Rays that `weighty_cells` sends out."""
     n_pixels = (1 + 2 * MARGIN) ** 2 * sum(camera.width * camera.height for camera in model.cameras)
-    return 3 * _share_of_pixels(model, resolution) * n_pixels
+    return (1 + BETWEEN) * _share_of_pixels(model, resolution) * n_pixels
 
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
-    footprints = np.tile(pixel_footprints(model), 3)
+    footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
     return min(HITS / (VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))), 1.0)
 
 

@@ -12,6 +12,8 @@ from vfr_bake.training.model_file import Model
 
 LARGEST_TURN = np.deg2rad(15.0)
 """Farther from a training camera than this nobody has taught the model anything."""
+BETWEEN = 4
+"""Views between for each training camera, where the number of rays does not depend on that of the views."""
 NEIGHBOURS = 3
 """Training cameras that count as beside one: on a walk the next, the last and one more."""
 PLACES = 64
