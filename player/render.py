@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from types import ModuleType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -303,9 +303,10 @@ def import_ahead(scipy: bool = True) -> None:
     """
 
     def imports() -> None:
-        hidden = not scipy and not {"scipy.linalg", "numba.np.arraymath"} & set(sys.modules)
+        modules: dict[str, Any] = sys.modules  # None in it is a module that is not to be found
+        hidden = not scipy and not {"scipy.linalg", "numba.np.arraymath"} & set(modules)
         if hidden:
-            sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
+            modules["scipy.linalg"] = None
         try:
             with suppress(ImportError):  # told by whoever needs it
                 if choose_march("auto")[0] == "numpy":
@@ -317,7 +318,7 @@ def import_ahead(scipy: bool = True) -> None:
                     pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
         finally:
             if hidden:
-                del sys.modules["scipy.linalg"]
+                del modules["scipy.linalg"]
 
     threading.Thread(target=imports, daemon=True).start()
 

@@ -107,11 +107,12 @@ def load_model(path: Path) -> Model:
             f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(world_from_model.tolist())}"
         )
     where = f"{path}: cameras"
+    cameras = content["cameras"].encode(errors="surrogatepass")  # a reader of UTF-8 refuses half a character
     return Model(
         field=field,
         sampler=sampler,
         world_from_model=world_from_model,
-        cameras=transforms_cameras(parse_transforms(_bytes(content["cameras"]), where), where),
+        cameras=transforms_cameras(parse_transforms(cameras, where), where),
         has_alpha=bool(content["has_alpha"]),
         train=content["train"],
         figures=content["figures"],
@@ -187,11 +188,6 @@ def _check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> 
     if not fits or tensor.layout is not torch.strided:
         got = f"{tensor.dtype}, {tensor.layout}".replace("torch.", "")
         raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
-
-
-def _bytes(text: str) -> bytes:
-    """UTF-8, but for halves of characters, whose bytes are for a reader of UTF-8 to refuse."""
-    return text.encode(errors="surrogatepass")
 
 
 def _check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
