@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from exporters import unwrap as module
-from exporters.mesh import TriangleMesh
 from exporters.texture import covered_texels
 from exporters.unwrap import parts_of, unwrap
 from player.errors import ConfigError, DataError, MissingExtraError
