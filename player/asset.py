@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -249,6 +250,8 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
+    """Both grids at the same time: what unpacks them leaves the interpreter to others."""
+
     def grid(names: Names, *of_a_vertex: int) -> list[np.ndarray]:
         coords_name, masks_name, codes_name = names
         coords = _map_array(folder / _FILES[coords_name])
@@ -257,7 +260,10 @@ def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
         path, shape = folder / _FILES[codes_name], (int(np.bitwise_count(masks).sum()), *of_a_vertex)
         return [coords, masks, unpack_codes(path.read_bytes(), shape, _DTYPES[codes_name], str(path))]
 
-    return GridArrays(*grid(_DENSITIES), *grid(_FEATURES, manifest.n_channels))
+    with ThreadPoolExecutor(1) as other:
+        features = other.submit(grid, _FEATURES, manifest.n_channels)
+        densities = grid(_DENSITIES)
+        return GridArrays(*densities, *features.result())
 
 
 def _read_manifest(folder: Path) -> Manifest:
