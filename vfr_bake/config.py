@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
 from player.json_files import brief
-from vfr_bake.baking.presets import PRESETS, BakeChoice, Preset
+from vfr_bake.baking.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
 Compositing = Literal["features", "colour"]
@@ -373,7 +373,7 @@ class BakeConfig:
         """
         preset = PRESETS[self.preset]
         if unbounded:
-            preset = replace(preset, refine_steps=preset.contracted_refine_steps)
+            preset = replace(preset, **UNBOUNDED[self.preset])
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_samples"] = None if self.k == "auto" else self.k
         return replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,6 +31,7 @@ from vfr_bake import __version__
 from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
 from vfr_bake.baking.cells import find_cells
 from vfr_bake.baking.estimate import make_plan
+from vfr_bake.baking.field_features import with_field_features
 from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
 from vfr_bake.baking.head_weights import fold_head, small_head
@@ -161,16 +162,17 @@ class _Bake:
             visible, step, left_out = find_cells(model, self.config, plan, self.held_out, progress)
         if left_out is not None:
             self.left_out["cells"] = left_out
-        n_cells = int(np.count_nonzero(visible))
+        n_cells = int(np.count_nonzero(visible)) * (plan.feature_resolution // len(visible)) ** 3
         if n_cells > plan.most_cells:
             raise TrainingError(
                 f"bake: cells: expected at most {plan.most_cells:,}, which fit into "
-                f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of {visible.size:,}: is the model "
+                f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of "
+                f"{plan.feature_resolution**3:,}: is the model "
                 "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
         self.n_rays = plan.n_rays(n_cells)
         near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
-        return make_layout(visible, step, plan.resolution, model.field.config.unbounded, near)
+        return make_layout(visible, step, plan.resolutions, model.field.config.unbounded, near)
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
         """The mesh of what is about to be written."""
@@ -190,19 +192,19 @@ class _Bake:
             taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
-            features = evaluate_features(model, layout, self._progress("features"))
-            own = fold_head(model.field.head, model.field.head.first_weights().astype(np.float64))
-            held_out.measure("grid", layout.float_grid(density, features), runner(own), 0)
             projection = self._projection(taught)
-            features = features @ projection.matrix.T.astype(np.float32)
+            features = evaluate_features(model, layout, projection.matrix, self._progress("features"))
             step = code_step(features, choice.code_levels)
             features /= np.float32(step)
             n_fit = self._channels_that_fit(layout, density, features)
             features = np.ascontiguousarray(features[:, :n_fit])
-            first = model.field.head.first_weights().astype(np.float64) @ projection.back[:, :n_fit]
-            head = fold_head(model.field.head, first * step)
-            held_out.measure("rank", layout.float_grid(density, features), runner(head), 0)
+            first = model.field.head.first_weights().astype(np.float64)
+            head = fold_head(model.field.head, first @ projection.back[:, :n_fit] * step)
             grid = layout.grid(density, features)
+            played = held_out.march(replace(grid, features=features), 0)
+            own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
+            held_out.measure_march("grid", own, runner(fold_head(model.field.head, first)))
+            held_out.measure_march("rank", played, runner(head))
             held_out.measure("codes", grid, runner(head), 0)
         n_all = model.field.config.n_channels
         self.left_out["channels"] = (

@@ -19,7 +19,7 @@ class StoredCells(NamedTuple):
     """What is stored."""
 
     visible: np.ndarray
-    """[n, n, n] bool."""
+    """[n, n, n] bool: cells of the features' grid, or blocks of them."""
     step: float
     """Of the march: model units, of an unbounded scene dphi of `player.contracted_rays`."""
     left_out: str | None
@@ -29,8 +29,7 @@ class StoredCells(NamedTuple):
 def find_cells(
     model: Model, config: BakeConfig, plan: Plan, held_out: HeldOut, progress: Progress
 ) -> StoredCells:
-    """The cells of an object's box, or of contracted space, that matter in some view; they are those of the
-    features' grid.
+    """The cells of an object's box, or of contracted space, that matter in some view.
 
     Raises TrainingError when nothing is seen.
     """

@@ -31,6 +31,8 @@ its samples, 20 bytes each; of an object a third meets something, at about 10 sa
 and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
+CHANNEL_BYTES = 5
+"""Of a stored channel of a vertex: the float that learns, and the code that is played."""
 DENSITY_BYTES = 40
 """Of a density, of which each cell of the features has as many as finer cells."""
 N_TIMED = 8192
@@ -57,6 +59,11 @@ class Plan:
     """Bytes for cells and rays."""
     marks: float
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
+
+    @property
+    def resolutions(self) -> tuple[int, int]:
+        """Both."""
+        return self.resolution, self.feature_resolution
 
     @property
     def ray_bytes(self) -> int:
@@ -88,7 +95,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     resolution, coarse = _resolutions(model, config)
     marks = _marks_bytes(model, config) * coarse**3
     n_stored = min(choice.n_channels, field.n_channels)
-    cell_bytes = max(4 * (field.n_channels + n_stored), 13 * n_stored) + 60
+    cell_bytes = CHANNEL_BYTES * n_stored + 60
     cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     plan = Plan(resolution, coarse, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
@@ -119,9 +126,11 @@ def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
     return resolution, coarse - coarse % BLOCK if field.unbounded else coarse
 
 
-def _marks_bytes(model: Model, config: BakeConfig) -> int:
+def _marks_bytes(model: Model, config: BakeConfig) -> float:
     """For each cell of the features' grid, while it is decided which are stored."""
-    n_floors = len(FLOORS) if config.weight_floor is None and not model.field.config.unbounded else 1
+    if model.field.config.unbounded:
+        return 5 / BLOCK**3
+    n_floors = len(FLOORS) if config.weight_floor is None else 1
     return 4 + (0 if config.no_cull else n_floors)
 
 

@@ -8,7 +8,7 @@ channel, the coarser one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,21 +92,21 @@ class Layout:
             self.near,
         )
 
-    def float_grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
-        """The same with features [n, n_channels] float32 as they are, for measuring alone."""
-        empty = np.zeros((len(features), 1), np.float32)
-        return replace(self.grid(density, empty), features=features)
-
 
 def make_layout(
-    visible: np.ndarray, step: float, resolution: int, contracted: bool = False, near: float = 0.0
+    visible: np.ndarray,
+    step: float,
+    resolutions: tuple[int, int],
+    contracted: bool = False,
+    near: float = 0.0,
 ) -> Layout:
-    """What is stored of the cells `visible` [n, n, n] bool: features at their corners, densities at those of
-    the finer cells in them, of which there are `resolution` along each axis; for march steps of `step`, from
-    `near` on."""
+    """What is stored of the cells `visible` [n, n, n] bool, for march steps of `step`, from `near` on:
+    densities and features at the corners of the cells of their own grids that lie in them, of which there are
+    `resolutions` along each axis."""
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
-    densities, features = (_corners(visible, n) for n in (resolution, len(visible)))
+    densities = _corners(visible, resolutions[0])
+    features = densities if resolutions[1] == resolutions[0] else _corners(visible, resolutions[1])
     return Layout(densities, features, step, density_range, contracted, near)
 
 
@@ -120,12 +120,12 @@ def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.n
     return codes
 
 
-def evaluate_features(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
-    """The field's features [n_features, n_channels] float32."""
-    vertices = layout.features
-    features = np.empty((len(vertices), model.field.config.n_channels), np.float32)
+def evaluate_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
+    """The field's features times `matrix` [n_stored, n_channels]: [n_features, n_stored] float32."""
+    vertices, back = layout.features, matrix.T.astype(np.float32)
+    features = np.empty((len(vertices), len(matrix)), np.float32)
     for rows, points in _chunks(vertices, layout.contracted):
-        features[rows] = model.field.features(points)
+        np.matmul(model.field.features(points), back, out=features[rows])
         progress(rows.stop, len(vertices))
     return features
 

@@ -86,9 +86,9 @@ class Lessons:
         starts = np.concatenate([[0], np.cumsum(counts)])
         index = np.repeat(self.starts[some] - starts[:-1], counts) + np.arange(starts[-1])
         points = self.points[index]
-        of_features = _corners(self.features, points * self.feature_scale, MIN_TOTAL)
+        of_features = corners(self.features, points * self.feature_scale, MIN_TOTAL)
         none = np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32)
-        of_densities = none if self.densities is None else _corners(self.densities, points, np.float32(0))
+        of_densities = none if self.densities is None else corners(self.densities, points, np.float32(0))
         return Fetches(starts, *of_features, *of_densities, self.weights[index], self.lengths[index])
 
     def composed(self, codes: np.ndarray) -> np.ndarray:
@@ -198,7 +198,7 @@ def player_fetches(
         bins = equal_mass_bins(many, n_samples)
         places = bins.s.copy()
         points = np.ascontiguousarray(entries.at(bins.ray, places).T)
-        gaps = np.flatnonzero(~_corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
+        gaps = np.flatnonzero(~corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
         if len(gaps):
             places[gaps] = many.s[heaviest(bins, gaps)]
         ray = np.concatenate([ray, bins.ray])
@@ -216,9 +216,9 @@ def compose_into(fetches: Fetches, codes: np.ndarray, out: np.ndarray) -> None:
     compose(fetches.starts, fetches.rows, fetches.shares, fetches.weights, codes, out)
 
 
-def _corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and shares [n, 8] of the corners around `points` [n, 3] float32, cells of the vertices' own
-    grid."""
+def corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and shares [n, 8] of the corners around `points` [n, 3] float32, cells of the vertices' own grid;
+    shares 0 where the stored ones have less than `least` in all."""
     n = len(points)
     rows, shares = np.empty((n, 8), np.int32), np.empty((n, 8), np.float32)
     corner_rows(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from player.errors import TrainingError
-from player.march import MIN_OPACITY
+from player.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
 from player.sparse_grid import SparseGrid
 from vfr_bake.baking.views import views_between
@@ -104,24 +104,29 @@ class HeldOut:
         off = self._opacity * (mean - own)
         return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
 
-    def shown(self, grid: SparseGrid, head: Head, n_samples: int) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [n, 3] over the background as played, and the samples taken of each ray that hits."""
-        march = choose_march("numba", grid.contracted)[1].march
-        played = march(grid, self.rays_o, self.rays_d, n_samples)
-        rgb = (1 - played.opacity[:, None]) * self.background
-        hits = played.hits
-        rgb[hits] += head(played.features, self.rays_d[hits]) * played.opacity[hits, None]
-        return rgb, played.n_samples[hits]
+    def march(self, grid: SparseGrid, n_samples: int) -> MarchResult:
+        """What the rays compose as played."""
+        return choose_march("numba", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_samples)
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""
-        stage = self.look(name, grid, head, n_samples)
+        return self.measure_march(name, self.march(grid, n_samples), head)
+
+    def measure_march(self, name: str, played: MarchResult, head: Head) -> Stage:
+        """Show what was composed, and keep the result under `name`."""
+        stage = self._stage(name, played, head)
         self.stages.append(stage)
         return stage
 
     def look(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
         """Play `grid` with `head`, without keeping the result."""
-        rgb, samples = self.shown(grid, head, n_samples)
+        return self._stage(name, self.march(grid, n_samples), head)
+
+    def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
+        rgb = (1 - played.opacity[:, None]) * self.background
+        hits = played.hits
+        rgb[hits] += head(played.features, self.rays_d[hits]) * played.opacity[hits, None]
+        samples = played.n_samples[hits]
         error = float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
         return Stage(
             name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 Preset = Literal["fidelity", "balanced", "fast"]
 
@@ -16,7 +16,8 @@ class BakeChoice:
     """Resolution of the densities where none is given: cells for each pixel that the training pictures see
     across the middle of the box, at most half again the field's finest level."""
     contracted_resolution: int
-    """The same for an unbounded scene: cells over all of contracted space, four model units."""
+    """The same for an unbounded scene: cells over all of contracted space, four model units, of which few
+    hold anything."""
     feature_share: float
     """Cells of the features' grid for a cell of the densities', along an axis; at most the field's finest
     level."""
@@ -39,8 +40,6 @@ class BakeChoice:
     direction."""
     head_bits: int
     refine_steps: int
-    contracted_refine_steps: int
-    """Of an unbounded scene, whose rays have several times as many fetches."""
     minutes: float
     """Wall-clock minutes of a bake, roughly: refinement takes fewer steps where the machine is too slow for
     all of them, unless their number was asked for."""
@@ -51,21 +50,35 @@ class BakeChoice:
 
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
-        cells_per_pixel=1.95, contracted_resolution=1216, feature_share=0.68, culled_loss_db=0.02,
+        cells_per_pixel=1.95, contracted_resolution=1152, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005, code_levels=127,
         head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=600,
-        contracted_refine_steps=300, minutes=5, mesh_resolution=128, target_loss_db=0.05,
+        minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=1088, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_samples=12, sample_loss_db=0.05, code_levels=64,
         head_width=64, head_layers=3, head_bands=4, head_bits=8, refine_steps=4000,
-        contracted_refine_steps=2500, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        minutes=8, mesh_resolution=128, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
         n_channels=12, channel_loss_db=0.5, n_samples=4, sample_loss_db=0.15, code_levels=50,
         head_width=32, head_layers=1, head_bands=3, head_bits=8, refine_steps=5000,
-        contracted_refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
+        minutes=8, mesh_resolution=112, target_loss_db=1.0,
     ),
 }  # fmt: skip
+
+UNBOUNDED: dict[Preset, dict[str, Any]] = {
+    "fidelity": {"refine_steps": 300, "feature_share": 1.0, "n_channels": 24},
+    "balanced": {
+        "refine_steps": 2500,
+        "feature_share": 1.0,
+        "n_channels": 24,
+        "channel_loss_db": 0.03,
+        "code_levels": 127,
+    },
+    "fast": {"refine_steps": 2500},
+}
+"""What they decide otherwise for an unbounded scene: its rays have several times as many fetches, which take
+their time; its features are most of what a grid of so few cells loses."""

@@ -16,6 +16,7 @@ import torch
 
 from vfr_bake.field.head import Head
 
+ROWS_AT_ONCE = 1 << 18
 LEAST_SENSITIVITY = 1e-6
 """Share of the mean that every direction of M keeps, so that S has an inverse."""
 
@@ -76,10 +77,14 @@ def code_step(values: np.ndarray, levels: int = 127) -> float:
     >>> code_step(np.array([[127.0, 0.0], [-254.0, 1.0]]))
     2.0
     """
-    largest = float(np.abs(values).max(initial=0))
+    largest = float(max(values.max(initial=0), -values.min(initial=0)))  # a copy of `values` may not fit
     return largest / levels if largest > 0 else 1.0
 
 
 def encode_features(codes: np.ndarray) -> np.ndarray:
     """Codes that need not be whole [n_vertices, n_stored] as signed bytes, rounded to nearest."""
-    return np.clip(np.rint(codes), -127, 127).astype(np.int8)
+    whole = np.empty(codes.shape, np.int8)
+    for first in range(0, len(codes), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        whole[rows] = np.clip(np.rint(codes[rows]), -127, 127)
+    return whole

@@ -114,15 +114,15 @@ def refine(
 ) -> Stored:
     """Head and codes after `steps` of the same kind.
 
-    Codes are rounded wherever they are composed, and returned as they stand, not rounded; `stored` is left
-    alone. With a `grid`, whose lookups and densities `lessons` must hold at every sample, the densities learn
-    too, and the weights of the lessons follow them. With `ranges` the head learns to live with 8 bits
-    (`vfr_bake.baking.folded_head`).
+    Codes are rounded wherever they are composed, and returned as they stand, not rounded. The features of
+    `stored` are moved themselves: there may be no room for them twice. With a `grid`, whose lookups and
+    densities `lessons` must hold at every sample, the densities learn too, and the weights of the lessons
+    follow them. With `ranges` the head learns to live with 8 bits (`vfr_bake.baking.folded_head`).
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
     head = FoldedHead(stored.head, UNIT * lessons.typical(stored.features), ranges)
-    features, density = stored.features.copy(), stored.density.copy()
+    features, density = stored.features, stored.density.copy()
     steep, steep_density = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     n_parts = get_num_threads()
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
@@ -157,9 +157,9 @@ def refine(
             )  # fmt: skip
             rate = np.float32(DENSITY_RATE * falling)
             descend_density(*of_densities, of_fetches, rate, n_parts, density, steep_density)
-        descend(
-            *where, fetches.weights, of_composed, np.float32(code_rate * falling), n_parts, features, steep
-        )
+        moved = features, steep
+        rate = np.float32(code_rate * falling)
+        descend(*where, fetches.weights, of_composed, rate, n_parts, *moved)
     return Stored(head.weights(), features, density)
 
 

@@ -20,6 +20,7 @@ from vfr_bake.baking.lessons import Taught, collect_lessons
 from vfr_bake.baking.loss import HeldOut, Stage
 from vfr_bake.baking.pace import LOOKUPS
 from vfr_bake.baking.presets import BakeChoice
+from vfr_bake.baking.projection import encode_features
 from vfr_bake.baking.refinement import CODE_RATE, HEAD_RATE, Progress, Steps, Stored, learn_head, refine
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -65,7 +66,8 @@ class Tuning:
         self._rounds_left = 3 if choice.head_width else 2
 
     def run(self, stored: Stored, layout: Layout, taught: Taught) -> Stored:
-        """Head and stored values adapted to each other: at every sample, then at the k that are played."""
+        """Head and stored values adapted to each other: at every sample, then at the k that are played. Moves
+        the features of `stored` themselves."""
         choice = self._choice
         grid = layout.grid(stored.density, stored.features)
         if choice.refine_steps == 0:
@@ -73,7 +75,8 @@ class Tuning:
             return stored
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
-        lessons = collect_lessons(taught, grid, 0, layout.densities.rows())
+        same = layout.densities is layout.features
+        lessons = collect_lessons(taught, grid, 0, grid.rows if same else layout.densities.rows())
         if choice.head_width:
             new = self._new_head(stored.head, lessons.typical(stored.features))
             stored = replace(stored, head=new)
@@ -84,19 +87,26 @@ class Tuning:
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
         with self._steps("refinement", choice.refine_steps) as steps:
             tuned = refine(stored, lessons, steps, head_rate, code_rate, grid)
-        grid = layout.grid(tuned.density, tuned.features)
+        del lessons  # they hold on to rows of a grid, for two of which there may be no room
+        played, grid = grid.features, layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
-        stored = tuned if self._gained("refinement", before, after) else stored
-        grid = layout.grid(stored.density, stored.features)
+        if self._gained("refinement", before, after):
+            stored = tuned
+        else:
+            stored = replace(stored, features=played.astype(np.float32))
+            grid = layout.grid(stored.density, stored.features)
         before = self._choose_lookups_and_bits(stored, grid, taught)
         if self.n_samples:
             lessons = collect_lessons(taught, grid, self.n_samples)
             rates = head_rate * AT_K[choice.head_width > 0], code_rate / 2  # what is left to learn is little
             with self._steps("refinement at k", choice.refine_steps) as steps:
                 tuned = refine(stored, lessons, steps, *rates, ranges=self.ranges)
-            grid, head = layout.grid(tuned.density, tuned.features), runner(tuned.head, self.ranges)
+            played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
+            head = runner(tuned.head, self.ranges)
             after = self._held_out.measure("refined at k", grid, head, self.n_samples)
-            stored = tuned if self._gained("refinement at k", before, after) else stored
+            if not self._gained("refinement at k", before, after):
+                return replace(stored, features=played.astype(np.float32))
+            stored = tuned
         return stored
 
     @contextmanager

@@ -157,11 +157,14 @@ def test_refinement_brings_the_head_back_to_its_teacher() -> None:
     learned = learn_head(stored, lessons, Steps(200, lambda *_: None), HEAD_RATE)
     head_alone = replace(stored, head=learned)
     assert error(head_alone) < before / 5
+    alone = error(head_alone)
     same = refine(stored, lessons, Steps(200, lambda *_: None), code_rate=0)
     assert np.array_equal(same.features, baked), "left alone"
-    assert error(same) == pytest.approx(error(head_alone), rel=1e-3)
-    both = refine(stored, lessons, Steps(200, lambda *_: None), code_rate=4)
-    assert error(both) < error(head_alone)
+    assert error(same) == pytest.approx(alone, rel=1e-3)
+    own = replace(stored, features=baked.copy())
+    both = refine(own, lessons, Steps(200, lambda *_: None), code_rate=4)
+    assert error(both) < alone
+    assert both.features is own.features, "moved where they are"
     assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
 
 
@@ -311,6 +314,18 @@ def test_views_between_come_near_to_what_lies_halfway_on_a_walk(model: Model) ->
     apart = np.stack([np.linalg.norm(views - place, axis=1).min() for place in halfway[1::2]])
     step = np.linalg.norm(halfway[0] - halfway[1])
     assert (apart < step / 2).mean() > 0.5
+
+
+def test_views_of_a_scene_stand_aside_of_the_way_between_two_cameras(model: Model) -> None:
+    walk = replace(model, cameras=orbit(model.cameras, 36))
+    cameras = np.stack([camera.c2w[:3, 3] for camera in walk.model_cameras()])
+    step = np.linalg.norm(cameras[0] - cameras[1])
+    off_the_walk = []
+    for wide in (False, True):
+        places = np.stack([camera.c2w[:3, 3] for camera in views_between(walk, 200, seed=0, wide=wide)])
+        off_the_walk.append(np.abs(np.linalg.norm(places, axis=1) - np.linalg.norm(cameras[0])))
+    assert off_the_walk[0].max() < 0.2 * step
+    assert step < off_the_walk[1].max() < 4 * step and np.median(off_the_walk[1]) > 0.1 * step
 
 
 def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
     few = weighty_cells(model, 64, 0.3, quiet)
     assert few.sum() < cells.sum()
     camera = model.model_cameras()[0].c2w[:3, 3]
-    x, y, z = ((contract(camera) + 2) * 16).astype(int)
+    x, y, z = ((contract(camera) + 2) * 8).astype(int)  # of the 32 blocks in 4 units
     assert not cells[x, y, z], "a camera stands in empty space"
 
 

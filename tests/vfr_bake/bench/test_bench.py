@@ -16,7 +16,6 @@ from player.asset import Asset
 from player.manifest import CONTRACTED_AABB
 from player.render import render
 from player.transforms import read_cameras, write_cameras
-from vfr_bake.baking.presets import PRESETS
 from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
@@ -101,7 +100,7 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
         manifest = replace(asset.manifest, contracted=contracted, aabb=aabb, provenance=remembered)
         return bake_command("out", replace(asset, manifest=manifest))
 
-    other = PRESETS["balanced"].refine_steps if contracted else PRESETS["balanced"].contracted_refine_steps
+    other = BakeConfig().choice(not contracted).refine_steps
     plain = "vfr-bake model.pt out --preset balanced"
     assert command(BakeConfig()) == plain
     assert command(BakeConfig(refine_steps=other, k=3)) == f"{plain} --refine-steps {other} --k 3"

@@ -1,0 +1,33 @@
+"""The field's own features, composed along rays without being stored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from player.render import choose_march
+from vfr_bake.baking.field_features import RAYS_AT_ONCE, with_field_features
+from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout
+from vfr_bake.baking.visibility import occupied_cells
+from vfr_bake.training.model_file import Model
+
+
+def quiet(done: int, of: int) -> None: ...
+
+
+def test_they_are_those_of_a_grid_that_holds_them_all(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout = make_layout(occupied_cells(model, 40), model.occupancy.step, (64, 40))
+    every = evaluate_features(model, layout, np.eye(model.field.config.n_channels), quiet)
+    grid = layout.grid(evaluate_densities(model, layout, quiet), np.zeros((len(every), 1), np.float32))
+    rays_o, rays_d = model.model_cameras()[0].rays()
+    march = choose_march("numba", contracted=False)[1].march
+    wanted = march(replace(grid, features=every), rays_o, rays_d, 0)
+    assert len(wanted.hits) > 100
+    monkeypatch.setattr("vfr_bake.baking.field_features.RAYS_AT_ONCE", len(wanted.hits) // 3)
+    assert len(wanted.hits) // 3 < RAYS_AT_ONCE, "in several parts"
+    played = march(grid, rays_o, rays_d, 0)
+    composed = with_field_features(model, layout, grid, rays_o, rays_d, played)
+    assert np.array_equal(composed.hits, wanted.hits) and np.array_equal(composed.opacity, wanted.opacity)
+    np.testing.assert_allclose(composed.features, wanted.features, rtol=0, atol=2e-4)
