@@ -24,7 +24,8 @@ from vfr_bake.baking.folded_head import FoldedHead
 from vfr_bake.baking.lessons import Lessons, compose_into
 from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
 
-BATCH = 2048
+BATCH, HEAD_BATCH = 2048, 1024
+"""Rays of a step, and of one in which the head learns alone: twice the steps on as many rays gain more."""
 UNIT = 4.0
 """Mean sizes of a channel's composites that make a unit of it; so large a unit makes the first weights of the
 size that the learning rate fits."""
@@ -35,6 +36,9 @@ CODE_RATE = 0.25
 
 DENSITY_RATE = 1.0
 """The same of the density's codes."""
+DAMPING = 8.0
+"""Rays by which Adagrad's squares of a vertex begin: one that few rays meet would else move as far as the
+others, to suit those rays alone."""
 N_WARM, N_TIMED = 10, 40
 """Steps of a round that are not timed, because something may be compiled for the first time, and steps that
 are."""
@@ -95,7 +99,7 @@ def learn_head(stored: Stored, lessons: Lessons, steps: Steps, rate: float) -> H
     composed = lessons.composed(stored.features)
     for step in steps:
         adam.param_groups[0]["lr"] = rate * steps.falling(step)
-        some = random.integers(0, len(lessons), BATCH)
+        some = random.integers(0, len(lessons), HEAD_BATCH)
         shown, opacity = torch.from_numpy(composed[some]), torch.from_numpy(lessons.opacity[some])
         adam.zero_grad(set_to_none=True)
         _loss(head, shown, opacity, lessons, some).backward()
@@ -155,12 +159,24 @@ def refine(
                 opacity.grad.numpy(), grid.density_low, grid.density_slope, fetches.lengths, density,
                 of_fetches,
             )  # fmt: skip
+            if step == 0:
+                descend_density(*of_densities, of_fetches, np.float32(0), n_parts, density, steep_density)
+                _damp(steep_density)
             rate = np.float32(DENSITY_RATE * falling)
             descend_density(*of_densities, of_fetches, rate, n_parts, density, steep_density)
         moved = features, steep
+        if step == 0:
+            descend(*where, fetches.weights, of_composed, np.float32(0), n_parts, *moved)
+            _damp(steep)
         rate = np.float32(code_rate * falling)
         descend(*where, fetches.weights, of_composed, rate, n_parts, *moved)
     return Stored(head.weights(), features, density)
+
+
+def _damp(steepness: np.ndarray) -> None:
+    """Let the squares [n] of all vertices begin at DAMPING times those that the first rays have left."""
+    met = steepness[steepness > 0]
+    steepness[:] = DAMPING * met.mean() if len(met) else 0
 
 
 def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, lessons: Lessons, some: np.ndarray) -> Tensor:
