@@ -30,7 +30,7 @@ from player.transforms import write_cameras
 from vfr_bake import __version__
 from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
 from vfr_bake.baking.cells import find_cells
-from vfr_bake.baking.estimate import make_plan
+from vfr_bake.baking.estimate import REFINED_BY, make_plan
 from vfr_bake.baking.field_features import with_field_features
 from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
@@ -54,8 +54,6 @@ Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
-REFINED_BY = 0.85
-"""Of a bake's time: then come the mesh, and what is written is played."""
 PLAYS_NOTHING = 6.0
 """Expected loss in dB over which the asset does not show what the model shows."""
 

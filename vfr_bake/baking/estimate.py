@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from player.cameras import Camera
 from player.errors import ConfigError
 from vfr_bake.baking.contracted import BLOCK, CELL_SHARE, rays_of_contracted_views
 from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
@@ -35,11 +36,17 @@ CHANNEL_BYTES = 5
 """Of a stored channel of a vertex: the float that learns, and the code that is played."""
 DENSITY_BYTES = 40
 """Of a density, of which each cell of the features has as many as finer cells."""
-N_TIMED = 8192
-"""Rays that tell how fast the model answers."""
+REFINED_BY = 0.8
+"""Of a bake's time: then come the mesh, and what is written is played."""
+N_TIMED = 2048
+"""Rays that tell how fast the model answers, of all its cameras."""
 STEP_COST, VERTEX_COST = {False: 2.5, True: 0.2}, 0.12
 """Of a lesson in a step of refinement, by whether the scene is unbounded (whose model takes its time for a
 ray), and of a vertex, in rays of the model."""
+OWN_HEAD = 4
+"""Times as long a step takes with the model's own head."""
+MESH_SECONDS = 40.0
+"""Of what hardly depends on the scene: the mesh, and playing what is written."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +150,8 @@ def _cells(model: Model, resolution: int) -> float:
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     """How long the bake will take, from how long some of the model's own rays take here."""
-    choice, camera = config.choice(model.field.config.unbounded), model.model_cameras()[0]
-    rays_o, rays_d = camera.rays()
-    some = np.arange(N_TIMED) * len(rays_o) // N_TIMED
-    rays_o, rays_d = np.ascontiguousarray(rays_o[some]), np.ascontiguousarray(rays_d[some])
+    choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
+    rays_o, rays_d = _some_rays(model.model_cameras())
     times = []
     for _ in range(2):  # the first compiles
         begin = time.perf_counter()
@@ -154,11 +159,27 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         times.append(time.perf_counter() - begin)
     finer = plan.resolution / plan.feature_resolution
     work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + finer**3)
-    if model.field.config.unbounded:
+    if unbounded:
         work += rays_of_contracted_views(model, plan.feature_resolution)
     elif not config.no_cull:
         shorter = max(model.occupancy.step * plan.feature_resolution / 2, 1.0)
         work += shorter * rays_of_views(model, plan.feature_resolution)
-    n_rounds = 3 if choice.head_width else 2
-    work += n_rounds * choice.refine_steps * BATCH * STEP_COST[model.field.config.unbounded]
-    return times[-1] * work / N_TIMED
+    steps = (3 if choice.head_width else 2 * OWN_HEAD) * choice.refine_steps
+    before, refinement = (
+        times[-1] / len(rays_o) * rays for rays in (work, steps * BATCH * STEP_COST[unbounded])
+    )
+    if config.refine_steps is None:
+        refinement = min(refinement, max(60 * REFINED_BY * choice.minutes - before, 0.0))
+    return before + refinement + MESH_SECONDS
+
+
+def _some_rays(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """About N_TIMED rays, evenly of all pictures."""
+    parts = []
+    for camera in cameras:
+        rays_o, rays_d = camera.rays()
+        n = -(-N_TIMED // len(cameras))
+        some = np.random.default_rng(len(parts)).integers(0, len(rays_o), n)
+        parts.append((rays_o[some], rays_d[some]))
+    rays_o, rays_d = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return rays_o, rays_d

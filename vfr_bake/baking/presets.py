@@ -76,7 +76,7 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "feature_share": 1.0,
         "n_channels": 24,
         "channel_loss_db": 0.03,
-        "code_levels": 127,
+        "code_levels": 90,
     },
     "fast": {"refine_steps": 2500},
 }
