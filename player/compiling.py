@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +17,13 @@ except ImportError:  # an extra: without it the numpy twin of whatever is compil
 def available() -> bool:
     """Whether numba is installed."""
     return numba is not None
+
+
+def first_use() -> bool:
+    """Whether numba is there and has kept no march yet: the first picture waits until it is compiled."""
+    if numba is None or os.environ.get("NUMBA_CACHE_DIR"):
+        return False
+    return not any((Path(__file__).parent / "__pycache__").glob("*march_compiled*.nbi"))
 
 
 def forget_outdated(folder: Path, *others: Path) -> None:

@@ -17,7 +17,7 @@ from player.cameras import Camera, orbit
 from player.errors import ConfigError
 from player.files import write_bytes
 from player.frame_files import Target, encode_frame, frame_key, unfinished
-from player.progress import Bar, duration
+from player.progress import Bar, duration, say_first_use
 from player.render import FRAME_BYTES, Background, March, Renderer, check_size, import_ahead
 from player.transforms import read_cameras
 from player.views import frame_rate, read_views
@@ -104,6 +104,8 @@ def _here(asset: Asset, jobs: list[Job], settings: PlaySettings, _: str | None) 
     if not jobs:
         return
     with Renderer(asset, settings.threads, settings.march) as renderer:
+        if renderer.march == "numba":
+            say_first_use()
         # compiles, or reads what was compiled before
         renderer.render(jobs[0].camera.resized(64, 64), settings.samples, settings.background)
         for index, job in enumerate(jobs):

@@ -36,6 +36,14 @@ class Bar:
         sys.stderr.flush()
 
 
+def say_first_use() -> None:
+    """On a terminal, why the first picture takes its time."""
+    from player.compiling import first_use  # numba, which is imported on another thread meanwhile
+
+    if sys.stderr.isatty() and first_use():
+        sys.stderr.write("vfr-play: compiling for this processor: up to a minute, once\n")
+
+
 def duration(seconds: float) -> str:
     """Seconds in words that a person reads at a glance.
 

@@ -17,6 +17,7 @@ import numpy as np
 from player.asset import Asset
 from player.cameras import focus_point, orbit, world_up
 from player.errors import ConfigError, MissingExtraError
+from player.progress import say_first_use
 from player.render import Renderer, import_ahead
 from player.transforms import read_cameras
 from player.viewer.window import Window
@@ -52,6 +53,8 @@ def serve(arguments: argparse.Namespace) -> None:
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
             sys.stdout.flush()
             sys.stderr.write(_advice(files, server.get_port()))
+            if renderers[0].march == "numba":
+                say_first_use()
             forever = threading.Event()
             while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
                 pass

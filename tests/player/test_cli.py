@@ -244,14 +244,19 @@ def test_ctrl_c_keeps_finished_frames(
     assert f"kept in {tmp_path / 'o'}; --resume goes on" in capsys.readouterr().err
 
 
-def test_progress_on_a_terminal(shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("first", [False, True])
+def test_progress_on_a_terminal(
+    first: bool, shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True
 
     monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setattr("player.compiling.first_use", lambda: first)
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o"), "--frames", ":2"]) == 0
-    assert "frame 2/2" in sys.stderr.getvalue()  # type: ignore[attr-defined]
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "frame 2/2" in shown and ("compiling for this processor" in shown) == first
 
 
 def run(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:

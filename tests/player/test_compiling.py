@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from player import compiling
+
 USER = """
 from pathlib import Path
 import player.compiling as compiling
@@ -41,6 +43,15 @@ def run(folder: Path) -> str:
 
 def kept(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in folder.glob("__pycache__/*.nbi")}
+
+
+def test_first_use_is_known_by_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "__file__", str(tmp_path / "compiling.py"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    assert compiling.first_use()
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__" / "march_compiled._march_rays-33.py311.nbi").touch()
+    assert not compiling.first_use()
 
 
 def test_a_change_in_another_file_is_compiled(tmp_path: Path) -> None:
