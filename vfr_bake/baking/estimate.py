@@ -32,8 +32,9 @@ its samples, 20 bytes each; of an object a third meets something, at about 10 sa
 and while they are put together they are there twice."""
 STORED_SHARE = 1.0
 """Cells that are stored for each that may hold matter, and the corners that they add."""
-CHANNEL_BYTES = 5
-"""Of a stored channel of a vertex: the float that learns, and the code that is played."""
+CHANNEL_BYTES = 6
+"""Of a stored channel of a cell, which has about 1.2 vertices: the float that learns, and the code that is
+played."""
 DENSITY_BYTES = 40
 """Of a density, of which each cell of the features has as many as finer cells."""
 REFINED_BY = 0.8

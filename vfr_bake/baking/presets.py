@@ -76,7 +76,10 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "feature_share": 1.0,
         "n_channels": 24,
         "channel_loss_db": 0.03,
+        "sample_loss_db": 0.02,
         "code_levels": 90,
+        "head_bands": 5,
+        "target_loss_db": 0.5,
     },
     "fast": {"refine_steps": 2500},
 }
