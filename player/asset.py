@@ -250,19 +250,20 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
-    """Both grids at the same time: what unpacks them leaves the interpreter to others."""
+    """Both grids at the same time: what unpacks them leaves the interpreter to others. Headers of .npy files
+    are read before, because Python 3.11 parses on one thread at a time."""
 
-    def grid(names: Names, *of_a_vertex: int) -> list[np.ndarray]:
-        coords_name, masks_name, codes_name = names
-        coords = _map_array(folder / _FILES[coords_name])
+    def grid(coords: np.ndarray, names: Names, *of_a_vertex: int) -> list[np.ndarray]:
+        _, masks_name, codes_name = names
         path = folder / _FILES[masks_name]
         masks = unpack_masks(path.read_bytes(), len(coords) if coords.ndim else 0, str(path))
         path, shape = folder / _FILES[codes_name], (int(np.bitwise_count(masks).sum()), *of_a_vertex)
         return [coords, masks, unpack_codes(path.read_bytes(), shape, _DTYPES[codes_name], str(path))]
 
+    of_densities, of_features = (_map_array(folder / _FILES[names[0]]) for names in (_DENSITIES, _FEATURES))
     with ThreadPoolExecutor(1) as other:
-        features = other.submit(grid, _FEATURES, manifest.n_channels)
-        densities = grid(_DENSITIES)
+        features = other.submit(grid, of_features, _FEATURES, manifest.n_channels)
+        densities = grid(of_densities, _DENSITIES)
         return GridArrays(*densities, *features.result())
 
 

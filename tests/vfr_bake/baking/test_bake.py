@@ -30,7 +30,7 @@ from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.lessons import Lessons, player_fetches
 from vfr_bake.baking.presets import PRESETS
 from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
-from vfr_bake.baking.refinement import HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, learn_head, refine
+from vfr_bake.baking.refinement import BATCH, HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, learn_head, refine
 from vfr_bake.baking.views import views_between
 from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
@@ -132,7 +132,8 @@ def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lesso
     )
 
 
-def test_refinement_brings_the_head_back_to_its_teacher() -> None:
+def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vfr_bake.baking.refinement.HEAD_BATCH", BATCH)  # to meet the same rays
     torch.manual_seed(0)
     head = Head(FieldConfig(n_levels=6, head_width=24))
     weights = fold_head(head, head.first_weights() * 0.02)
