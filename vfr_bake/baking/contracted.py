@@ -29,7 +29,7 @@ FASTEST_CELLS = 2.0
 """Cells between two samples of a ray where it is fastest in contracted space; where it is slowest two fifths
 of it."""
 RAYS_AT_ONCE = 1 << 14
-WEIGHT_FLOOR = 0.008
+WEIGHT_FLOOR = 0.01
 """Weight that a cell must have on some ray where none is asked for. Fox at 1088 cells loses nothing to it; it
 would have half again as many vertices with 0.003."""
 CELL_SHARE = 0.008

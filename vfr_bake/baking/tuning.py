@@ -93,7 +93,8 @@ class Tuning:
         if self._gained("refinement", before, after):
             stored = tuned
         else:
-            stored = replace(stored, features=played.astype(np.float32))
+            stored.features[:] = played
+            del grid
             grid = layout.grid(stored.density, stored.features)
         before = self._choose_lookups_and_bits(stored, grid, taught)
         if self.n_samples:
@@ -104,9 +105,9 @@ class Tuning:
             played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
             head = runner(tuned.head, self.ranges)
             after = self._held_out.measure("refined at k", grid, head, self.n_samples)
-            if not self._gained("refinement at k", before, after):
-                return replace(stored, features=played.astype(np.float32))
-            stored = tuned
+            if self._gained("refinement at k", before, after):
+                return tuned
+            stored.features[:] = played
         return stored
 
     @contextmanager
