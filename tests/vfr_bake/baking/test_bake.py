@@ -169,6 +169,26 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
     assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
 
 
+def test_a_round_that_gains_nothing_leaves_what_was_stored(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {
+        "resolution": 48,
+        "mesh_resolution": 16,
+        "check_views": 1,
+        "head_width": 0,
+        "head_bits": 32,
+        "k": 4,
+    }
+    bake(model, tmp_path / "as_it_is", BakeConfig(refine_steps=0, **small), quiet)
+    monkeypatch.setattr("vfr_bake.baking.tuning.Tuning._gained", lambda *_: False)
+    bake(model, tmp_path / "left_out", BakeConfig(refine_steps=20, **small), quiet)
+    one, other = (Asset.open(tmp_path / name).arrays for name in ("as_it_is", "left_out"))
+    assert np.array_equal(one.features, other.features) and np.array_equal(one.density, other.density)
+    heads = [(tmp_path / name / "head.onnx").read_bytes() for name in ("as_it_is", "left_out")]
+    assert heads[0] == heads[1]
+
+
 def test_a_round_takes_fewer_steps_where_there_is_no_time() -> None:
     told: list[tuple[int, int]] = []
     steps = Steps(100_000, lambda done, of: told.append((done, of)), seconds=0.5)
