@@ -104,8 +104,7 @@ def _here(asset: Asset, jobs: list[Job], settings: PlaySettings, _: str | None) 
     if not jobs:
         return
     with Renderer(asset, settings.threads, settings.march) as renderer:
-        if renderer.march == "numba":
-            say_first_use()
+        say_first_use(renderer.march)
         # compiles, or reads what was compiled before
         renderer.render(jobs[0].camera.resized(64, 64), settings.samples, settings.background)
         for index, job in enumerate(jobs):

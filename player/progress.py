@@ -36,11 +36,13 @@ class Bar:
         sys.stderr.flush()
 
 
-def say_first_use() -> None:
-    """On a terminal, why the first picture takes its time."""
-    from player.compiling import first_use  # numba, which is imported on another thread meanwhile
+def say_first_use(march: str) -> None:
+    """On a terminal, why the first picture of a compiled `march` takes its time."""
+    if march != "numba" or not sys.stderr.isatty():
+        return
+    from player.compiling import first_use  # imports numba, which is there by now
 
-    if sys.stderr.isatty() and first_use():
+    if first_use():
         sys.stderr.write("vfr-play: compiling for this processor: up to a minute, once\n")
 
 

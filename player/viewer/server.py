@@ -53,8 +53,7 @@ def serve(arguments: argparse.Namespace) -> None:
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
             sys.stdout.flush()
             sys.stderr.write(_advice(files, server.get_port()))
-            if renderers[0].march == "numba":
-                say_first_use()
+            say_first_use(renderers[0].march)
             forever = threading.Event()
             while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
                 pass

@@ -252,10 +252,11 @@ def test_progress_on_a_terminal(
         def isatty(self) -> bool:
             return True
 
-    monkeypatch.setattr(sys, "stderr", Terminal())
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("player.compiling.first_use", lambda: first)
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o"), "--frames", ":2"]) == 0
-    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    shown = terminal.getvalue()
     assert "frame 2/2" in shown and ("compiling for this processor" in shown) == first
 
 
