@@ -136,10 +136,10 @@ def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
 
 def _marks_bytes(model: Model, config: BakeConfig) -> float:
     """For each cell of the features' grid, while it is decided which are stored."""
-    if model.field.config.unbounded:
-        return 5 / BLOCK**3
-    n_floors = len(FLOORS) if config.weight_floor is None else 1
-    return 4 + (0 if config.no_cull else n_floors)
+    unbounded = model.field.config.unbounded
+    n_floors = len(FLOORS) if config.weight_floor is None and not unbounded else 1
+    n_bytes = 4 + (0 if config.no_cull else n_floors)
+    return n_bytes / BLOCK**3 if unbounded else n_bytes
 
 
 def _cells(model: Model, resolution: int) -> float:

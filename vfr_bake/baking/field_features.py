@@ -42,7 +42,8 @@ def _composed(
     points: np.ndarray,
     weights: np.ndarray,
 ) -> np.ndarray:
-    """[n, n_channels] of rays with `counts` [n] fetches at `points` [n_fetches, 3]."""
+    """[n, n_channels] of rays with `counts` [n] fetches at `points` [n_fetches, 3]. The kernel that composes
+    what is stored rounds it; these are no codes."""
     rows, shares = corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)
     met, where = np.unique(rows, return_inverse=True)
     at = unit_points(layout.features.index[met], layout.features.resolution, layout.contracted)

@@ -37,8 +37,8 @@ CODE_RATE = 0.25
 DENSITY_RATE = 1.0
 """The same of the density's codes."""
 DAMPING = 8.0
-"""Rays by which Adagrad's squares of a vertex begin: one that few rays meet would else move as far as the
-others, to suit those rays alone."""
+"""Times the mean that the first batch leaves at the vertices that it meets: where Adagrad's squares of all
+begin. A vertex that few rays meet would else move as far as the others, to suit those rays alone."""
 N_WARM, N_TIMED = 10, 40
 """Steps of a round that are not timed, because something may be compiled for the first time, and steps that
 are."""
@@ -132,6 +132,7 @@ def refine(
     adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
     for step in steps:
         falling = steps.falling(step)
+        moving = falling if step else 0.0  # what is stored waits for the squares of the first rays
         adam.param_groups[0]["lr"] = head_rate * falling
         some = random.integers(0, len(lessons), BATCH)
         fetches, of_grid = lessons.fetches(some), lessons.opacity[some]
@@ -159,17 +160,13 @@ def refine(
                 opacity.grad.numpy(), grid.density_low, grid.density_slope, fetches.lengths, density,
                 of_fetches,
             )  # fmt: skip
-            if step == 0:
-                descend_density(*of_densities, of_fetches, np.float32(0), n_parts, density, steep_density)
-                _damp(steep_density)
-            rate = np.float32(DENSITY_RATE * falling)
+            rate = np.float32(DENSITY_RATE * moving)
             descend_density(*of_densities, of_fetches, rate, n_parts, density, steep_density)
-        moved = features, steep
+        rate = np.float32(code_rate * moving)
+        descend(*where, fetches.weights, of_composed, rate, n_parts, features, steep)
         if step == 0:
-            descend(*where, fetches.weights, of_composed, np.float32(0), n_parts, *moved)
             _damp(steep)
-        rate = np.float32(code_rate * falling)
-        descend(*where, fetches.weights, of_composed, rate, n_parts, *moved)
+            _damp(steep_density)
     return Stored(head.weights(), features, density)
 
 

@@ -21,8 +21,6 @@ PLACES = 64
 MARGIN = 0.1
 """Of a picture of an unbounded scene, on every side: what the bake looks at beyond its border. Fox's held-out
 views see there, and what was not stored cost them a decibel and more."""
-
-
 ASIDE = 1.0
 """Of the way between two cameras: up to so far aside of it stand views of an unbounded scene. A held-out view
 of can, which stands that far from the others, lost 5 dB to cells that came into sight and were not stored."""
