@@ -39,6 +39,19 @@ class Sensor:
     """Focal length in pixels, from EXIF."""
 
 
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures that have something in common."""
+
+    i: int
+    j: int
+    """Numbers of the pictures, in the order of their names; i < j."""
+    matches: np.ndarray
+    """[n, 2] uint32, indices of features of i and of j."""
+    geometry: Any
+    """`pycolmap.TwoViewGeometry`: which of the matches agree with one geometry, and with which."""
+
+
 def pycolmap_module() -> Any:
     """pycolmap, silenced. Raises MissingExtraError."""
     try:
@@ -52,13 +65,15 @@ def pycolmap_module() -> Any:
     return pycolmap
 
 
-def write_pictures(
-    database: Path, names: Sequence[str], sensors: Sequence[Sensor], features: Sequence[Features]
-) -> list[int]:
-    """Put the pictures, their cameras and their features into a new COLMAP database.
-
-    Returns COLMAP's number of each picture. Pictures of the same `Sensor` share a camera.
-    """
+def write_database(
+    database: Path,
+    names: Sequence[str],
+    sensors: Sequence[Sensor],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+) -> None:
+    """Put the pictures, their cameras and features, and what the pairs have in common into a new COLMAP
+    database. Pictures of the same `Sensor` share a camera."""
     pycolmap = pycolmap_module()
     rigs: dict[Sensor, tuple[int, int]] = {}
     numbers = []
@@ -79,7 +94,9 @@ def write_pictures(
             db.write_frame(frame)
             db.write_keypoints(image.image_id, found.points.astype(np.float32))
             numbers.append(image.image_id)
-    return numbers
+        for pair in pairs:
+            db.write_matches(numbers[pair.i], numbers[pair.j], pair.matches)
+            db.write_two_view_geometry(numbers[pair.i], numbers[pair.j], pair.geometry)
 
 
 def colmap_camera(sensor: Sensor) -> Any:
@@ -97,43 +114,39 @@ def colmap_camera(sensor: Sensor) -> Any:
 
 
 def match_pictures(
-    database: Path,
-    numbers: Sequence[int],
     sensors: Sequence[Sensor],
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
     progress: Callable[[int, int], object],
-) -> None:
-    """Match the `pairs` (i, j) of pictures, keep what agrees with one geometry, and put it into the
-    database."""
+) -> list[Pair]:
+    """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry."""
     pycolmap = pycolmap_module()
     cameras = {sensor: colmap_camera(sensor) for sensor in set(sensors)}
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     options.min_num_inliers = MIN_MATCHES
 
-    def geometry(pair: tuple[int, int]) -> tuple[np.ndarray, Any]:
+    def geometry(pair: tuple[int, int]) -> Pair | None:
         i, j = pair
         matches = match(features[i].descriptors, features[j].descriptors)
         if len(matches) < MIN_MATCHES:
-            return matches, None
+            return None
         estimate = pycolmap.estimate_two_view_geometry(
             cameras[sensors[i]], features[i].points, cameras[sensors[j]], features[j].points, matches, options
         )
-        return matches, estimate
+        return Pair(i, j, matches, estimate) if len(estimate.inlier_matches) >= MIN_MATCHES else None
 
-    with closing(pycolmap.Database.open(database)) as db, ThreadPoolExecutor(n_threads()) as pool:
+    found = []
+    with ThreadPoolExecutor(n_threads()) as pool:
         futures = [pool.submit(geometry, pair) for pair in pairs]
         try:
-            for done, ((i, j), future) in enumerate(zip(pairs, futures, strict=True)):
-                matches, estimate = future.result()
-                if estimate is not None and len(estimate.inlier_matches) >= MIN_MATCHES:
-                    db.write_matches(numbers[i], numbers[j], matches)
-                    db.write_two_view_geometry(numbers[i], numbers[j], estimate)
+            for done, future in enumerate(futures):
+                found.append(future.result())
                 progress(done + 1, len(pairs))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    return [pair for pair in found if pair is not None]
 
 
 def map_pictures(

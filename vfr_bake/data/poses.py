@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,13 +17,15 @@ from player.errors import DataError, FormatError
 from player.files import new_folder
 from vfr_bake.data import video
 from vfr_bake.data.features import Features, find_features, pairs_to_match
+from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
 from vfr_bake.data.mapping import (
+    Pair,
     Sensor,
     map_pictures,
     match_pictures,
     n_threads,
     pycolmap_module,
-    write_pictures,
+    write_database,
 )
 from vfr_bake.data.pictures import read_picture
 
@@ -96,12 +99,14 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     `photos`: a folder with JPEG or PNG pictures in `images/` or in itself, or a video, whose frames are
     first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and left as it
     is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a video, then
-    `features`, `matches`, `cameras`), how much of it is done and how much there is.
+    `features`, `matches`, `cameras`; where those are folded also `walk`, `turns`, `cameras again`), how much
+    of it is done and how much there is.
 
     Pictures of one size, and of one maker, model and focal length where EXIF tells, share one camera (model
     RADIAL), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
-    do not tell them. A subject that looks the same from two sides may be folded into one, as if walked around
-    half: nothing here tells, and surroundings in the pictures prevent it.
+    do not tell them. A subject that looks the same from two sides is folded into one, as if walked around
+    half, where nothing but it is matched. Pictures of one walk, named in its order, are unfolded
+    (`vfr_bake.data.folds`); pictures in no order are not, unless their surroundings prevent it.
 
     Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
     `sparse/0`), OutputError, MissingExtraError.
@@ -122,22 +127,10 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
         )
     pycolmap_module()  # said at once if it is missing, not after minutes
     sensors, features = _look_at(pictures, photos, lambda done, of: progress("features", done, of))
-    with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
-        work = Path(name)
-        database = work / "database.db"
-        names = [path.name for path in pictures]
-        numbers = write_pictures(database, names, sensors, features)
-        pairs = pairs_to_match(features)
-        match_pictures(
-            database, numbers, sensors, features, pairs, lambda done, of: progress("matches", done, of)
-        )
-        result = map_pictures(
-            database,
-            pictures[0].parent,
-            work,
-            len(pictures),
-            lambda done, of: progress("cameras", done, of),
-        )
+    pairs = match_pictures(
+        sensors, features, pairs_to_match(features), lambda done, of: progress("matches", done, of)
+    )
+    result = _placed(pictures, sensors, features, pairs, progress)
     n_registered = result.num_reg_images() if result is not None else 0
     if result is None or n_registered < _n_needed(len(pictures)):
         raise DataError(
@@ -147,6 +140,38 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     with new_folder(model) as new:
         result.write_binary(str(new))
     return _read_report(model, photos, len(pictures))
+
+
+def _placed(
+    pictures: Sequence[Path],
+    sensors: Sequence[Sensor],
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    progress: Progress,
+) -> Any:
+    """The `pycolmap.Reconstruction` of the pictures, or None; if that is folded, one that is not."""
+    names = [path.name for path in pictures]
+
+    def place(some: Sequence[Pair], stage: str) -> Any:
+        with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
+            database = Path(name) / "database.db"
+            write_database(database, names, sensors, features, some)
+            return map_pictures(
+                database, pictures[0].parent, Path(name), len(names), lambda *n: progress(stage, *n)
+            )
+
+    def n_torn(model: Any) -> int:
+        return len(torn_neighbours(model, names, pairs))
+
+    model = place(pairs, "cameras")
+    if model is None or not n_torn(model):
+        return model
+    walk = place(near_pairs(pairs), "walk")
+    if walk is None or walk.num_reg_images() < _n_needed(len(names)) or n_torn(walk) >= n_torn(model):
+        return model  # no walk
+    agreeing = agreeing_pairs(walk, names, features, pairs, lambda *n: progress("turns", *n))
+    closed = place(agreeing, "cameras again")
+    return closed if closed is not None and n_torn(closed) <= n_torn(walk) else walk
 
 
 def _pictures(folder: Path) -> list[Path]:
