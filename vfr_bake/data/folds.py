@@ -63,7 +63,7 @@ def agreeing_pairs(
     """The near pairs, and those of the others whose turn is the one that `walk`, the model of the near ones,
     has: where it comes by again."""
     pycolmap = pycolmap_module()
-    images = {image.name: image for image in walk.images.values() if image.has_pose}
+    images: dict[str, Any] = {image.name: image for image in walk.images.values() if image.has_pose}
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     options.compute_relative_pose = True
@@ -71,9 +71,9 @@ def agreeing_pairs(
     def agrees(pair: Pair) -> bool:
         if pair.j - pair.i <= N_NEIGHBOURS:
             return True
-        ends = [images.get(names[number]) for number in (pair.i, pair.j)]
-        if None in ends:
+        if names[pair.i] not in images or names[pair.j] not in images:
             return False
+        ends = [images[names[number]] for number in (pair.i, pair.j)]
         cameras = [walk.camera(image.camera_id) for image in ends]
         own = pycolmap.estimate_calibrated_two_view_geometry(
             cameras[0], features[pair.i].points, cameras[1], features[pair.j].points,
