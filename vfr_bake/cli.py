@@ -94,6 +94,8 @@ def _train(options: Any) -> int:
     data = processes.in_turn(lambda: _with_cameras(options.data))
     with Bar("reading pictures", processes.first) as bar:
         scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
+    if processes.first:
+        _warn_of_folds(scene)
     trainer = Trainer(scene, config, processes)
     checkpoint = checkpoint_path(options.model)
     if options.resume and checkpoint.exists():
@@ -125,6 +127,23 @@ def _with_cameras(data: str) -> str:
         report = estimate_cameras(Path(data), bars.count)
     print(f"vfr-train: {report.summary()}", file=sys.stderr)
     return str(report.folder)
+
+
+def _warn_of_folds(scene: Scene) -> None:
+    from vfr_bake.data.folds import torn_views
+
+    try:
+        torn = torn_views(scene.train)
+    except MissingExtraError:
+        return
+    if torn:
+        named = ", ".join(f"{first} and {second}" for first, second in torn)
+        print(
+            f"vfr-train: {scene.name}: {named} match, but their cameras are far apart: the subject seems to "
+            "look the same from several sides, and its cameras are folded. Train on a folder of the pictures "
+            "alone to have the cameras estimated anew",
+            file=sys.stderr,
+        )
 
 
 def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:

@@ -29,7 +29,8 @@ class Turns:
 
     def __init__(self, scene: Scene, compositing: Compositing, options: argparse.Namespace) -> None:
         field = FieldOptions(compositing=compositing)
-        settings = {} if options.batch_samples is None else {"batch_samples": options.batch_samples}
+        given = {name: getattr(options, name) for name in ("batch_samples", "batch_rays", "step_cells")}
+        settings = {name: value for name, value in given.items() if value is not None}
         self.trainer = Trainer(scene, TrainConfig(minutes=options.minutes, field=field, **settings))
         self.seconds, self.done = 0.0, False
 
@@ -49,7 +50,9 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--downscale", type=int, default=1)
-    parser.add_argument("--batch-samples", type=int, default=None)
+    parser.add_argument("--batch-samples", type=int, help="objects: samples in a batch")
+    parser.add_argument("--batch-rays", type=int, help="unbounded scenes: rays in a batch")
+    parser.add_argument("--step-cells", type=float, help="objects: length of a march step, in cells")
     parser.add_argument("--views", type=int, default=25)
     options = parser.parse_args()
     scene = load_scene(options.data, downscale=options.downscale)

@@ -304,6 +304,17 @@ def test_photographs_without_cameras_have_them_estimated(
     assert calls == [photos]
 
 
+def test_cameras_that_are_folded_are_told_of(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which are is tested where they are found."""
+    monkeypatch.setattr("vfr_bake.data.folds.torn_views", lambda _: [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")])
+    steps = ["--steps", "1", "--eval-views", "0"]
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), *steps]) == 0
+    said = capsys.readouterr().err
+    assert "a.jpg and b.jpg, c.jpg and d.jpg match" in said and "the pictures alone" in said
+
+
 def test_a_disk_that_fills_in_a_temporary_folder_is_one_line(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from vfr_bake.data.features import N_NEIGHBOURS, Features
-from vfr_bake.data.mapping import Pair, n_threads, pycolmap_module
+from player.cameras import Camera
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
+from vfr_bake.data.mapping import MIN_MATCHES, Pair, n_threads, pycolmap_module
 
 MIN_KEPT = 0.1
 """Of the matches of two pictures that follow each other, a model keeps more than half as points that both see
@@ -25,6 +28,10 @@ MAX_TURN = 30.0
 """Degrees between what a pair's own geometry says of the turn and what the walk does. Walks drift, and two
 views of a plane are off by some 10 degrees: of can's pairs that are a lap apart nine in ten are within it,
 and those of opposite sides are off by 90 to 180."""
+
+WALK_TURN, LEAP_TURN = 20.0, 60.0
+"""Degrees: pictures are a walk if half of them turn by less than the first from one to the next, and leap
+where one turns by more than the second."""
 
 
 def torn_neighbours(model: Any, names: Sequence[str], pairs: Sequence[Pair]) -> list[tuple[int, int]]:
@@ -62,11 +69,7 @@ def agreeing_pairs(
 ) -> list[Pair]:
     """The near pairs, and those of the others whose turn is the one that `walk`, the model of the near ones,
     has: where it comes by again."""
-    pycolmap = pycolmap_module()
     images: dict[str, Any] = {image.name: image for image in walk.images.values() if image.has_pose}
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    options.compute_relative_pose = True
 
     def agrees(pair: Pair) -> bool:
         if pair.j - pair.i <= N_NEIGHBOURS:
@@ -75,15 +78,10 @@ def agreeing_pairs(
             return False
         ends = [images[names[number]] for number in (pair.i, pair.j)]
         cameras = [walk.camera(image.camera_id) for image in ends]
-        own = pycolmap.estimate_calibrated_two_view_geometry(
-            cameras[0], features[pair.i].points, cameras[1], features[pair.j].points,
-            pair.geometry.inlier_matches, options,
-        )  # fmt: skip
-        if own.cam2_from_cam1 is None:
-            return False
+        points = (features[pair.i].points, features[pair.j].points)
+        own = _own_turn(cameras, points, pair.geometry.inlier_matches)
         first, second = (image.cam_from_world().rotation.matrix() for image in ends)
-        cosine = (np.trace(own.cam2_from_cam1.rotation.matrix() @ first @ second.T) - 1) / 2
-        return bool(cosine > np.cos(np.radians(MAX_TURN)))
+        return own is not None and _angle(own @ first @ second.T) < MAX_TURN
 
     agreeing = []
     with ThreadPoolExecutor(n_threads()) as pool:
@@ -97,3 +95,54 @@ def agreeing_pairs(
             pool.shutdown(cancel_futures=True)
             raise
     return agreeing
+
+
+def torn_views(views: PosedImages) -> list[tuple[str, str]]:
+    """Names of neighbours in a walk whose given cameras leap apart, and which match as if they did not.
+
+    A hint that the cameras were estimated elsewhere and are folded; needs OpenCV and pycolmap only where
+    cameras leap. Raises MissingExtraError.
+    """
+    # OpenCV's axes: y down, z ahead.
+    rotations = [np.diag([1.0, -1, -1]) @ camera.c2w[:3, :3].T for camera in views.cameras]
+    turns = [after @ before.T for before, after in pairwise(rotations)]
+    angles = np.array([_angle(turn) for turn in turns])
+    if len(angles) == 0 or np.median(angles) > WALK_TURN:
+        return []
+    torn = []
+    for i in np.flatnonzero(angles > LEAP_TURN):
+        ends = views.cameras[i : i + 2]
+        found = [find_features(image) for image in views.images[i : i + 2]]
+        matches = match(found[0].descriptors, found[1].descriptors)
+        if len(matches) < MIN_MATCHES:
+            continue
+        own = _own_turn([_pinhole(camera) for camera in ends], [each.points for each in found], matches)
+        if own is not None and _angle(own) < LEAP_TURN and _angle(own @ turns[i].T) > MAX_TURN:
+            torn.append((ends[0].name, ends[1].name))
+    return torn
+
+
+def _pinhole(camera: Camera) -> Any:
+    params = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return pycolmap_module().Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
+
+
+def _own_turn(cameras: Sequence[Any], points: Sequence[np.ndarray], matches: np.ndarray) -> np.ndarray | None:
+    """[3, 3] rotation from the first to the second of two `pycolmap.Camera`s that most matches of their
+    `points` agree with; None if too few agree with any."""
+    pycolmap = pycolmap_module()
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    options.min_num_inliers = MIN_MATCHES
+    options.compute_relative_pose = True
+    own = pycolmap.estimate_calibrated_two_view_geometry(
+        cameras[0], points[0], cameras[1], points[1], matches, options
+    )
+    if own.cam2_from_cam1 is None or len(own.inlier_matches) < MIN_MATCHES:
+        return None
+    return own.cam2_from_cam1.rotation.matrix()
+
+
+def _angle(rotation: np.ndarray) -> float:
+    """Degrees."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

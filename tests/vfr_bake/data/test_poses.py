@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError
-from vfr_bake.data import folds, mapping, poses, video
+from vfr_bake.data import folds, load_scene, mapping, poses, video
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
 
@@ -122,6 +122,14 @@ def test_a_label_on_both_sides_does_not_fold_the_walk(tmp_path: Path, monkeypatc
     turned = np.einsum("ij,ij->i", np.cross(ahead[:-1], ahead[1:]), np.tile(up, (70, 1))) / np.linalg.norm(up)
     angles = np.degrees(np.arctan2(turned, np.einsum("ij,ij->i", ahead[:-1], ahead[1:])))
     assert 520 < abs(angles.sum()) < 570
+
+
+def test_given_cameras_that_are_folded_are_told_from_those_that_are_not():
+    """Can's were estimated without this; fox's camera leaps ten steps once, without a turn."""
+    scene = load_scene(real_pictures("can"), downscale=2)
+    torn = [("0013.jpg", "0014.jpg"), ("0034.jpg", "0035.jpg"), ("0052.jpg", "0053.jpg")]
+    assert folds.torn_views(scene.train) == torn
+    assert folds.torn_views(load_scene(real_pictures("fox"), downscale=4).train) == []
 
 
 def test_what_is_torn_in_the_walk_as_well_is_left_as_it_is(
