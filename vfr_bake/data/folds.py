@@ -10,7 +10,6 @@ turned. Pairs whose own geometry says something else are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +18,8 @@ import numpy as np
 from player.cameras import Camera
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
-from vfr_bake.data.mapping import MIN_MATCHES, Pair, n_threads, pycolmap_module
+from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module
+from vfr_bake.data.threads import in_threads
 
 MIN_KEPT = 0.1
 """Of the matches of two pictures that follow each other, a model keeps more than half as points that both see
@@ -28,7 +28,6 @@ MAX_TURN = 30.0
 """Degrees between what a pair's own geometry says of the turn and what the walk does. Walks drift, and two
 views of a plane are off by some 10 degrees: of can's pairs that are a lap apart nine in ten are within it,
 and those of opposite sides are off by 90 to 180."""
-
 WALK_TURN, LEAP_TURN = 20.0, 60.0
 """Degrees: pictures are a walk if half of them turn by less than the first from one to the next, and leap
 where one turns by more than the second."""
@@ -83,18 +82,8 @@ def agreeing_pairs(
         first, second = (image.cam_from_world().rotation.matrix() for image in ends)
         return own is not None and _angle(own @ first @ second.T) < MAX_TURN
 
-    agreeing = []
-    with ThreadPoolExecutor(n_threads()) as pool:
-        futures = [pool.submit(agrees, pair) for pair in pairs]
-        try:
-            for done, (pair, future) in enumerate(zip(pairs, futures, strict=True)):
-                if future.result():
-                    agreeing.append(pair)
-                progress(done + 1, len(pairs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return agreeing
+    agreeing = in_threads(agrees, pairs, progress)
+    return [pair for pair, agreed in zip(pairs, agreeing, strict=True) if agreed]
 
 
 def torn_views(views: PosedImages) -> list[tuple[str, str]]:

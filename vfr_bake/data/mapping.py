@@ -7,7 +7,6 @@ takes the process down on some it does not know.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +20,7 @@ import numpy as np
 
 from player.errors import MissingExtraError
 from vfr_bake.data.features import Features, match
+from vfr_bake.data.threads import in_threads, n_threads
 
 MIN_MATCHES = 15
 MIN_FOR_PRINCIPAL_POINT = 20
@@ -136,17 +136,7 @@ def match_pictures(
         )
         return Pair(i, j, matches, estimate) if len(estimate.inlier_matches) >= MIN_MATCHES else None
 
-    found = []
-    with ThreadPoolExecutor(n_threads()) as pool:
-        futures = [pool.submit(geometry, pair) for pair in pairs]
-        try:
-            for done, future in enumerate(futures):
-                found.append(future.result())
-                progress(done + 1, len(pairs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return [pair for pair in found if pair is not None]
+    return [pair for pair in in_threads(geometry, pairs, progress) if pair is not None]
 
 
 def map_pictures(
@@ -221,8 +211,3 @@ def _refine_principal_points(model: Any) -> None:
     # Not `pycolmap.bundle_adjustment`, which writes to stderr whatever the log level.
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
-
-
-def n_threads() -> int:
-    """As many as there are cores, up to eight: each holds a block of products and a decoded picture."""
-    return min(8, os.cpu_count() or 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,11 @@ from vfr_bake.data.mapping import (
     Sensor,
     map_pictures,
     match_pictures,
-    n_threads,
     pycolmap_module,
     write_database,
 )
 from vfr_bake.data.pictures import read_picture
+from vfr_bake.data.threads import in_threads
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -163,15 +162,18 @@ def _placed(
     def n_torn(model: Any) -> int:
         return len(torn_neighbours(model, names, pairs))
 
+    def enough(model: Any) -> bool:
+        return model is not None and model.num_reg_images() >= _n_needed(len(names))
+
     model = place(pairs, "cameras")
     if model is None or not n_torn(model):
         return model
     walk = place(near_pairs(pairs), "walk")
-    if walk is None or walk.num_reg_images() < _n_needed(len(names)) or n_torn(walk) >= n_torn(model):
+    if not enough(walk) or n_torn(walk) >= n_torn(model):
         return model  # no walk
     agreeing = agreeing_pairs(walk, names, features, pairs, lambda *n: progress("turns", *n))
     closed = place(agreeing, "cameras again")
-    return closed if closed is not None and n_torn(closed) <= n_torn(walk) else walk
+    return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -211,16 +213,7 @@ def _look_at(
         thumbnail = np.asarray(Image.fromarray(rgba).convert("L").resize((32, 32), Image.Resampling.BOX))
         return _sensor(path, rgba.shape[1], rgba.shape[0]), find_features(rgba), thumbnail.astype(np.float64)
 
-    looks = []
-    with ThreadPoolExecutor(n_threads()) as pool:
-        futures = [pool.submit(look, path) for path in pictures]
-        try:
-            for done, future in enumerate(futures):
-                looks.append(future.result())
-                progress(done + 1, len(pictures))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    looks = in_threads(look, pictures, progress)
     sensors, features, thumbnails = (list(column) for column in zip(*looks, strict=True))
     n_good = sum(len(found.points) >= MIN_FEATURES for found in features)
     if n_good < _n_needed(len(pictures)):
