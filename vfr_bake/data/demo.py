@@ -11,9 +11,7 @@ Vectors in that frame are stored component first, [3, n].
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -38,6 +36,7 @@ from vfr_bake.data.demo_solids import (
     scene_distance,
 )
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.data.threads import in_threads
 
 __all__ = [
     "AABB",
@@ -148,12 +147,11 @@ def demo_views(
     train = demo_cameras(size, n_train)
     test = demo_cameras(size, n_test, phase=0.5, prefix="./test/r_")
     cameras = train + test
-    images = []
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        for index, (rgba, _) in enumerate(pool.map(trace, cameras)):
-            images.append((rgba * 255 + 0.5).astype(np.uint8))
-            if progress is not None:
-                progress(index + 1, len(cameras))
+
+    def picture(camera: Camera) -> np.ndarray:
+        return (trace(camera)[0] * 255 + 0.5).astype(np.uint8)
+
+    images = in_threads(picture, cameras, progress or (lambda *_: None))
     return PosedImages(train, images[:n_train]), PosedImages(test, images[n_train:])
 
 

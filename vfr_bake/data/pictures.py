@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from PIL import Image
 from player.cameras import Camera
 from player.errors import DataError, MissingExtraError
 from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.threads import in_threads
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -29,7 +28,6 @@ def read_pictures(
     A camera that speaks of another size than its picture has is scaled to it. `distortions`: keyword
     arguments of `undistort`. Raises DataError.
     """
-    results: list[tuple[Camera, np.ndarray]] = []
 
     def load(index: int) -> tuple[Camera, np.ndarray]:
         image = read_picture(paths[index])
@@ -38,15 +36,7 @@ def read_pictures(
             image = undistort(image, camera, **distortions[index])
         return camera, image
 
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        futures = [pool.submit(load, index) for index in range(len(paths))]
-        try:
-            for future in futures:
-                results.append(future.result())
-                count(None)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    results = in_threads(load, range(len(paths)), lambda *_: count(None))
     return PosedImages([camera for camera, _ in results], [image for _, image in results])
 
 
