@@ -54,7 +54,7 @@ COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
 | `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
 | `n_channels` | integer, 1..1024 | |
-| `background` | 3 numbers, 0..1 | what the field was trained on |
+| `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
 | `colour_space` | "srgb" | |
 | `view_size` | 2 integers | width and height of the training pictures |
 | `files` | object | name: {`bytes`: integer, `sha256`: 64 hexadecimal digits}, every file but the manifest |

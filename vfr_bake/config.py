@@ -199,7 +199,7 @@ class TrainConfig:
     paper. Training ends here or when the minutes are over."""
     minutes: float | None = None
     """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
-    further. CPU: objects 9.25, scenes 12; GPU: no limit."""
+    further. CPU: objects 9.4, scenes 12; GPU: no limit."""
     batch_samples: int | None = None
     """Objects: samples along rays in a batch; GPU 262,144, CPU 4,096, because the time of a CPU step
     grows with it, and many small steps teach more than few large ones: the same 25 million samples gave lego

@@ -24,7 +24,7 @@ DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
 SHARE = 32
-"""An update looks at one cell in this many at random; the others are left to the rays that pass. With 64,
+"""An update looks at one cell in this many, at random; the others are left to the rays that pass. With 64,
 matter that appears in a cell that counts as empty is found too late (lego after 1,200 steps: 1.0 dB less);
 with 8, more cells stay occupied, and a batch of so many samples holds fewer rays (0.9 dB less)."""
 
@@ -58,7 +58,9 @@ class OccupancyGrid:
             cells = np.arange(n_cells)
             flat[:] = 0
         else:
-            cells = np.unique(self._random.integers(0, n_cells, n_cells // SHARE))
+            # One of every stretch of so many: ascending, as memory likes it, without being sorted.
+            first = np.arange(0, n_cells, SHARE)
+            cells = np.minimum(first + self._random.integers(0, SHARE, len(first)), n_cells - 1)
         flat *= DECAY
         flat[cells] = np.maximum(flat[cells], self._sample(field, cells))
         self.n_updates += 1

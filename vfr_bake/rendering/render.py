@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,8 @@ from vfr_bake.rendering.samples import Samples
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
+SMALL = 24
+"""Pixels along the side of a picture that only its mean is wanted of."""
 RAY_CHUNK = 1024
 """Rays whose samples are held at once where the head is evaluated at each of them."""
 
@@ -49,6 +52,13 @@ def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: 
     colours, opacity = render(field, sampler, rays_o, rays_d)
     rgb = colours + (1 - opacity[:, None]) * background.astype(np.float32)
     return rgb.reshape(camera.height, camera.width, 3)
+
+
+def mean_colour(field: VfrField, sampler: Sampler, cameras: Sequence[Camera]) -> np.ndarray:
+    """[3] mean of the colours that `cameras`, model frame, see, from a small picture of each."""
+    small = [camera.resized(SMALL, SMALL) for camera in cameras]
+    pictures = [render_image(field, sampler, camera, np.zeros(3)) for camera in small]
+    return np.mean(pictures, axis=(0, 1, 2))
 
 
 def _colours_of_features(

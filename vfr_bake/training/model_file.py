@@ -11,6 +11,7 @@ resolution; that of an unbounded scene its proposals: near (model units), state 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,13 @@ from vfr_bake.config import field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
+from vfr_bake.rendering.render import mean_colour
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
 
 FORMAT = "vfr-model"
 VERSION = (2, 0)
+N_MEAN_VIEWS = 16
+"""As many cameras tell the mean colour of what all see."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +61,15 @@ class Model:
             raise ConfigError("model: sampler: expected an object's occupancy grid, got a scene's proposals")
         return self.sampler
 
-    @property
+    @cached_property
     def background(self) -> np.ndarray:
-        """[3] default background: white, as NeRF-synthetic is compared."""
-        return np.ones(3, np.float32)
+        """[3] default background, sRGB: white, as NeRF-synthetic is compared; of surroundings without end the
+        mean of what their cameras see, for what is missing there is a hole in a wall and no white."""
+        if self.has_alpha or not self.field.config.unbounded:
+            return np.ones(3, np.float32)
+        some = self.model_cameras()[:: max(1, len(self.cameras) // N_MEAN_VIEWS)]
+        seen = mean_colour(self.field, self.sampler, some)
+        return (np.round(255 * seen) / 255).astype(np.float32)
 
     def model_cameras(self) -> list[Camera]:
         """The training cameras in the model frame."""

@@ -38,7 +38,7 @@ from vfr_bake.training.optimiser import (
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, Pixels, PixelSampler
 
-MINUTES = {False: 9.25, True: 12.0}
+MINUTES = {False: 9.4, True: 12.0}
 """Training time on a CPU by whether the scene is unbounded, where none is asked for."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""

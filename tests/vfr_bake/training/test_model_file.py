@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from player.errors import FormatError, VersionError
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model, load_model, save_model
 
 CONFIG = FieldConfig(n_levels=2, base_resolution=4, max_resolution=8, log2_table_size=10, head_width=8)
@@ -53,6 +56,26 @@ def test_round_trip(model: Model, saved: Path) -> None:
     assert np.array_equal(model.world_from_model, again.world_from_model)
     assert [c.name for c in again.cameras] == ["./train/r_0"] and again.cameras[0].fx == 9
     assert (again.train, again.figures, again.occupancy.step) == ({"steps": 3}, {"test_psnr": 30.0}, 0.01)
+
+
+def test_what_lies_behind_surroundings_is_their_mean_colour(model: Model) -> None:
+    """Every ray of an unbounded field meets something; here a fog, each of whose directions has a colour."""
+    field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
+    with torch.no_grad():
+        field.grid.table.fill_(1.0)
+        field.density.out.bias.fill_(8.0)
+        for layer in (field.head.spatial[0], field.head.spatial[1], field.head.directional[0]):
+            layer.weight.mul_(3)
+    camera = Camera("a", np.eye(4), 48, 24, 12.0, 12.0, 24.0, 12.0)
+    surroundings = replace(
+        model, field=field, sampler=ProposalSampler(0.1), world_from_model=np.eye(4), cameras=[camera] * 40,
+        has_alpha=False,
+    )  # fmt: skip
+    picture = render_image(field, surroundings.sampler, camera, np.ones(3))
+    assert np.ptp(picture, axis=(0, 1)).max() > 0.01 and np.ptp(picture.mean(axis=(0, 1))) > 0.01
+    np.testing.assert_allclose(surroundings.background, picture.mean(axis=(0, 1)), atol=0.01)
+    assert replace(surroundings, has_alpha=True).background.tolist() == [1, 1, 1]
+    assert model.background.tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize("content", [b"", b"not a model", pickle.dumps({"format": "vfr-model"})])
