@@ -29,7 +29,7 @@ class Turns:
 
     def __init__(self, scene: Scene, compositing: Compositing, options: argparse.Namespace) -> None:
         field = FieldOptions(compositing=compositing)
-        given = {name: getattr(options, name) for name in ("batch_samples", "batch_rays", "step_cells")}
+        given = {name: getattr(options, name) for name in ("batch_samples", "step_cells")}
         settings = {name: value for name, value in given.items() if value is not None}
         self.trainer = Trainer(scene, TrainConfig(minutes=options.minutes, field=field, **settings))
         self.seconds, self.done = 0.0, False
@@ -51,7 +51,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=4.0)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--batch-samples", type=int, help="objects: samples in a batch")
-    parser.add_argument("--batch-rays", type=int, help="unbounded scenes: rays in a batch")
     parser.add_argument("--step-cells", type=float, help="objects: length of a march step, in cells")
     parser.add_argument("--views", type=int, default=25)
     options = parser.parse_args()
