@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError
-from vfr_bake.data import folds, load_scene, mapping, poses, video
+from vfr_bake.data import mapping, poses, video
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
 
@@ -93,54 +93,6 @@ def test_the_cameras_are_those_that_are_known(can):
     for turn in turns:
         assert np.degrees(np.arccos(min(1, (np.trace(turn.T @ u @ vt) - 1) / 2))) < 1
     assert report.n_pictures == report.n_registered == N_CAN and report.folder == folder
-
-
-def test_a_label_on_both_sides_does_not_fold_the_walk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """All pictures of the can, one and a half times around it: matched alone, its two sides are taken for
-    one, as they are in the cameras that come with the pictures."""
-    for path in sorted((real_pictures("can") / "images").iterdir()):
-        with Image.open(path) as file:
-            file.reduce(2).save(tmp_path / path.name, quality=95)
-    torn: list[int] = []
-
-    def counted(*arguments):
-        torn.append(len(found := folds.torn_neighbours(*arguments)))
-        return found
-
-    monkeypatch.setattr(poses, "torn_neighbours", counted)
-    stages: list[str] = []
-    report = estimate_cameras(tmp_path, lambda stage, done, of: stages.append(stage))
-    assert list(dict.fromkeys(stages)) == ["features", "matches", "cameras", "walk", "turns", "cameras again"]
-    assert torn[0] > 0 == torn[-1]
-    assert report.n_registered == report.n_pictures == 71 and report.mean_error < 1
-    places, rotations = centres(tmp_path / "sparse" / "0")
-    steps = np.linalg.norm(np.diff([places[name] for name in sorted(places)], axis=0), axis=1)
-    assert steps.max() < 3 * np.median(steps)  # folded, 8 to 16 times
-    up = -np.mean([rotation[1] for rotation in rotations.values()], axis=0)
-    ahead = np.array([rotations[name][2] for name in sorted(rotations)])
-    ahead -= np.outer(ahead @ up, up) / (up @ up)
-    turned = np.einsum("ij,ij->i", np.cross(ahead[:-1], ahead[1:]), np.tile(up, (70, 1))) / np.linalg.norm(up)
-    angles = np.degrees(np.arctan2(turned, np.einsum("ij,ij->i", ahead[:-1], ahead[1:])))
-    assert 520 < abs(angles.sum()) < 570
-
-
-def test_given_cameras_that_are_folded_are_told_from_those_that_are_not():
-    """Can's were estimated without this; fox's camera leaps ten steps once, without a turn."""
-    scene = load_scene(real_pictures("can"), downscale=2)
-    torn = [("0013.jpg", "0014.jpg"), ("0034.jpg", "0035.jpg"), ("0052.jpg", "0053.jpg")]
-    assert folds.torn_views(scene.train) == torn
-    assert folds.torn_views(load_scene(real_pictures("fox"), downscale=4).train) == []
-
-
-def test_what_is_torn_in_the_walk_as_well_is_left_as_it_is(
-    can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    for path in sorted(can[0].glob("*.jpg"))[:5]:
-        shutil.copy(path, tmp_path)
-    monkeypatch.setattr(poses, "torn_neighbours", lambda *_: [(0, 1)])
-    stages: list[str] = []
-    report = estimate_cameras(tmp_path, lambda stage, done, of: stages.append(stage))
-    assert stages[-1] == "walk" and report.n_registered == 5
 
 
 def test_the_report_is_what_colmap_says_of_its_model(can):
