@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from player.cameras import Camera
+from player.colmap import OPENGL_FROM_OPENCV
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
-from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module
+from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_options
 from vfr_bake.data.threads import in_threads
 
 MIN_KEPT = 0.1
@@ -56,7 +57,11 @@ def torn_neighbours(model: Any, names: Sequence[str], pairs: Sequence[Pair]) -> 
 
 def near_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     """The pairs of pictures that (nearly) follow each other."""
-    return [pair for pair in pairs if pair.j - pair.i <= N_NEIGHBOURS]
+    return [pair for pair in pairs if _is_near(pair)]
+
+
+def _is_near(pair: Pair) -> bool:
+    return pair.j - pair.i <= N_NEIGHBOURS
 
 
 def agreeing_pairs(
@@ -71,7 +76,7 @@ def agreeing_pairs(
     images: dict[str, Any] = {image.name: image for image in walk.images.values() if image.has_pose}
 
     def agrees(pair: Pair) -> bool:
-        if pair.j - pair.i <= N_NEIGHBOURS:
+        if _is_near(pair):
             return True
         if names[pair.i] not in images or names[pair.j] not in images:
             return False
@@ -92,8 +97,8 @@ def torn_views(views: PosedImages) -> list[tuple[str, str]]:
     A hint that the cameras were estimated elsewhere and are folded; needs OpenCV and pycolmap only where
     cameras leap. Raises MissingExtraError.
     """
-    # OpenCV's axes: y down, z ahead.
-    rotations = [np.diag([1.0, -1, -1]) @ camera.c2w[:3, :3].T for camera in views.cameras]
+    opencv_from_opengl = OPENGL_FROM_OPENCV[:3, :3].T
+    rotations = [opencv_from_opengl @ camera.c2w[:3, :3].T for camera in views.cameras]
     turns = [after @ before.T for before, after in pairwise(rotations)]
     angles = np.array([_angle(turn) for turn in turns])
     if len(angles) == 0 or np.median(angles) > WALK_TURN:
@@ -119,12 +124,9 @@ def _pinhole(camera: Camera) -> Any:
 def _own_turn(cameras: Sequence[Any], points: Sequence[np.ndarray], matches: np.ndarray) -> np.ndarray | None:
     """[3, 3] rotation from the first to the second of two `pycolmap.Camera`s that most matches of their
     `points` agree with; None if too few agree with any."""
-    pycolmap = pycolmap_module()
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    options.min_num_inliers = MIN_MATCHES
+    options = two_view_options()
     options.compute_relative_pose = True
-    own = pycolmap.estimate_calibrated_two_view_geometry(
+    own = pycolmap_module().estimate_calibrated_two_view_geometry(
         cameras[0], points[0], cameras[1], points[1], matches, options
     )
     if own.cam2_from_cam1 is None or len(own.inlier_matches) < MIN_MATCHES:

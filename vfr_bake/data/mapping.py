@@ -113,6 +113,14 @@ def colmap_camera(sensor: Sensor) -> Any:
     return camera
 
 
+def two_view_options() -> Any:
+    """What the geometry of a pair is estimated with: the same in every run."""
+    options = pycolmap_module().TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    options.min_num_inliers = MIN_MATCHES
+    return options
+
+
 def match_pictures(
     sensors: Sequence[Sensor],
     features: Sequence[Features],
@@ -122,9 +130,7 @@ def match_pictures(
     """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry."""
     pycolmap = pycolmap_module()
     cameras = {sensor: colmap_camera(sensor) for sensor in set(sensors)}
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = 0
-    options.min_num_inliers = MIN_MATCHES
+    options = two_view_options()
 
     def geometry(pair: tuple[int, int]) -> Pair | None:
         i, j = pair
