@@ -1,12 +1,17 @@
-"""What the tests and the examples in docstrings share: a small asset, to be opened as "out/" in the
-latter."""
+"""What the tests and the examples in docstrings share: guarded arrays, and a small asset, to be opened as
+"out/" in the latter."""
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
 import pytest
+
+# Before player is imported, here and in every process that a test starts: compiled code that writes beside
+# its arrays is found out (`player.scratch`).
+os.environ["VFR_CANARIES"] = "1"
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,11 @@ import numpy as np
 
 from player.compiling import compiled, inlined
 from player.contracted_rays import MAX_SPEED, MIN_COS, enter_space, lattice
-from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, take_hits
+from player.grid_compiled import LANES, add_fetches, fetch_arrays, result_arrays, take_hits
 from player.march import MarchResult
 from player.packet_fetches import choose_fetches
 from player.packets import SPACE_ROWS, SUMS, march_space
+from player.scratch import check_scratch, scratch
 from player.sparse_grid import SparseGrid
 
 F32 = np.float32
@@ -28,10 +29,10 @@ def march(
     n_rays = len(rays_o)
     rays = enter_space(grid, rays_o, rays_d)
     table = lattice(float(grid.step))
-    capacity = table.shape[1]
-    opacity, depth = np.zeros(n_rays, F32), np.zeros(n_rays, F32)
-    counts, hits = np.zeros(n_rays, np.int32), np.empty(n_rays, np.int64)
-    features = np.zeros((n_rays, -(-grid.n_channels // CHANNELS) * CHANNELS), F32)
+    out = result_arrays(n_rays, grid.n_channels)
+    packet = scratch((SPACE_ROWS + 1, LANES), F32, 0)
+    found = scratch((2, table.shape[1], LANES), F32), scratch((SUMS, LANES), F32)
+    fetches = fetch_arrays(n_samples)
     half = grid.step * F32(0.5)
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.density_low, grid.density_slope),
@@ -42,11 +43,13 @@ def march(
         (*rays.nearest, *rays.along, rays.cos, rays.sin, rays.width, rays.length, rays.t_nearest),
         table,
         n_samples,
-        np.zeros((SPACE_ROWS + 1, LANES), F32),
-        (np.empty((2, capacity, LANES), F32), np.empty((SUMS, LANES), F32)),
-        fetch_arrays(n_samples),
-        (opacity, depth, counts, features, hits),
-    )  # fmt: skip
+        packet,
+        found,
+        fetches,
+        out,
+    )
+    check_scratch(packet, found, fetches, out)
+    opacity, depth, counts, features, hits = out
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
 
 

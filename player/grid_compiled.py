@@ -16,6 +16,7 @@ from player.lanes import LANES
 from player.march import MIN_OPACITY
 from player.packet_fetches import stored_corners
 from player.prefetch import prefetch
+from player.scratch import scratch
 
 F32 = np.float32
 
@@ -32,14 +33,26 @@ def fetch_arrays(k: int) -> tuple[np.ndarray, ...]:
     """For the fetches of a packet: `chosen` [3, k, LANES] of `choose_fetches`; opacities [LANES], 0 where
     nothing is fetched, and rows of the features [LANES] that the rays are added to; places [3, LANES], in
     cells of the densities' grid, and weights [LANES]; and [8, LANES] and [9, LANES] for `stored_corners`."""
-    corners = np.empty((8, LANES), np.int32), np.empty((9, LANES), F32)
-    to = np.empty(LANES, F32), np.empty(LANES, np.int64)
     return (
-        np.zeros((3, max(k, 1), LANES), F32),
-        *to,
-        np.zeros((3, LANES), F32),
-        np.empty(LANES, F32),
-        *corners,
+        scratch((3, max(k, 1), LANES), F32, 0),
+        scratch(LANES, F32),
+        scratch(LANES, np.int64),
+        scratch((3, LANES), F32, 0),
+        scratch(LANES, F32),
+        scratch((8, LANES), np.int32),
+        scratch((9, LANES), F32),
+    )
+
+
+def result_arrays(n_rays: int, n_channels: int) -> tuple[np.ndarray, ...]:
+    """For what a march finds: opacity, depth and counts of the rays [n_rays], the features of those that are
+    hits [n_rays, whole CHANNELS], and which these are [n_rays]."""
+    return (
+        scratch(n_rays, F32, 0),
+        scratch(n_rays, F32, 0),
+        scratch(n_rays, np.int32, 0),
+        scratch((n_rays, -(-n_channels // CHANNELS) * CHANNELS), F32, 0),
+        scratch(n_rays, np.int64),
     )
 
 

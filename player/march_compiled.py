@@ -11,10 +11,11 @@ import math
 import numpy as np
 
 from player.compiling import compiled, inlined
-from player.grid_compiled import CHANNELS, LANES, add_fetches, fetch_arrays, take_hits
+from player.grid_compiled import LANES, add_fetches, fetch_arrays, result_arrays, take_hits
 from player.march import MarchResult
 from player.packet_fetches import choose_fetches
 from player.packets import BOX_ROWS, SUMS, march_box
+from player.scratch import check_scratch, scratch
 from player.sparse_grid import SparseGrid
 
 F32 = np.float32
@@ -31,10 +32,10 @@ def march(
     n_rays = len(rays_o)
     near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
     far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
-    opacity, depth = np.zeros(n_rays, F32), np.zeros(n_rays, F32)
-    counts, hits = np.zeros(n_rays, np.int32), np.empty(n_rays, np.int64)
-    features = np.zeros((n_rays, -(-grid.n_channels // CHANNELS) * CHANNELS), F32)
-    capacity = grid.most_samples
+    out = result_arrays(n_rays, grid.n_channels)
+    packet = scratch((BOX_ROWS + 1, LANES), F32, 0), scratch(LANES, np.int32)
+    found = scratch((2, grid.most_samples, LANES), F32), scratch((SUMS, LANES), F32)
+    fetches = fetch_arrays(n_samples)
     origin, scale = tuple(grid.aabb_min), tuple(grid.cells_per_unit)
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
@@ -43,11 +44,13 @@ def march(
         (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
         n_samples,
-        (np.zeros((BOX_ROWS + 1, LANES), F32), np.empty(LANES, np.int32)),
-        (np.empty((2, capacity, LANES), F32), np.empty((SUMS, LANES), F32)),
-        fetch_arrays(n_samples),
-        (opacity, depth, counts, features, hits),
-    )  # fmt: skip
+        packet,
+        found,
+        fetches,
+        out,
+    )
+    check_scratch(packet, found, fetches, out)
+    opacity, depth, counts, features, hits = out
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
 
 

@@ -13,15 +13,17 @@ import numpy as np
 from player.cameras import Camera
 from player.compiling import compiled
 from player.march import MarchResult
+from player.scratch import check_scratch, scratch
 
 F32 = np.float32
 
 
 def directions(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """[n, 3] float32 unit directions through pixel centres, as `Camera.rays` defines them."""
-    rays_d = np.empty((len(columns), 3), F32)
+    rays_d = scratch((len(columns), 3), F32)
     lens = (camera.cx, camera.cy, camera.fx, camera.fy)
     _directions(columns, rows, lens, np.ascontiguousarray(camera.c2w[:3, :3]), rays_d)
+    check_scratch(rays_d)
     return rays_d
 
 

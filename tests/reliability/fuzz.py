@@ -12,6 +12,7 @@ import argparse
 import hashlib
 import io
 import json
+import os
 import resource
 import shutil
 import signal
@@ -26,6 +27,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+# Before player is imported: compiled code that writes beside its arrays is found out (`player.scratch`).
+os.environ["VFR_CANARIES"] = "1"
 
 from exporters.onnx_head import head_onnx
 from player.asset import Asset
