@@ -23,6 +23,7 @@ import numpy as np
 from player.asset import Asset
 from player.errors import FormatError, MissingExtraError, ParityError
 from player.head import Head
+from player.head_graph import read_head
 
 TOLERANCE = 1e-6
 """Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
@@ -53,8 +54,11 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
     except ImportError as error:
         raise MissingExtraError("ONNX: needs the package onnx: pip install 'vfr-bake[export]'") from error
     source = asset.path("head.onnx")
-    Head(source, asset.manifest.n_channels)  # a head that does not open has its own message
-    model = onnx.load_from_string(source.read_bytes())
+    data = source.read_bytes()
+    arrays = read_head(data, str(source))  # a head that is none has its own message
+    model = onnx.load_from_string(data)
+    if arrays.may_saturate:
+        _make_weights_unsigned(onnx, model)
     if decode:
         _put_decode_in_front(onnx, model, asset.manifest.n_channels)
     del model.metadata_props[:]
@@ -82,12 +86,19 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
     return data
 
 
+def _make_weights_unsigned(onnx: Any, model: Any) -> None:
+    """The same numbers with codes of weights from 0 to 255 around 128, which every processor multiplies
+    exactly: onnxruntime adds up products of an unsigned and a signed byte in 16 bits, where it has to."""
+    to_array, from_array = onnx.numpy_helper.to_array, onnx.numpy_helper.from_array
+    for tensor in model.graph.initializer:
+        if tensor.name.endswith(("_weight_codes", "_weight_zero")):
+            codes = to_array(tensor).astype(np.int16) + 128
+            tensor.CopyFrom(from_array(codes.astype(np.uint8), tensor.name))
+
+
 def _put_decode_in_front(onnx: Any, model: Any, n_channels: int) -> None:
     """`features = squeeze(weights [n, 1, k] @ codes [n, k, c])`, instead of the input `features`."""
     helper, graph = onnx.helper, model.graph
-    taken = {name for node in graph.node for name in (*node.input, *node.output)}
-    taken |= {tensor.name for tensor in graph.initializer}
-    assert not taken & {"codes", "weights", "decode_axis"}, "a head from elsewhere"
     axis = onnx.numpy_helper.from_array(np.array([1], np.int64), "decode_axis")
     nodes = [
         helper.make_node("Cast", ["codes"], ["decode_codes"], "decode_codes", to=onnx.TensorProto.FLOAT),

@@ -1,30 +1,31 @@
 """The head of Volume Feature Rendering as one ONNX graph: composited features and a direction in, rgb out.
 
-With F the composited `features` of a pixel and d its unit direction (row vectors, y = x @ W + b):
-    h   = gelu(... gelu(F S0 + s0) ...)                      spatial layers
-    e   = (h Wf + bf) * repeat(Y(d), n_sh_features)          spherical-harmonics encoding, basis-major
-    z   = gelu(h D_bottleneck + e D_sh + d0)                 first directional layer, bottleneck folded
-    rgb = sigmoid(gelu(... gelu(z D1 + d1) ...) W + b)       more directional layers, output
-gelu(x) = x (1 + erf(x / sqrt 2)) / 2, the exact form. Y is computed inside the graph from the one table of
-`exporters.spherical_harmonics`, so that no caller can disagree with it on order or sign: powers of d, a
-product with a constant matrix. Built from numpy arrays, the same weights give the same bytes.
+The graph, its letters and what 8 bits round are specified in `player.head_graph`; here are the weights that
+go into it. The spherical harmonics are computed inside the graph from the one table of
+`exporters.spherical_harmonics`, so that no caller can disagree with it on order or sign. Built from numpy
+arrays, the same weights give the same bytes.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from exporters.spherical_harmonics import sh_monomials
 from player.errors import FormatError, MissingExtraError, ShapeError
-
-OPSET = 20
-"""The first operator set with a native Gelu."""
-IR_VERSION = 10
+from player.head_graph import (
+    IR_VERSION,
+    OPSET,
+    PAIR_LIMIT,
+    HeadForm,
+    head_nodes,
+    head_ports,
+    monomials,
+    pair_sums,
+    read_head,
+)
 
 Layer = tuple[np.ndarray, np.ndarray]
 """Weights [n_in, n_out] and bias [n_out]."""
@@ -106,53 +107,45 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
             pixel's colour does not depend on which pixels it is evaluated with.
 
     Raises:
+        ShapeError: not one range for each activation.
+        FormatError: a head that no player would take, such as one of too many layers.
         MissingExtraError: the package `onnx` is not installed.
     """
     try:
         import onnx
-        from onnx import helper
+        from onnx import helper, numpy_helper
     except ImportError as error:
         raise MissingExtraError(
             "the ONNX head: needs the package onnx: pip install vfr-bake[export]"
         ) from error
-    graph = _Graph(helper, onnx.numpy_helper)
-    h = "features"
-    for index, layer in enumerate(weights.spatial):
-        h = graph.dense(f"spatial_{index}", h, *layer, activation="Gelu")
-    if ranges is not None:
-        if len(ranges) != 1 + len(weights.directional):
-            raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
-        h = graph.quantized(h, ranges[0])
-    f = graph.dense("to_sh", h, *weights.to_sh)
-    e = graph.add("Mul", [f, _harmonics(graph, weights)], "sh_encoded")
-    d_bottleneck, d_sh, bias = weights.directional_first
-    z = graph.dense("directional_0_bottleneck", h, d_bottleneck, bias)
-    z = graph.add("Gemm", [e, graph.constant("directional_0_sh_weight", d_sh), z], "directional_0_linear")
-    z = graph.add("Gelu", [z], "directional_0", approximate="none")
-    for index, layer in enumerate(weights.directional, start=1):
-        if ranges is not None:
-            z = graph.quantized(z, ranges[index])
-        z = graph.dense(f"directional_{index}", z, *layer, activation="Gelu")
-    z = graph.dense("output", z, *weights.output)
-    graph.add("Sigmoid", [z], "rgb")
-
-    def tensor(name: str, width: int) -> Any:
-        return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["n", width])
-
+    if ranges is not None and len(ranges) != 1 + len(weights.directional):
+        raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
+    form = HeadForm(len(weights.spatial), len(weights.directional), weights.sh_degree, ranges is not None)
+    nodes = [
+        helper.make_node(node.operator, node.inputs, [node.output], node.output, **node.attributes)
+        for node in head_nodes(form)
+    ]
+    tensors = [
+        numpy_helper.from_array(np.ascontiguousarray(array), name)
+        for name, array in _constants(weights, ranges).items()
+    ]
+    inputs, outputs = (
+        [
+            helper.make_tensor_value_info(port.name, onnx.TensorProto.FLOAT, ["n", port.width])
+            for port in ports
+        ]
+        for ports in head_ports(weights.n_channels)
+    )
     model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "vfr_head",
-            [tensor("features", weights.n_channels), tensor("dirs", 3)],
-            [tensor("rgb", 3)],
-            graph.constants,
-        ),
+        helper.make_graph(nodes, "vfr_head", inputs, outputs, tensors),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="vfr-bake",
     )
     onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString(deterministic=True)
+    data = model.SerializeToString(deterministic=True)
+    read_head(data, "head")  # what is written can be played
+    return data
 
 
 def levels(limits: Range) -> tuple[float, int]:
@@ -165,109 +158,80 @@ def levels(limits: Range) -> tuple[float, int]:
     return scale, int(np.clip(np.rint(-limits[0] / scale), 0, 255))
 
 
-class _Graph:
-    """Nodes and constants collected in order."""
+def weight_scales(weight: np.ndarray) -> np.ndarray:
+    """What a code of the weights [n_in, n_out] counts, for each output: [n_out] float32.
 
-    def __init__(self, helper: Any, numpy_helper: Any) -> None:
-        self._helper = helper
-        self._numpy_helper = numpy_helper
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-        self._scales: dict[str, float] = {}  # of the tensors that have 8 bits
-
-    def constant(self, name: str, array: np.ndarray) -> str:
-        """A constant: 8-bit and 32-bit integers as they are, other integers as int64, the rest as float32."""
-        kind: Any = array.dtype
-        if kind not in (np.int8, np.uint8, np.int32):
-            kind = np.int64 if kind.kind == "i" else np.float32
-        self.constants.append(self._numpy_helper.from_array(np.ascontiguousarray(array, kind), name))
-        return name
-
-    def add(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        self.nodes.append(self._helper.make_node(operator, inputs, [output], name=output, **attributes))
-        return output
-
-    def dense(
-        self, name: str, x: str, weight: np.ndarray, bias: np.ndarray, activation: str | None = None
-    ) -> str:
-        if x in self._scales:
-            inputs = [x, *self._quantized_layer(name, weight, bias, self._scales[x])]
-        else:
-            inputs = [x, self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
-        linear = self.add("Gemm", inputs, f"{name}_linear")
-        return self.add(activation, [linear], name, approximate="none") if activation else linear
-
-    def quantized(self, x: str, limits: Range) -> str:
-        """`x` rounded to 256 levels between its limits, zero among them; what follows may multiply in 8
-        bits."""
-        scale, zero = levels(limits)
-        steps = [
-            self.constant(f"{x}_scale", np.array(scale)),
-            self.constant(f"{x}_zero", np.array(zero, np.uint8)),
-        ]
-        self.add("QuantizeLinear", [x, *steps], f"{x}_codes")
-        out = self.add("DequantizeLinear", [f"{x}_codes", *steps], f"{x}_rounded")
-        self._scales[out] = float(np.float32(scale))
-        return out
-
-    def _quantized_layer(self, name: str, weight: np.ndarray, bias: np.ndarray, x_scale: float) -> list[str]:
-        """Weights with signed 8-bit codes, a scale for each output; the bias in steps of the products'
-        scale."""
-        scales = np.maximum(np.abs(weight).max(axis=0), 1e-12) / 127
-        scales = scales.astype(np.float32)
-        codes = np.clip(np.rint(weight / scales), -127, 127).astype(np.int8)
-        product_scales = scales * np.float32(x_scale)
-        bias_codes = np.clip(np.rint(bias / product_scales.astype(np.float64)), -(2**31) + 1, 2**31 - 1)
-        n = len(scales)
-        inputs = []
-        for part, values, steps in (
-            ("weight", codes, scales), ("bias", bias_codes.astype(np.int32), product_scales)
-        ):  # fmt: skip
-            zero = np.zeros(n, values.dtype)
-            parts = [
-                self.constant(f"{name}_{part}_codes", values),
-                self.constant(f"{name}_{part}_scale", steps),
-                self.constant(f"{name}_{part}_zero", zero),
-            ]
-            axis = values.ndim - 1
-            inputs.append(self.add("DequantizeLinear", parts, f"{name}_{part}", axis=axis))
-        return inputs
-
-
-def _harmonics(graph: _Graph, weights: HeadWeights) -> str:
-    """Y(dirs), each basis repeated `n_sh_features` times: monomials of every order, then one matrix product.
-
-    A monomial of order k is one of order k - 1 times x, y or z.
+    No two neighbouring codes then exceed `player.head_graph.PAIR_LIMIT`: their sum before rounding is one
+    less at most, and each may be rounded up by a half.
     """
+    return (np.maximum(pair_sums(weight).max(axis=0), 1e-12) / (PAIR_LIMIT - 1)).astype(np.float32)
+
+
+def _constants(weights: HeadWeights, ranges: Sequence[Range] | None) -> dict[str, np.ndarray]:
+    """The graph's constants by name."""
+    constants: dict[str, np.ndarray] = {}
+
+    def dense(name: str, layer: Layer, x: str = "") -> None:
+        """A layer, in 8 bits if what it takes in, `x`, is."""
+        x_scale = constants.get(f"{x}_scale")
+        if x_scale is None:
+            constants[f"{name}_weight"], constants[f"{name}_bias"] = (a.astype(np.float32) for a in layer)
+            return
+        for part, (codes, scale) in _in_8_bits(layer, x_scale[0]).items():
+            constants[f"{name}_{part}_codes"], constants[f"{name}_{part}_scale"] = codes, scale
+            constants[f"{name}_{part}_zero"] = np.zeros(len(scale), codes.dtype)
+
+    def in_codes(x: str, index: int) -> None:
+        if ranges is not None:
+            scale, zero = levels(ranges[index])
+            constants[f"{x}_scale"] = np.array([scale], np.float32)
+            constants[f"{x}_zero"] = np.array([zero], np.uint8)
+
+    for index, layer in enumerate(weights.spatial):
+        dense(f"spatial_{index}", layer)
+    h = f"spatial_{len(weights.spatial) - 1}"
+    in_codes(h, 0)
+    dense("to_sh", weights.to_sh, h)
+    constants.update(_harmonics(weights))
+    d_bottleneck, d_sh, bias = weights.directional_first
+    dense("directional_0_bottleneck", (d_bottleneck, bias), h)
+    constants["directional_0_sh_weight"] = d_sh.astype(np.float32)
+    for index, layer in enumerate(weights.directional, start=1):
+        in_codes(f"directional_{index - 1}", index)
+        dense(f"directional_{index}", layer, f"directional_{index - 1}")
+    dense("output", weights.output)
+    return constants
+
+
+def _in_8_bits(layer: Layer, x_scale: np.float32) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Weights as signed 8-bit codes, a scale for each output; the bias in steps of the products' scale.
+
+    A bias that is huge beside its weights makes the steps coarser: its code has to fit into 32 bits.
+    """
+    weight, bias = layer
+    smallest = np.abs(bias) / (float(x_scale) * 2**30)
+    scales = np.maximum(weight_scales(weight), smallest).astype(np.float32)
+    products = scales * x_scale
+    codes = np.rint(weight / scales).astype(np.int8)
+    bias_codes = np.rint(bias / products.astype(np.float64)).astype(np.int32)
+    return {"weight": (codes, scales), "bias": (bias_codes, products)}
+
+
+def _harmonics(weights: HeadWeights) -> dict[str, np.ndarray]:
+    """Monomials of every order from those of the order below, and each basis's coefficients, repeated
+    `n_sh_features` times."""
     exponents, coefficients = sh_monomials(weights.sh_degree)
-    columns = np.repeat(coefficients, weights.n_sh_features, axis=1)
-    parts, rows, previous, name = [], [], [(1, 0, 0), (0, 1, 0), (0, 0, 1)], "dirs"
-    wanted = {tuple(powers): row for row, powers in enumerate(exponents.tolist())}
+    columns = np.repeat(coefficients, weights.n_sh_features, axis=1).astype(np.float32)
+    of_powers = {tuple(powers): columns[row] for row, powers in enumerate(exponents.tolist())}
+    constants = {"sh_bias": of_powers.pop((0, 0, 0))}
+    rows: list[np.ndarray] = []
     for order in range(1, weights.sh_degree):
+        powers, parents, axes = monomials(order)
+        rows += [of_powers.get(p, np.zeros(columns.shape[1], np.float32)) for p in powers]
         if order > 1:
-            current = [p for p in itertools.product(range(order, -1, -1), repeat=3) if sum(p) == order]
-            axes = [int(np.argmax(np.array(powers) > 0)) for powers in current]
-            parents = [
-                previous.index(tuple(power - (axis == k) for k, power in enumerate(powers)))  # type: ignore[arg-type]
-                for powers, axis in zip(current, axes, strict=True)
-            ]
-            # Columns are picked by a product with zeros and ones: exact, and much faster than Gather.
-            factors = [
-                graph.add(
-                    "MatMul",
-                    [source, graph.constant(f"sh_{order}_{kind}_pick", np.eye(width)[:, index])],
-                    f"sh_{order}_{kind}",
-                )
-                for kind, source, width, index in (
-                    ("parent", name, len(previous), parents), ("axis", "dirs", 3, axes)
-                )
-            ]  # fmt: skip
-            name = graph.add("Mul", factors, f"sh_{order}")
-            previous = current
-        parts.append(name)
-        rows += [columns[wanted[p]] if p in wanted else np.zeros(columns.shape[1]) for p in previous]
-    constant = graph.constant("sh_bias", columns[0])
-    if not parts:  # one band: the constant alone broadcasts over the pixels
-        return constant
-    monomials = graph.add("Concat", parts, "sh_monomials", axis=1) if len(parts) > 1 else parts[0]
-    return graph.add("Gemm", [monomials, graph.constant("sh_weight", np.array(rows)), constant], "sh")
+            n_below = order * (order + 1) // 2
+            constants[f"sh_{order}_parent_pick"] = np.eye(n_below, dtype=np.float32)[:, parents]
+            constants[f"sh_{order}_axis_pick"] = np.eye(3, dtype=np.float32)[:, axes]
+    if rows:
+        constants["sh_weight"] = np.array(rows)
+    return constants

@@ -106,22 +106,21 @@ quantize_lanes: Any = intrinsic(_quantize)
 """quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
 
 
-def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any, step: Any) -> Any:
+def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         here = address(context, builder, signature.args[0], arguments[0])
-        _, out, x, zero, per_step, step = arguments
+        _, out, x, zero, per_step = arguments
         levels = _code(load(builder, here, x), zero, per_step) - splat(builder, builder.sitofp(zero, FLOAT))
-        store(here, out, levels * splat(builder, step))
+        store(here, out, levels)
         return context.get_dummy_value()
 
-    long, number = types.int64, types.float32
-    return types.void(memory, long, long, long, number, number), generate
+    long = types.int64
+    return types.void(memory, long, long, long, types.float32), generate
 
 
 round_lanes: Any = intrinsic(_round)
-"""round_lanes(memory, out, x, zero, per_step, step): the numbers that the codes of `quantize_lanes` stand
-for."""
+"""round_lanes(memory, out, x, zero, per_step): the codes of `quantize_lanes` less `zero`, as floats."""
 
 
 def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:

@@ -73,6 +73,7 @@ def _write_json(target: str | None, document: dict[str, Any]) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from player.asset import Asset, checksums, read_manifest
+    from player.head import read_head_file
 
     manifest = read_manifest(arguments.asset)
     results = {}
@@ -84,7 +85,8 @@ def _check(arguments: argparse.Namespace) -> int:
     _write_json(arguments.json, {"ok": not failed, "files": results})
     if failed:
         raise VfrError(f"{arguments.asset}: {failed} of {len(results)} files failed")
-    Asset.open(arguments.asset)  # the checksums hold; now the content
+    asset = Asset.open(arguments.asset)  # the checksums hold; now the content
+    read_head_file(asset.path("head.onnx"), manifest.n_channels)
     return 0
 
 

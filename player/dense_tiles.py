@@ -36,7 +36,6 @@ def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: A
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
-        (x_at, x_pitch), (w_at, w_pitch), out = (_pair(builder, arguments[index]) for index in (2, 3, 5))
         in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
         first = builder.select(in_memory, here, there)
         start_at, start_pitch = _pair(builder, arguments[4])
@@ -45,15 +44,8 @@ def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: A
             at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
             for half in range(2):
                 sums.set(row, half, load(builder, first, builder.add(at, LONG(half * LANES))))
-        x_rows = _rows(builder, here, x_at, x_pitch)
-        with cgutils.for_range(builder, arguments[6]) as loop:
-            at = builder.add(w_at, builder.mul(w_pitch, loop.index))
-            columns = [load(builder, there, builder.add(at, LONG(half * LANES))) for half in range(2)]
-            for row in range(ROWS):
-                value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
-                for half in range(2):
-                    sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
-        sums.write(here, out, lambda x, _: x)
+        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
+        sums.write(here, _pair(builder, arguments[5]), lambda x, _: x)
         return context.get_dummy_value()
 
     two, three = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
@@ -67,6 +59,49 @@ dense_tile: Any = intrinsic(_dense)
 `weights`, the others in `memory`. start: the same, and whether it is in `memory` rather than in `weights`;
 what the sums begin with, a bias with 0 from row to row. depth: inputs of the layer.
 """
+
+
+def _dense_codes(_: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, depth: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
+        rows = [
+            [load(builder, there, builder.add(at, LONG(half * LANES))) for half in range(2)]
+            for at in _pair(builder, arguments[4])
+        ]
+        starts, scales = rows
+        sums = _Sums(builder, FLOAT)
+        for row in range(ROWS):
+            for half in range(2):
+                sums.set(row, half, starts[half])
+        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
+        sums.write(here, _pair(builder, arguments[5]), lambda x, half: x * scales[half])
+        return context.get_dummy_value()
+
+    two = types.UniTuple(types.int64, 2)
+    return types.void(memory, weights, two, two, two, two, types.int64), generate
+
+
+dense_codes_tile: Any = intrinsic(_dense_codes)
+"""dense_codes_tile(memory, weights, x, w, places, out, depth): the same of 8-bit codes that are floats.
+
+Sums below 2^24 are then exact, as `dense_bytes_tile` has them. places: (first of what the sums begin with,
+first of what they are multiplied by), both in `weights`, the same for every row.
+"""
+
+
+def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, Any], depth: Any) -> None:
+    """Add to `sums` the products of `depth` inputs of each row and their weights; x and w are (array, (index
+    of the first number, numbers from row to row))."""
+    x_rows = _rows(builder, x[0], *_pair(builder, x[1]))
+    w_at, w_pitch = _pair(builder, w[1])
+    with cgutils.for_range(builder, depth) as loop:
+        at = builder.add(w_at, builder.mul(w_pitch, loop.index))
+        columns = [load(builder, w[0], builder.add(at, LONG(half * LANES))) for half in range(2)]
+        for row in range(ROWS):
+            value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
+            for half in range(2):
+                sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
 
 
 def _dense_bytes(

@@ -25,22 +25,24 @@ from player.dense_tiles import (
     ROWS,
     WIDTH,
     dense_bytes_tile,
+    dense_codes_tile,
     dense_tile,
     multiply_lanes,
 )
+from player.head_graph import HeadArrays
 from player.head_program import (
     BLOCK,
     DENSE,
     DENSE_BYTES,
+    DENSE_CODES,
     MULTIPLY,
     QUAD,
     QUANTIZE,
     ROUND,
-    NotOursError,
     Program,
     program_of,
 )
-from player.onnx_graph import Graph
+from player.scratch import check_scratch, scratch
 
 
 class CompiledHead:
@@ -54,23 +56,23 @@ class CompiledHead:
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         """As `player.head.Head`."""
         p = self._program
+        n_channels = p.features.width
+        assert features.shape == (len(dirs), n_channels) and dirs.shape[1:] == (3,)
         rgb = np.empty((len(features), 3), np.float32)
-        scratch = np.zeros(p.n_floats, np.float32), np.zeros(p.n_bytes, np.uint8)
+        memory, codes = scratch(p.n_floats, np.float32, 0), scratch(p.n_bytes, np.uint8, 0)
         inputs = (np.ascontiguousarray(a, np.float32) for a in (features, dirs))
-        _run(p.steps, p.weights, (p.packed, p.starts), *scratch, *inputs, rgb, self._places)
+        _run(p.steps, p.weights, (p.packed, p.starts), p.pairs, memory, codes, *inputs, rgb, self._places)
+        check_scratch(memory, codes)
         return rgb
 
 
-def compile_head(graph: Graph, n_channels: int) -> CompiledHead | None:
-    """The head of a graph; None if there is anything in it but a head's layers."""
-    try:
-        return CompiledHead(program_of(graph, n_channels))
-    except NotOursError:
-        return None
+def compile_head(head: HeadArrays) -> CompiledHead:
+    """The head, ready to run."""
+    return CompiledHead(program_of(head))
 
 
 @compiled
-def _run(steps, weights, integers, memory, codes, features, dirs, rgb, places):
+def _run(steps, weights, integers, pairs, memory, codes, features, dirs, rgb, places):
     at, pitch = places
     for begin in range(0, len(features), BLOCK):
         n = min(BLOCK, len(features) - begin)
@@ -80,26 +82,38 @@ def _run(steps, weights, integers, memory, codes, features, dirs, rgb, places):
             step = steps[i]
             if step[0] == DENSE:
                 _dense(memory, weights, step, n)
+            elif step[0] == DENSE_CODES:
+                _dense_codes(memory, weights, step, n)
             elif step[0] == DENSE_BYTES:
                 _dense_bytes(codes, memory, integers[0], integers[1], weights, step, n)
             elif step[0] == MULTIPLY:
-                _multiply(memory, step[8], step[1], step[3], n * step[2])
+                _multiply(memory, step[1], step[3], n * step[2])
             elif step[0] == QUANTIZE:
                 _quantize(codes, memory, weights, step, n)
             elif step[0] == ROUND:
                 _round(memory, weights, step, n * step[2])
             else:
-                for row in range(n):
-                    _move(memory, step[8] + row * step[9], step[1] + row * step[2], step[10])
+                _monomials(memory, pairs, step, n)
         for row in range(n):
             for c in range(3):
                 rgb[begin + row, c] = memory[at[2] + row * pitch[2] + c]
 
 
 @compiled
-def _multiply(memory, out, a, b, n):
+def _multiply(memory, a, b, n):
     for i in range(0, n, LANES):
-        multiply_lanes(memory, out + i, a + i, b + i)
+        multiply_lanes(memory, a + i, a + i, b + i)
+
+
+@compiled
+def _monomials(memory, pairs, step, n):
+    dirs, pitch, out, out_pitch = step[1], step[2], step[8], step[9]
+    for _ in range(n):
+        for i in range(len(pairs)):
+            parent, axis = pairs[i, 0], pairs[i, 1]
+            value = memory[dirs + axis]
+            memory[out + i] = value if parent < 0 else memory[out + parent] * value
+        dirs, out = dirs + pitch, out + out_pitch
 
 
 @compiled
@@ -113,15 +127,9 @@ def _quantize(codes, memory, weights, step, n):
 
 @compiled
 def _round(memory, weights, step, n):
-    out, x, zero, per_step, of_step = step[8], step[1], step[4], weights[step[3]], weights[step[3] + 1]
+    out, x, zero, per_step = step[8], step[1], step[4], weights[step[3]]
     for i in range(0, n, LANES):
-        round_lanes(memory, out + i, x + i, zero, per_step, of_step)
-
-
-@compiled
-def _move(memory, out, a, n):
-    for i in range(n):
-        memory[out + i] = memory[a + i]
+        round_lanes(memory, out + i, x + i, zero, per_step)
 
 
 @compiled
@@ -154,6 +162,20 @@ def _activate(memory, at, n, kind):
     elif kind == SIGMOID:
         for i in range(at, at + n, LANES):
             sigmoid_lanes(memory, i)
+
+
+@compiled
+def _dense_codes(memory, weights, step, n):
+    """The same of a layer in 8 bits whose codes are floats."""
+    x, x_pitch, w, w_pitch, start, scale = step[1], step[2], step[3], step[4], step[5], step[7]
+    out, pitch = step[8], step[9]
+    for first in range(0, w_pitch, WIDTH):
+        for row in range(0, n, ROWS):
+            dense_codes_tile(
+                memory, weights, (x + row * x_pitch, x_pitch), (w + first, w_pitch),
+                (start + first, scale + first), (out + first + row * pitch, pitch), step[10],
+            )  # fmt: skip
+    _activate(memory, out, n * pitch, step[11])
 
 
 @compiled

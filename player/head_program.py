@@ -1,52 +1,41 @@
-"""From the graph of a head to a program: the instructions that `player.head_compiled` runs.
+"""From the numbers of a head to a program: the instructions that `player.head_compiled` runs.
 
-A value of the graph is a table in memory of BLOCK pixels by its width, padded to whole tiles. What the graph
-rounds to 8 bits is kept in 8 bits where the processor multiplies those (`player.dense_tiles`); elsewhere the
-rounded numbers are kept as floats: the same colours, more slowly. A graph with anything else in it is left to
-onnxruntime.
+A value of the head is a table in memory of BLOCK pixels by its width, padded to whole tiles. All places and
+sizes follow from the widths that `player.head_graph` has checked. What is rounded to 8 bits is kept in bytes
+where the processor multiplies those (`player.dense_tiles`); elsewhere codes are kept as floats, whose sums of
+products are the same integers, added up more slowly.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from player.activations import GELU, LINEAR, SIGMOID
 from player.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, WIDTH
-from player.onnx_graph import Graph, Node
+from player.head_graph import HeadArrays, Layer, Rounding, monomials
 
 BLOCK = 4 * ROWS
 """Pixels at a time: all the numbers of a 64 wide head are then 300 kB."""
-DENSE, DENSE_BYTES, MULTIPLY, COPY, QUANTIZE, ROUND = range(6)
-_ACTIVATIONS = {"Gelu": GELU, "Sigmoid": SIGMOID}
-_LARGEST = 2**31 - 1
-_MOST_FLOATS = 1 << 22
-"""Of all values of a graph, 16 MB: a head 256 wide has a 25th of it."""
-
-
-class NotOursError(Exception):
-    """A graph, or a node, that is left to onnxruntime."""
+DENSE, DENSE_CODES, DENSE_BYTES, MULTIPLY, MONOMIALS, QUANTIZE, ROUND = range(7)
 
 
 @dataclass(frozen=True)
 class Value:
-    """Where a value of the graph is."""
+    """A table of BLOCK pixels: its first number in memory, numbers from a pixel to the next, and how many of
+    them count. `in_bytes`: it is among the bytes, not the floats."""
 
     place: int
     pitch: int
-    """Numbers from a pixel to the next."""
     width: int
-    scale: np.float32 | None = None
-    """Of a value that was rounded to 8 bits: what a step counts."""
-    zero: int = 0
-    """And the code of 0."""
     in_bytes: bool = False
 
 
 @dataclass(frozen=True)
 class Program:
-    """Instructions, what they read, and where the graph's inputs and its output are in memory."""
+    """Instructions, what they read, and where the head's inputs and its output are in memory."""
 
     steps: np.ndarray
     """[n, 12] int64; what the numbers mean, `player.head_compiled` knows."""
@@ -55,6 +44,8 @@ class Program:
     """int8 weights as `dense_bytes_tile` takes them."""
     starts: np.ndarray
     """int32 that its sums begin with."""
+    pairs: np.ndarray
+    """[n_monomials, 2] int64: of which monomial, -1 for 1, and which of x, y and z each is the product."""
     n_floats: int
     n_bytes: int
     features: Value
@@ -62,208 +53,130 @@ class Program:
     rgb: Value
 
 
-def program_of(graph: Graph, n_channels: int, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
-    """Raises NotOursError for a graph that holds anything but a head's layers in float32 or 8 bits, or that
-    breaks the rules of ONNX: onnxruntime says which.
-
-    `in_bytes`: whether the processor multiplies bytes.
-    """
-    try:
-        return _Compiler(graph, n_channels, in_bytes).program()
-    except (IndexError, ValueError, TypeError, OverflowError) as error:
-        raise NotOursError from error
+def program_of(head: HeadArrays, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
+    """The program of a head. `in_bytes`: whether the processor multiplies bytes."""
+    return _Compiler(head, in_bytes).program()
 
 
 class _Compiler:
-    def __init__(self, graph: Graph, n_channels: int, in_bytes: bool) -> None:
-        self._graph = graph
+    def __init__(self, head: HeadArrays, in_bytes: bool) -> None:
+        self._head = head
         self._in_bytes = in_bytes
         self._weights = _Constants(np.float32)
         self._packed = _Constants(np.int8)
         self._starts = _Constants(np.int32)
         self._n_floats = self._n_bytes = 0
-        self._values: dict[str, Value] = {}
-        self._codes: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # constants: codes, steps of the last axis
         self._steps: list[tuple[int, ...]] = []
-        self._add("features", n_channels)
-        self._add("dirs", 3)
 
     def program(self) -> Program:
-        nodes = list(self._graph.nodes)
-        while nodes:
-            node = nodes.pop(0)
-            followed = (
-                nodes and nodes[0].operator in _ACTIVATIONS and nodes[0].inputs == node.outputs
-                and not any(node.outputs[0] in other.inputs for other in nodes[1:])
-            )  # fmt: skip
-            if node.operator in ("Gemm", "MatMul"):
-                self._dense(node, nodes.pop(0) if followed else None)
-            elif node.operator == "Mul":
-                self._multiply(node)
-            elif node.operator == "Concat" and node.attributes == {"axis": 1}:
-                self._concatenate(node)
-            elif node.operator == "QuantizeLinear":
-                self._quantize(node)
-            elif node.operator == "DequantizeLinear":
-                self._dequantize(node)
-            else:
-                raise NotOursError
-        rgb = self._floats("rgb")
-        if rgb.width != 3:
-            raise NotOursError
-        weights = self._weights.joined()
-        if not np.isfinite(weights).all():
-            raise NotOursError
+        head = self._head
+        features, dirs = self._floats(head.n_channels), self._floats(3)
+        roundings = iter(head.roundings)
+        h = features
+        for layer in head.spatial:
+            h = self._dense(h, layer, GELU)
+        h, of_h = self._rounded(h, next(roundings, None))
+        encoded = self._dense(h, head.to_sh, rounding=of_h)
+        self._multiply(encoded, self._harmonics(dirs))
+        z = self._dense(h, head.bottleneck, rounding=of_h)
+        z = self._dense(encoded, Layer(head.from_sh, np.zeros(0)), GELU, start=z)
+        for layer in head.directional:
+            z, of_z = self._rounded(z, next(roundings, None))
+            z = self._dense(z, layer, GELU, rounding=of_z)
+        rgb = self._dense(z, head.output, SIGMOID)
+        pairs = [pair for order in range(1, head.form.sh_degree) for pair in _pairs(order)]
         return Program(
-            np.array(self._steps, np.int64), weights, self._packed.joined(), self._starts.joined(),
-            self._n_floats, self._n_bytes, self._values["features"], self._values["dirs"], rgb,
+            np.array(self._steps, np.int64), self._weights.joined(), self._packed.joined(),
+            self._starts.joined(), np.array(pairs, np.int64).reshape(-1, 2), self._n_floats, self._n_bytes,
+            features, dirs, rgb,
         )  # fmt: skip
 
-    def _value(self, name: str) -> Value:
-        if name not in self._values:
-            raise NotOursError
-        return self._values[name]
-
-    def _floats(self, name: str) -> Value:
-        value = self._value(name)
-        if value.in_bytes:
-            raise NotOursError
+    def _floats(self, width: int) -> Value:
+        value = Value(self._n_floats, _padded(width), width)
+        self._n_floats += BLOCK * value.pitch
         return value
-
-    def _constant(self, name: str) -> np.ndarray:
-        if name not in self._graph.constants:
-            raise NotOursError
-        return self._graph.constants[name]
-
-    def _add(self, name: str, width: int) -> Value:
-        pitch = _padded(width)
-        self._values[name] = Value(self._n_floats, pitch, width)
-        self._n_floats += BLOCK * pitch
-        if self._n_floats > _MOST_FLOATS:
-            raise NotOursError
-        return self._values[name]
 
     def _step(self, *numbers: int) -> None:
         self._steps.append((*numbers, *[0] * (12 - len(numbers))))
 
-    def _dense(self, node: Node, activation: Node | None) -> None:
-        if node.attributes or (activation is not None and activation.attributes not in _EXACT):
-            raise NotOursError
-        kind = LINEAR if activation is None else _ACTIVATIONS[activation.operator]
-        out = (activation or node).outputs[0]
-        if self._value(node.inputs[0]).in_bytes:
-            self._dense_bytes(node, out, kind)
-            return
-        x, weight = self._value(node.inputs[0]), self._floats_of(node.inputs[1])
-        if weight.ndim != 2 or len(weight) != x.width:
-            raise NotOursError
-        width = weight.shape[1]
-        if len(node.inputs) < 3:
-            start, start_pitch, in_memory = self._weights.add(np.zeros((1, width))), 0, 0
-        elif node.inputs[2] in self._values:
-            before = self._floats(node.inputs[2])
-            start, start_pitch, in_memory = before.place, before.pitch, 1
-            if before.width != width:
-                raise NotOursError
-        else:
-            bias = self._floats_of(node.inputs[2])
-            if bias.shape != (width,):
-                raise NotOursError
-            start, start_pitch, in_memory = self._weights.add(bias[None]), 0, 0
-        w = self._weights.add(weight)
-        to = self._add(out, width)
+    def _dense(
+        self,
+        x: Value,
+        layer: Layer,
+        activation: int = LINEAR,
+        rounding: Rounding | None = None,
+        start: Value | None = None,
+    ) -> Value:
+        """A layer of `x`; its sums begin with the bias, or with the rows of `start`."""
+        width = layer.weight.shape[1]
+        out = self._floats(width)
+        if rounding is not None:
+            self._dense_rounded(x, layer, rounding, out, activation)
+            return out
+        first = (start.place, start.pitch, 1) if start else (self._weights.add(layer.bias[None]), 0, 0)
         self._step(
-            DENSE, x.place, x.pitch, w, _padded(width), start, start_pitch, in_memory, to.place, to.pitch,
-            x.width, kind,
+            DENSE, x.place, x.pitch, self._weights.add(layer.weight), _padded(width), *first,
+            out.place, out.pitch, x.width, activation,
         )  # fmt: skip
+        return out
 
-    def _floats_of(self, name: str) -> np.ndarray:
-        """A constant, or what the codes of one stand for."""
-        if name in self._codes:
-            codes, steps = self._codes[name]
-            return codes.astype(np.float32) * steps
-        constant = self._constant(name)
-        if constant.dtype != np.float32:
-            raise NotOursError
-        return constant
-
-    def _dense_bytes(self, node: Node, out: str, kind: int) -> None:
-        x = self._value(node.inputs[0])
-        if len(node.inputs) != 3 or not set(node.inputs[1:]) <= set(self._codes):
-            raise NotOursError
-        (codes, steps), (bias, bias_steps) = (self._codes[name] for name in node.inputs[1:])
-        if codes.dtype != np.int8 or codes.ndim != 2 or len(codes) != x.width:
-            raise NotOursError
-        width = codes.shape[1]
-        if bias.shape != (width,) or not np.array_equal(bias_steps, steps * x.scale):
-            raise NotOursError
-        starts = bias.astype(np.int64) - x.zero * codes.sum(axis=0, dtype=np.int64)
-        if (np.abs(starts) + 255 * np.abs(codes.astype(np.int64)).sum(axis=0) > _LARGEST).any():
-            raise NotOursError
+    def _dense_rounded(self, x: Value, layer: Layer, rounding: Rounding, out: Value, activation: int) -> None:
+        """A layer of codes: the code of 0 is in what the sums begin with, in bytes, or in `x`, in floats."""
+        codes, bias, width = layer.weight, layer.bias, out.width
+        assert layer.scale is not None
+        scale = self._weights.add(layer.scale[None])
+        if not x.in_bytes:
+            self._step(
+                DENSE_CODES, x.place, x.pitch, self._weights.add(codes), _padded(width),
+                self._weights.add(bias[None]), 0, scale, out.place, out.pitch, x.width, activation,
+            )  # fmt: skip
+            return
+        starts = bias - rounding.zero * codes.sum(axis=0, dtype=np.int64)
         n_quads, tiles = -(-x.width // QUAD), _padded(width) // WIDTH
         table = np.zeros((n_quads * QUAD, tiles * WIDTH), np.int8)
         table[: x.width, :width] = codes
         table = table.reshape(n_quads, QUAD, tiles, WIDTH).transpose(2, 0, 3, 1)
-        to = self._add(out, width)
         self._step(
-            DENSE_BYTES, x.place, 0, self._packed.add(table.reshape(1, -1)),
-            self._starts.add(starts[None]), self._weights.add(bias_steps[None]), 0, 0, to.place, to.pitch,
-            n_quads, kind,
+            DENSE_BYTES, x.place, 0, self._packed.add(table.reshape(1, -1)), self._starts.add(starts[None]),
+            scale, 0, 0, out.place, out.pitch, n_quads, activation,
         )  # fmt: skip
 
-    def _multiply(self, node: Node) -> None:
-        a, b = (self._floats(name) for name in node.inputs)
-        if a.width != b.width:
-            raise NotOursError
-        out = self._add(node.outputs[0], a.width)
-        self._step(MULTIPLY, a.place, a.pitch, b.place, 0, 0, 0, 0, out.place)
+    def _multiply(self, a: Value, b: Value) -> None:
+        """In place, in `a`."""
+        self._step(MULTIPLY, a.place, a.pitch, b.place)
 
-    def _concatenate(self, node: Node) -> None:
-        parts = [self._floats(name) for name in node.inputs]
-        out = self._add(node.outputs[0], sum(part.width for part in parts))
-        at = out.place
-        for part in parts:
-            self._step(COPY, part.place, part.pitch, 0, 0, 0, 0, 0, at, out.pitch, part.width)
-            at += part.width
+    def _harmonics(self, dirs: Value) -> Value:
+        weight = self._head.harmonics.weight
+        terms = self._floats(len(weight))
+        self._step(MONOMIALS, dirs.place, dirs.pitch, 0, 0, 0, 0, 0, terms.place, terms.pitch)
+        return self._dense(terms, self._head.harmonics)
 
-    def _quantize(self, node: Node) -> None:
-        """To codes in bytes, or to the numbers that they stand for."""
-        x, (scale, zero) = self._floats(node.inputs[0]), (self._constant(name) for name in node.inputs[1:])
-        if node.attributes or scale.size != 1 or zero.size != 1 or zero.dtype != np.uint8 or not scale > 0:
-            raise NotOursError
-        scale, zero = scale.item(), zero.item()
-        numbers = self._weights.add(np.array([[1 / scale, scale]], np.float32))
+    def _rounded(self, x: Value, rounding: Rounding | None) -> tuple[Value, Rounding | None]:
+        """`x` as codes, in bytes or in floats, from which the code of 0 is taken off."""
+        if rounding is None:
+            return x, None
+        numbers = self._weights.add(np.array([[1 / rounding.scale]], np.float32))
         if self._in_bytes and x.width <= MOST_BYTES:
-            kind, out = QUANTIZE, Value(self._n_bytes, MOST_BYTES, x.width, in_bytes=True)
+            out = Value(self._n_bytes, MOST_BYTES, x.width, in_bytes=True)
             self._n_bytes += BLOCK * MOST_BYTES
         else:
-            kind, out = ROUND, self._add(node.outputs[0], x.width)
-        self._values[node.outputs[0]] = replace(out, scale=np.float32(scale), zero=zero)
-        self._step(kind, x.place, x.pitch, numbers, zero, 0, 0, 0, out.place)
-
-    def _dequantize(self, node: Node) -> None:
-        """Codes are kept; only what they count is noted."""
-        name, scale, zero = node.inputs[0], *(self._constant(name) for name in node.inputs[1:])
-        if name in self._values:
-            value = self._values[name]
-            if node.attributes or value.scale is None or scale != value.scale or zero != value.zero:
-                raise NotOursError
-            self._values[node.outputs[0]] = value
-            return
-        codes = self._constant(name)
-        last = codes.ndim - 1
-        if node.attributes != {"axis": last} or zero.any() or scale.shape != codes.shape[last:]:
-            raise NotOursError
-        self._codes[node.outputs[0]] = codes, scale
+            out = self._floats(x.width)
+        kind = QUANTIZE if out.in_bytes else ROUND
+        self._step(kind, x.place, x.pitch, numbers, rounding.zero, 0, 0, 0, out.place)
+        return out, rounding
 
 
-_EXACT = ({}, {"approximate": b"none"})
+def _pairs(order: int) -> list[tuple[int, int]]:
+    """What the monomials of an order are products of, by their places among those of all orders from 1 on."""
+    _, parents, axes = monomials(order)
+    below = sum(k * (k + 1) // 2 for k in range(2, order))  # monomials of the orders before the one below
+    return [(below + parent if order > 1 else -1, axis) for parent, axis in zip(parents, axes, strict=True)]
 
 
 class _Constants:
     """Numbers of one kind after one another, rows padded with zeros to whole tiles."""
 
-    def __init__(self, kind: type) -> None:
+    def __init__(self, kind: Any) -> None:
         self._kind = kind
         self._parts: list[np.ndarray] = []
         self._size = 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from player.asset import Asset
 from player.contracted_rays import MAX_SPEED
-from player.head import count_parameters
+from player.head import read_head_file
 from player.manifest import Manifest
 from player.transforms import read_cameras
 
@@ -37,13 +37,14 @@ CONTENT = {
 def facts(asset: Asset) -> dict[str, Any]:
     """Everything that `--info` knows, as JSON has it."""
     m = asset.manifest
+    _, head = read_head_file(asset.path("head.onnx"), m.n_channels)
     return {
         "bytes": {name: entry.bytes for name, entry in sorted(m.files.items())},
         "bytes_total": sum(entry.bytes for entry in m.files.values()),
         "n_bricks": len(asset.arrays.brick_coords),
         "n_vertices": len(asset.arrays.density),
         "n_feature_vertices": len(asset.arrays.features),
-        "head_parameters": count_parameters(asset.path("head.onnx").read_bytes()),
+        "head_parameters": head.n_parameters,
         "n_cameras": len(read_cameras(asset.path("cameras.json"), (m.view_size[0], m.view_size[1]))),
         "world_box": _world_box(asset),
         "world_units_per_model_unit": asset.scale,

@@ -13,7 +13,7 @@ An asset is a folder. It holds no absolute path and plays wherever it is moved. 
 | `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
 | `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored, packed |
 | `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed |
-| `head.onnx` | `features` [n, n_channels], `dirs` [n, 3] -> `rgb` [n, 3], float32 |
+| `head.onnx` | the graph of `player.head_graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
 | `report.json`, `report.html` | what the bake measured; for people, no player reads them; may be absent |

@@ -32,7 +32,7 @@ import numpy as np
 
 from player.asset import Asset
 from player.cameras import Camera, orbit
-from player.head import count_parameters
+from player.head_graph import read_head
 from player.march import MIN_OPACITY
 from player.options import positive, size
 from player.play import peak_rss_mb
@@ -125,7 +125,13 @@ def bounds(asset: Asset, parts: Parts, rates: tuple[float, float]) -> str:
     lookups = (
         parts.n_fetches * 8 * (width + 2) / speed / 1e6, parts.n_fetches * 8 * (2 * width + 4) / flops / 1e6
     )  # fmt: skip
-    head = 2 * count_parameters(asset.path("head.onnx").read_bytes()) * parts.n_rays_hit / flops / 1e6
+    head = (
+        2
+        * read_head(asset.path("head.onnx").read_bytes(), "head.onnx").n_parameters
+        * parts.n_rays_hit
+        / flops
+        / 1e6
+    )
     return (
         f"at {flops:.0f} GFLOP/s and {speed:.1f} GB/s at least: march {max(march):.1f} ms "
         f"({parts.march / max(march):.0f} times that), lookups {max(lookups):.1f} ms "

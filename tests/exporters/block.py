@@ -9,10 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper
 
 from exporters.mesh import TriangleMesh
+from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
 from player.asset import GridArrays, write_asset
 from player.bricks import pack_vertices
@@ -21,7 +20,7 @@ from player.density import encode_density
 from player.manifest import Manifest
 from player.transforms import write_cameras
 from tests.exporters.meshes import box
-from tests.player.conftest import WORLD_FROM_MODEL, look_at
+from tests.player.conftest import WORLD_FROM_MODEL, linear_head, look_at
 
 RESOLUTION = 64
 LOW, HIGH = np.array([20, 16, 24]), np.array([36, 40, 56])
@@ -59,7 +58,8 @@ def write_block(folder: Path) -> Path:
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
     )
     arrays = GridArrays(coords, masks, codes, coords, masks, (vertices * 2 - 64).astype(np.int8))
-    write_asset(folder, manifest, arrays, _head(), ply_bytes(_mesh()), write_cameras(cameras()))
+    head = head_onnx(linear_head(_WEIGHTS, np.zeros((3, 3)), _BIAS))  # the direction counts for nothing
+    write_asset(folder, manifest, arrays, head, ply_bytes(_mesh()), write_cameras(cameras()))
     return folder
 
 
@@ -90,26 +90,3 @@ def _mesh() -> TriangleMesh:
     rgba = np.concatenate([np.rint(colours(index) * 255), np.full((len(index), 1), 255)], axis=1)
     mesh = TriangleMesh(index / 32 - 1, faces.astype(np.int32), normals, rgba.astype(np.uint8))
     return mesh.transformed(np.array(WORLD_FROM_MODEL))
-
-
-def _head() -> bytes:
-    """rgb = sigmoid(features W + b): the direction counts for nothing."""
-    constants = [
-        helper.make_tensor(name, TensorProto.FLOAT, array.shape, array.reshape(-1))
-        for name, array in (("w", _WEIGHTS), ("b", _BIAS), ("none", np.zeros((3, 3))))
-    ]
-    nodes = [
-        helper.make_node("Gemm", ["features", "w", "b"], ["linear"]),
-        helper.make_node("MatMul", ["dirs", "none"], ["zero"]),
-        helper.make_node("Add", ["linear", "zero"], ["sum"]),
-        helper.make_node("Sigmoid", ["sum"], ["rgb"]),
-    ]
-    ports = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 3])
-        for name in ("features", "dirs", "rgb")
-    ]
-    graph = helper.make_graph(nodes, "head", ports[:2], ports[2:], constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.checker.check_model(model)
-    return model.SerializeToString()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import onnx
 import pytest
-from onnx import numpy_helper
 
 from exporters import surface_colour
 from exporters.surface_colour import surface_colours
@@ -13,6 +11,7 @@ from exporters.training_views import depth_views
 from player.asset import Asset
 from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS
 from tests.exporters.solids import WORLD_FROM_MODEL
+from tests.player.conftest import head_arrays
 
 SAMPLES = np.random.default_rng(3).normal(size=(200, 3))
 DIRECTIONS = SAMPLES / np.linalg.norm(SAMPLES, axis=-1, keepdims=True)
@@ -25,10 +24,9 @@ def on_the_ball(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
     return points, DIRECTIONS @ matrix[:3, :3].T / asset.scale
 
 
-def head(asset: Asset, points: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+def head(points: np.ndarray, dirs: np.ndarray) -> np.ndarray:
     """What the head says of model points seen along model directions: sigmoid(features W + dirs V)."""
-    graph = onnx.load(asset.path("head.onnx")).graph
-    w, v = (numpy_helper.to_array(tensor) for tensor in graph.initializer)
+    w, v = head_arrays()
     features = np.concatenate([(points + 1) * 90 - 90, np.full((len(points), 1), 50)], axis=-1)
     return 1 / (1 + np.exp(-(features @ w + dirs @ v)))
 
@@ -36,7 +34,7 @@ def head(asset: Asset, points: np.ndarray, dirs: np.ndarray) -> np.ndarray:
 def test_along_the_normal_without_views(ball_asset: Asset) -> None:
     points, normals = on_the_ball(ball_asset)
     rgb, known = surface_colours(ball_asset, points, normals, [])
-    expected = head(ball_asset, np.array(BALL_CENTRE) + DIRECTIONS * BALL_RADIUS, -DIRECTIONS)
+    expected = head(np.array(BALL_CENTRE) + DIRECTIONS * BALL_RADIUS, -DIRECTIONS)
     assert known.all()
     # the place that is drawn is a mean over a voxel or two of depth: 1.25 codes a voxel of 0.02 each
     assert np.abs(rgb - expected).max() < 0.06 and np.abs(rgb - expected).mean() < 0.02
@@ -54,7 +52,7 @@ def test_mean_of_the_cameras_that_see_it(ball_asset: Asset, monkeypatch: pytest.
         towards = eye[:3] - model
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
         cosines = np.maximum((towards * DIRECTIONS).sum(-1, keepdims=True), 0)
-        total += cosines * head(ball_asset, model, -towards)
+        total += cosines * head(model, -towards)
         weight += cosines
     assert known.all() and (weight > 0).mean() > 0.95
     clear = weight[:, 0] > 0.3

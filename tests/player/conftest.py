@@ -8,10 +8,9 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
 
+from exporters.onnx_head import HeadWeights, head_onnx
 from player.asset import Asset, GridArrays, write_asset
 from player.bricks import pack_vertices
 from player.density import encode_density
@@ -24,27 +23,35 @@ STEP = 0.9 * 2 / RESOLUTION
 WORLD_FROM_MODEL = [[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, 2.0], [0.0, 0.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def head_bytes(n_channels: int = 4, output: str = "rgb") -> bytes:
-    """rgb = sigmoid(features W + dirs V), 3 channels out of `n_channels`."""
-    rng = np.random.default_rng(0)
-    w = helper.make_tensor("w", TensorProto.FLOAT, [n_channels, 3], rng.normal(0, 0.02, n_channels * 3))
-    v = helper.make_tensor("v", TensorProto.FLOAT, [3, 3], rng.normal(0, 0.5, 9))
-    nodes = [
-        helper.make_node("MatMul", ["features", "w"], ["a"]),
-        helper.make_node("MatMul", ["dirs", "v"], ["b"]),
-        helper.make_node("Add", ["a", "b"], ["c"]),
-        helper.make_node("Sigmoid", ["c"], [output]),
-    ]
+def head_arrays(n_channels: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """W [n_channels, 3] and V [3, 3] of `head_bytes`."""
+    random = np.random.default_rng(0)
+    w, v = random.normal(0, 0.02, (n_channels, 3)), random.normal(0, 0.5, (3, 3))
+    return w.astype(np.float32), v.astype(np.float32)
 
-    def port(name: str, width: int) -> onnx.ValueInfoProto:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
 
-    graph = helper.make_graph(
-        nodes, "head", [port("features", n_channels), port("dirs", 3)], [port(output, 3)], [w, v]
+def linear_head(w: np.ndarray, v: np.ndarray, b: np.ndarray) -> HeadWeights:
+    """rgb = sigmoid(features W + dirs V + b) as a head: gelu(x) - gelu(-x) = x.
+
+    W [n_channels, 3], V [3, 3], b [3].
+    """
+    both, apart = np.concatenate([np.eye(3), -np.eye(3)], axis=1), np.concatenate([np.eye(3), -np.eye(3)])
+    # bands 0 and 1 of the spherical harmonics: a constant, -y, z, -x times sqrt(3 / 4 pi)
+    of_basis = np.array([np.zeros(3), -v[1], v[2], -v[0]]) / np.sqrt(3 / (4 * np.pi))
+    return HeadWeights(
+        spatial=((w.astype(np.float64) @ both, b @ both),),
+        to_sh=(np.zeros((6, 4)), np.ones(4)),
+        directional_first=(apart @ both, of_basis @ both, np.zeros(6)),
+        directional=(),
+        output=(apart, np.zeros(3)),
+        sh_degree=2,
+        n_sh_features=1,
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    return model.SerializeToString()
+
+
+def head_bytes(n_channels: int = 4) -> bytes:
+    """rgb = sigmoid(features W + dirs V), with `head_arrays`."""
+    return head_onnx(linear_head(*head_arrays(n_channels), np.zeros(3)))
 
 
 def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:

@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 
 from player.asset import _map_array
 from player.errors import ConfigError, FormatError
-from player.head import Head
 from player.manifest import NAME, parse_manifest
 from player.transforms import parse_transforms, transforms_cameras
-from tests.player.conftest import cameras_bytes, head_bytes
+from tests.player.conftest import cameras_bytes
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
@@ -72,16 +70,6 @@ def test_an_angle_below_every_number() -> None:
     assert all(math.isfinite(camera.fx) and camera.fx > 1e300 for camera in cameras)
 
 
-def test_a_dimension_whose_name_is_no_text(tmp_path: Path) -> None:
-    """onnxruntime loads it, and decodes the name when it is asked for."""
-    data = head_bytes(4)
-    assert data.count(b"\x12\x01n") > 0  # dim_param "n"
-    path = tmp_path / "head.onnx"
-    path.write_bytes(data.replace(b"\x12\x01n", b"\x12\x01\xee"))
-    with pytest.raises(FormatError, match="expected names in UTF-8"):
-        Head(path, 4)
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -101,22 +89,3 @@ def test_values_of_a_model_that_are_none_of_ours(
     with pytest.raises(FormatError, match=message) as caught:
         load_model(path)
     assert len(str(caught.value)) < 300 and "\n" not in str(caught.value)
-
-
-def test_a_failure_whose_message_is_no_text(tmp_path: Path) -> None:
-    """onnxruntime repeats the name of the node in its message."""
-    model = onnx.load_from_string(head_bytes(4))
-    for node in model.graph.node:
-        node.output[:] = ["rgb_" if name == "rgb" else name for name in node.output]
-    model.graph.node.extend(
-        [
-            onnx.helper.make_node("Shape", ["dirs"], ["n_by_3"]),
-            onnx.helper.make_node("Add", ["n_by_3", "one"], ["larger"]),
-            onnx.helper.make_node("Reshape", ["rgb_", "larger"], ["rgb"], name="node"),
-        ]
-    )
-    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([1]), "one"))
-    path = tmp_path / "head.onnx"
-    path.write_bytes(model.SerializeToString().replace(b"node", b"nod\xff"))
-    with pytest.raises(FormatError, match="expected a head that runs"):
-        Head(path, 4)(np.zeros((2, 4), np.float32), np.zeros((2, 3), np.float32))

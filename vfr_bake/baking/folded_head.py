@@ -1,7 +1,7 @@
 """The exported head in torch, to be tuned: in float32, or as it is played in 8 bits.
 
-Letters as in `exporters.onnx_head`. What 8 bits round, activations to 256 levels of a fixed range and weights
-to 127 on either side of 0 for each output, is rounded in the same places, and learns as if it were not
+Letters as in `player.head_graph`. What 8 bits round, activations to 256 levels of a fixed range and weights
+as `exporters.onnx_head.weight_scales` says, is rounded in the same places, and learns as if it were not
 (straight through).
 """
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from exporters.onnx_head import HeadWeights, Layer, Range, levels
+from player.head_graph import PAIR_LIMIT
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 
 
@@ -75,7 +76,8 @@ class FoldedHead(nn.Module):
         if self._ranges is None:
             return weight
         w = weight.detach()
-        scales = w.abs().amax(dim=0).clamp_min(1e-12) / 127
+        pairs = nn.functional.pad(w.abs(), (0, 0, 0, len(w) % 2)).unflatten(0, (-1, 2)).sum(dim=1)
+        scales = pairs.amax(dim=0).clamp_min(1e-12) / (PAIR_LIMIT - 1)
         return weight + ((w / scales).round_() * scales - w)
 
     def _layers(self) -> tuple[list[tuple[Tensor, Tensor]], tuple[Tensor, Tensor, Tensor]]:

@@ -19,7 +19,7 @@ from torch.nn.functional import gelu
 
 from exporters.asset_head import comparisons, head_bytes
 from exporters.int8_head import activation_ranges
-from exporters.onnx_head import HeadWeights, Range, head_onnx
+from exporters.onnx_head import HeadWeights, Range, head_onnx, weight_scales
 from player.asset import Asset
 from tests.exporters import block
 from vfr_bake.baking.head_weights import fold_head
@@ -129,7 +129,7 @@ def quantised(
 
     def layer(x: torch.Tensor, weight: np.ndarray, bias: np.ndarray) -> torch.Tensor:
         w = tensor(weight)
-        scales = w.abs().amax(dim=0) / 127
+        scales = torch.from_numpy(weight_scales(weight))
         zeros = torch.zeros(len(scales), dtype=torch.int32)
         w = torch.fake_quantize_per_channel_affine(w, scales, zeros, 1, -127, 127)
         return x @ w + tensor(bias)
