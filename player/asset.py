@@ -56,6 +56,9 @@ Names = tuple[str, str, str]
 _DENSITIES: Names = ("brick_coords", "brick_masks", "density")
 _FEATURES: Names = ("feature_coords", "feature_masks", "features")
 
+MAX_VERTICES = 2**31 - 1
+"""Stored vertices of a grid, whose rows are numbered in 32 bits (`player.vertex_rows`)."""
+
 
 @dataclass(frozen=True, eq=False)
 class GridArrays:
@@ -78,6 +81,10 @@ class GridArrays:
         coords, masks = getattr(self, coords_name), getattr(self, masks_name)
         n_bricks = len(coords) if coords.ndim else 0
         n_vertices = int(np.bitwise_count(masks).sum()) if masks.dtype.kind == "u" else 0
+        if n_vertices > MAX_VERTICES:
+            raise FormatError(
+                f"{where}{_FILES[masks_name]}: expected at most {MAX_VERTICES} vertices, got {n_vertices}"
+            )
         shapes = {
             coords_name: (n_bricks, 3),
             masks_name: (n_bricks, 8),

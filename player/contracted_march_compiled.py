@@ -29,10 +29,12 @@ def march(
     n_rays = len(rays_o)
     rays = enter_space(grid, rays_o, rays_d)
     table = lattice(float(grid.step))
+    capacity = table.shape[1]
+    k = min(n_samples, capacity)  # no ray has more samples
     out = result_arrays(n_rays, grid.n_channels)
     packet = scratch((SPACE_ROWS + 1, LANES), F32, 0)
-    found = scratch((2, table.shape[1], LANES), F32), scratch((SUMS, LANES), F32)
-    fetches = fetch_arrays(n_samples)
+    found = scratch((2, capacity, LANES), F32), scratch((SUMS, LANES), F32)
+    fetches = fetch_arrays(k)
     half = grid.step * F32(0.5)
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.density_low, grid.density_slope),
@@ -42,7 +44,7 @@ def march(
         (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (*rays.nearest, *rays.along, rays.cos, rays.sin, rays.width, rays.length, rays.t_nearest),
         table,
-        n_samples,
+        k,
         packet,
         found,
         fetches,

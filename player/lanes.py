@@ -131,6 +131,10 @@ class Lanes:
         """Towards zero."""
         return self._new(self.b.fptosi(self.value, vector(INT)))
 
+    def wide(self) -> Lanes:
+        """Integers in 64 bits, for what a large grid counts further than 32 bits do."""
+        return self._new(self.b.sext(self.value, vector(LONG)))
+
     def halves(self) -> tuple[Lanes, Lanes]:
         """The lower and the upper int32 of integers of 64 bits."""
         upper = self.b.lshr(self.value, self._other(32))
@@ -197,18 +201,22 @@ def store(base: Any, first: Any, values: Lanes) -> None:
     b.store(values.value, place, align=4)
 
 
-def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT) -> Lanes:
+def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT, offset: int = 0) -> Lanes:
     """Integers of a `kind` that begin `index` times `size` bytes behind the address `base`, of the lanes that
     are true in `where`; the others read what is at `base`, and are 0.
+
+    `index` is in 32 bits or, `wide`, in 64; in bytes it is 64 bits either way. `offset` is a number that is
+    added to the index of all lanes: what is gathered around one index shares all but the reading.
 
     One by one: the gathering instructions of Intel's processors take a fifth longer here.
     """
     b = where.b
     numbers = choose(where, index, 0).value
-    start = b.bitcast(base, ir.PointerType(BYTE))
+    start = b.gep(b.bitcast(base, ir.PointerType(BYTE)), [LONG(offset * size)])
     words: Any = ir.Constant(vector(kind), ir.Undefined)
     for lane in range(LANES):
-        at = b.mul(b.sext(b.extract_element(numbers, INT(lane)), LONG), LONG(size))
+        number = b.extract_element(numbers, INT(lane))
+        at = b.mul(number if index.element == LONG else b.sext(number, LONG), LONG(size))
         place = b.bitcast(b.gep(start, [at]), ir.PointerType(kind))
         words = b.insert_element(words, b.load(place, align=1), INT(lane))
     return choose(where, Lanes(b, words), 0)

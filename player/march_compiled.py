@@ -32,10 +32,12 @@ def march(
     n_rays = len(rays_o)
     near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
     far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
+    capacity = grid.most_samples
+    k = min(n_samples, capacity)  # no ray has more samples
     out = result_arrays(n_rays, grid.n_channels)
     packet = scratch((BOX_ROWS + 1, LANES), F32, 0), scratch(LANES, np.int32)
-    found = scratch((2, grid.most_samples, LANES), F32), scratch((SUMS, LANES), F32)
-    fetches = fetch_arrays(n_samples)
+    found = scratch((2, capacity, LANES), F32), scratch((SUMS, LANES), F32)
+    fetches = fetch_arrays(k)
     origin, scale = tuple(grid.aabb_min), tuple(grid.cells_per_unit)
     n_hits = _march_rays(
         (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
@@ -43,7 +45,7 @@ def march(
         (grid.rows.bricks, grid.rows.rows, grid.features),
         (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
         (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
-        n_samples,
+        k,
         packet,
         found,
         fetches,
@@ -103,7 +105,8 @@ def _enter(settings, rays, start, n_lanes, longest, entered, first):
         length = min(min(t_out - t_in, longest), far[ray] - t_in)
         if not length > F32(0.0):
             continue
-        first[lane] = max(math.floor(max(near[ray] - t_in, F32(0.0)) / step - F32(0.5)), 0)
+        ahead = max(near[ray] - t_in, F32(0.0)) / step - F32(0.5)
+        first[lane] = max(math.floor(min(ahead, F32(1e9))), 0)
         entered[0, lane] = min(max(ox + t_in * dx, F32(0.0)), size)
         entered[1, lane] = min(max(oy + t_in * dy, F32(0.0)), size)
         entered[2, lane] = min(max(oz + t_in * dz, F32(0.0)), size)

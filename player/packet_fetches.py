@@ -34,16 +34,19 @@ from player.lanes import (
 class _Chosen:
     """The table that fetches are written into: [3, n, LANES] float32, s, weight, another s."""
 
-    def __init__(self, base: Any, pitch: Lanes, lane: Lanes, full: Lanes) -> None:
-        self._base, self._pitch, self._lane = base, pitch, lane
-        self.n = Variable(full)
+    def __init__(self, base: Any, most: Any, lane: Lanes) -> None:
+        """most: fetches that a ray can have, k, in 64 bits."""
+        b = lane.b
+        self._rows = [b.gep(base, [b.mul(most, LONG(row * LANES))]) for row in range(3)]
+        self._lane = lane
+        self.n = Variable(lane.like(0))
 
     def add(self, s: Lanes, weight: Lanes, other: Lanes, where: Lanes) -> None:
         """The next fetch of the rays in `where`."""
         n = self.n.get()
         at = n * LANES + self._lane
-        for row, values in enumerate((s, weight, other)):
-            scatter(self._base, at + self._pitch * row, values, where)
+        for row, values in zip(self._rows, (s, weight, other), strict=True):
+            scatter(row, at, values, where)
         self.n.set(choose(where, n + 1, n))
 
 
@@ -61,7 +64,7 @@ def _choose_fetches(_: Any, samples: Any, n_rows: Any, sums: Any, mass: Any, cho
         bins = room.to_float()
         visible = load(b, opacity, LONG(0))
         zero = total.like(0.0)
-        out = _Chosen(table, room * LANES, one_each, room.like(0))
+        out = _Chosen(table, most, one_each)
         cut = n_weights > bins  # rays with more samples than bins
         share, weight_of_bin = total / bins, visible / bins
         no_other = zero.like(float("nan"))
@@ -142,11 +145,11 @@ def _stored_corners(
         x, y, z = (cell >> 3 for cell in low)
         held = gather(bricks, (x * n_per_axis + y) * n_per_axis + z, 4, resolution > 0)
         x, y, z = (cell & 7 for cell in low)
-        first = held * 729 + x * 81 + y * 9 + z
+        first = held.wide() * 729 + (x * 81 + y * 9 + z).wide()
         total = scale.like(0.0)
         parts = []
         for x, y in np.ndindex(2, 2):
-            pair = gather(of_bricks, first + (x * 81 + y * 9), 4, held > -1, LONG).halves()
+            pair = gather(of_bricks, first, 4, held > -1, LONG, x * 81 + y * 9).halves()
             for z, row in enumerate(pair):
                 there = (held > -1) & (row > -1)
                 parts.append(

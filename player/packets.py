@@ -103,21 +103,20 @@ class _Box:
 
 
 class _Space:
-    def __init__(self, b: Any, packet: Any, lattice: Any, pitch: Lanes, numbers: list[Lanes]) -> None:
-        """pitch: samples that the lattice has. numbers: cos and sin of half a step of phi, sin of a step,
-        cells that a step makes at most, cells in a contracted unit."""
+    def __init__(self, b: Any, packet: Any, lattice: Any, pitch: Any, numbers: list[Lanes]) -> None:
+        """pitch: samples that the lattice has, in 64 bits. numbers: cos and sin of half a step of phi, sin of
+        a step, cells that a step makes at most, cells in a contracted unit."""
         rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
         self._p, self._wd = rows[:3], rows[3:6]
         self._cos0, self._sin0, self._width, self._length = rows[6:]
-        self._lattice, self._pitch = lattice, pitch
+        self._lattice = [b.gep(lattice, [b.mul(pitch, LONG(row))]) for row in range(3)]
+        self._end = splat(b, b.trunc(pitch, INT)) - SPARE
         self._cos_half, self._sin_half, self._sin_step, self._fastest, self._cells = numbers
         self._turned: tuple[Lanes, Lanes]
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
-        active = active & (i < self._pitch - SPARE)
-        s, cos_s, sin_s = (
-            gather(self._lattice, i + self._pitch * row, 4, active).as_float() for row in range(3)
-        )
+        active = active & (i < self._end)
+        s, cos_s, sin_s = (gather(row, i, 4, active).as_float() for row in self._lattice)
         cos = self._cos0 * cos_s - self._sin0 * sin_s
         sin = self._sin0 * cos_s + self._cos0 * sin_s
         self._turned = cos, sin
@@ -169,13 +168,12 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
             i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))
         with b.if_then(busy.any()):  # a grid without a slot has nothing to read
             within = [c & 7 for c in cell]
-            column = (slot << 6) + (within[0] << 3) + within[1]
-            word = gather(grid.live, column >> 2, 4, busy)
-            bit = ((column & 3) << 3) + within[2]
+            word = gather(grid.live, (slot << 4) + (within[0] << 1) + (within[1] >> 2), 4, busy)
+            bit = ((within[1] & 3) << 3) + within[2]
             lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
             live = lit.is_not(0)
             with b.if_then(live.any()):
-                at = slot * 729 + within[0] * 81 + within[1] * 9 + within[2]
+                at = slot.wide() * 729 + (within[0] * 81 + within[1] * 9 + within[2]).wide()
                 f = [x - c.to_float() for x, c in zip(g, cell, strict=True)]
                 code = _trilinear(grid.density, at, f, live)
                 optical = (grid.low + grid.slope * code).exp() * path.way()
@@ -224,7 +222,7 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
     """Codes between the corners of cells: along z, then y, then x."""
 
     def along_z(offset: int) -> Lanes:
-        pair = gather(density, at + offset, 1, where)
+        pair = gather(density, at, 1, where, offset=offset)
         low, high = (pair & 255).to_float(), ((pair >> 8) & 255).to_float()
         return low + (high - low) * f[2]
 
@@ -280,7 +278,7 @@ def _march_space(
         pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
         n = b.udiv(context.make_array(lattice)(context, b, arguments[2]).nitems, LONG(3))
         of_steps = [splat(b, b.extract_value(arguments[3], i)) for i in range(5)]
-        path = _Space(b, rows, table, splat(b, b.trunc(n, INT)), of_steps)
+        path = _Space(b, rows, table, n, of_steps)
         return _collect(b, grid, path, grid.last.like(0), places, pitch, found)
 
     return types.int64(lookup, numbers, lattice, steps, packet, samples, out), generate

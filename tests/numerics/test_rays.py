@@ -188,13 +188,3 @@ def test_rays_of_a_camera_are_unit(focal: float, place: float) -> None:
     _, rays_d = camera.rays()
     lengths = np.linalg.norm(rays_d.astype(np.float64), axis=1)
     np.testing.assert_allclose(lengths, 1, rtol=0, atol=2**-23)
-
-
-def test_indices_of_the_largest_grid_fit_their_integers() -> None:
-    """Dense tables are addressed in 32 bits, everything a brick holds in 64."""
-    from player.bricks import bricks_per_axis
-    from player.manifest import MAX_RESOLUTION
-
-    n = bricks_per_axis(MAX_RESOLUTION)
-    assert n**3 < 2**31 and n**3 * 64 < 2**31 * 2
-    assert np.int64(n**3) * 729 > 2**31, "so densities are addressed in 64 bits"

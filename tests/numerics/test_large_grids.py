@@ -1,0 +1,242 @@
+"""Compiled code on arrays of more than 2^31 numbers: marches, fetches and training's kernels against numpy.
+
+The arrays are holes in files: only the pages that are touched cost memory, and none of them is on a disk for
+long.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+from player import contracted_march, contracted_march_compiled, march, march_compiled
+from player.asset import GridArrays
+from player.bricks import bricks_per_axis
+from player.contracted_rays import MAX_SPEED
+from player.errors import FormatError
+from player.few_samples import MIN_TOTAL, stored_features
+from player.manifest import MAX_RESOLUTION, Manifest
+from player.sparse_grid import SPARE, SparseGrid
+from player.vertex_rows import VertexRows
+from tests.player.test_contracted_march import some_rays
+from tests.player.test_march import random_rays
+from vfr_bake.baking.lessons import corners
+from vfr_bake.kernels import adam, hash_grid, proposals
+from vfr_bake.kernels.stored_features import compose, descend, descend_density
+
+F32 = np.float32
+N_CHANNELS = 10
+LAST_IN_32_BITS = 2**31 // 729 - 1
+"""The last slot whose densities have indices below 2^31."""
+MOST_SLOTS = bricks_per_axis(MAX_RESOLUTION) ** 3
+"""Of a grid that the format allows."""
+MOST_ROWS = 2**31 - 1
+
+
+class Zeros(Protocol):
+    """`np.zeros`, of which only what is touched takes memory."""
+
+    def __call__(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray: ...
+
+
+@pytest.fixture
+def zeros(tmp_path: Path) -> Zeros:
+    n = 0
+
+    def make(shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
+        nonlocal n
+        n += 1
+        mapped = np.memmap(tmp_path / str(n), dtype, "w+", shape=shape)
+        (tmp_path / str(n)).unlink()  # the pages go when the array does
+        return np.asarray(mapped)
+
+    return make
+
+
+def grid_behind(zeros: Zeros, n_slots: int, n_rows: int, contracted: bool) -> SparseGrid:
+    """A grid of eight bricks, all cells live: the last of `n_slots`, with the last of `n_rows` features."""
+    rng = np.random.default_rng(0)
+    resolution = 15
+    slots = np.arange(n_slots - 8, n_slots, dtype=np.int32)
+    live, density = zeros(n_slots * 64, np.uint8), zeros(n_slots * 729 + SPARE, np.uint8)
+    live[-8 * 64 :] = 255
+    density[-8 * 729 - SPARE :] = rng.integers(0, 256, 8 * 729 + SPARE)
+    rows = zeros(n_slots * 729, np.int32)
+    rows[-8 * 729 :] = rng.integers(n_rows - 5000, n_rows, 8 * 729)
+    rows[-4 * 729 :: 7] = -1
+    features = zeros((n_rows, N_CHANNELS), np.int8)
+    features[-5000:] = rng.integers(-127, 128, (5000, N_CHANNELS))
+    box = 2.0 if contracted else 1.0
+    return SparseGrid(
+        resolution=resolution,
+        n_per_axis=2,
+        aabb_min=np.full(3, -box, F32),
+        cells_per_unit=np.full(3, resolution / (2 * box), F32),
+        step=F32(4 / 96 / float(MAX_SPEED)) if contracted else F32(1 / 40),
+        density_low=F32(-2),
+        density_slope=F32(4 / 255),
+        slot_coords=np.argwhere(np.ones((2, 2, 2))).astype(np.int32),
+        table=slots,
+        live=live,
+        density=density,
+        rows=VertexRows(resolution, 2, slots.copy(), rows),
+        features=features,
+        contracted=contracted,
+    )
+
+
+SIZES = pytest.mark.parametrize(
+    ("n_slots", "n_rows"),
+    [
+        (LAST_IN_32_BITS + 1, 2**31 // N_CHANNELS),
+        (LAST_IN_32_BITS + 9, 2**31 // N_CHANNELS + 5000),
+        (LAST_IN_32_BITS * 3, 2**30),  # where 32 bits wrap around to what is there, and elsewhere
+        (MOST_SLOTS, MOST_ROWS),
+    ],
+)
+
+
+@SIZES
+@pytest.mark.parametrize("k", [0, 3])
+@pytest.mark.parametrize(
+    ("compiled", "plain"),
+    [(march_compiled, march), (contracted_march_compiled, contracted_march)],
+    ids=["box", "space"],
+)
+def test_compiled_marches_reach_the_last_slot(
+    compiled: ModuleType, plain: ModuleType, k: int, n_slots: int, n_rows: int, zeros: Zeros
+) -> None:
+    grid = grid_behind(zeros, n_slots, n_rows, contracted=plain is contracted_march)
+    rays = some_rays(40) if grid.contracted else random_rays(40)
+    got, expected = compiled.march(grid, *rays, k), plain.march(grid, *rays, k)
+    assert len(expected.hits) > 20 and np.abs(expected.features).max() > 20
+    np.testing.assert_array_equal(got.n_samples, expected.n_samples)
+    np.testing.assert_array_equal(got.hits, expected.hits)
+    np.testing.assert_allclose(got.opacity, expected.opacity, rtol=0, atol=5e-6)
+    np.testing.assert_allclose(got.depth, expected.depth, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(got.features, expected.features, rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize("n_samples", [2**31, 10**30])
+@pytest.mark.parametrize("module", [march_compiled, contracted_march_compiled], ids=["box", "space"])
+def test_no_number_of_fetches_is_too_large(module: ModuleType, n_samples: int, zeros: Zeros) -> None:
+    """Nothing is allocated or addressed by it beyond the samples that a ray can have."""
+    grid = grid_behind(zeros, 8, 5000, contracted=module is contracted_march_compiled)
+    rays = some_rays(40) if grid.contracted else random_rays(40)
+    np.testing.assert_array_equal(
+        module.march(grid, *rays, n_samples).features, module.march(grid, *rays, 0).features
+    )
+
+
+@SIZES
+def test_fetches_of_the_bake_reach_the_last_brick(n_slots: int, n_rows: int, zeros: Zeros) -> None:
+    grid = grid_behind(zeros, n_slots, n_rows, contracted=False)
+    points = np.random.default_rng(1).uniform(-1, 16, (200, 3)).astype(F32)
+    rows, shares = corners(grid.rows, points, F32(0))
+    assert rows[shares > 0].min() >= n_rows - 5000
+    values = (shares[:, :, None] * grid.features[rows].astype(F32)).sum(axis=1)
+    expected, total = stored_features(grid, points.T)
+    assert (total > MIN_TOTAL).all()
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-4)
+
+
+def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
+    """Composites of and steps on the last rows, as on the same rows alone."""
+    n_rows = 2**31 // N_CHANNELS + 1000
+    rng = np.random.default_rng(2)
+    near = rng.integers(0, 1000, (50, 8)).astype(np.int32)
+    far = near + np.int32(n_rows - 1000)
+    shares = rng.uniform(0, 1, (50, 8)).astype(F32)
+    starts, weights = np.arange(0, 51, 10), rng.uniform(0, 1, 50).astype(F32)
+    gradient = rng.normal(size=(5, N_CHANNELS)).astype(F32)
+    small, codes = rng.uniform(0, 100, (1000, N_CHANNELS)).astype(F32), rng.uniform(0, 100, 1000).astype(F32)
+    large, large_codes = zeros((n_rows, N_CHANNELS), F32), zeros(MOST_ROWS, F32)
+    large[-1000:], large_codes[-1000:] = small, codes
+    out = []
+    for latent, rows in ((small, near), (large, far)):
+        composites, steepness = np.empty((5, N_CHANNELS), F32), zeros(len(latent), F32)
+        compose(starts, rows, shares, weights, latent, composites)
+        descend(starts, rows, shares, weights, gradient, F32(0.5), 2, latent, steepness)
+        out.append((composites, latent[-1000:], steepness[-1000:]))
+    for latent, offset in ((codes, 0), (large_codes, MOST_ROWS - 1000)):
+        steepness = zeros(len(latent), F32)
+        descend_density(near + np.int32(offset), shares, weights, F32(0.5), 2, latent, steepness)
+        out.append((latent[-1000:], steepness[-1000:]))
+    for ours, expected in ((out[1], out[0]), (out[3], out[2])):
+        for a, b in zip(ours, expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+            assert b.any()
+
+
+SCALES = np.array([7, 12, 30], F32)
+HASHED = np.array([False, False, True])
+MASK = 2**12 - 1
+NEAR = np.array([0, 1000, 4000])
+FAR = NEAR + np.array([2**30 - 500, 2**31 - 500, 2**32 + 77])  # rows; two channels or one in each
+
+
+@pytest.mark.parametrize("n_channels", [1, 2])
+def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
+    """Looked up, scattered to and stepped far behind, as in a table of the same rows alone."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0, 1, (60, 3)).astype(F32)
+    sizes = [9**3, 14**3, MASK + 1]
+    values = [rng.normal(size=(size, n_channels)).astype(F32) for size in sizes]
+    gradient = rng.normal(size=(60, 2 * len(SCALES))).astype(F32)
+    found: list[list[Any]] = []
+    for offsets in (NEAR, FAR):
+        n_rows = int(offsets[-1]) + sizes[-1]
+        table, grad = zeros((n_rows, n_channels), F32), zeros((n_rows, n_channels), F32)
+        parts = [slice(int(first), int(first) + size) for first, size in zip(offsets, sizes, strict=True)]
+        for part, value in zip(parts, values, strict=True):
+            table[part] = value
+        levels = SCALES, offsets, HASHED, MASK
+        if n_channels == 1:
+            proposals.scatter_logits(points, gradient[:, 0].copy(), *levels, 2, grad)
+            edges = np.linspace(0.1, 0.9, 9, dtype=F32)[None].repeat(60, 0)
+            arrays = [np.zeros((60, 8, *more), F32) for more in [(), (3,), ()] * 2]
+            rounds = [[edges.copy(), *arrays[3 * i : 3 * i + 3]] for i in range(2)]
+            proposals.propose(
+                points, points, np.full((60, 3), 0.5, F32), (F32(0.1), F32(0.9)), F32(1), (table, *levels),
+                (table, *levels), (F32(10), F32(10)), *rounds[0], *rounds[1], edges,
+            )  # fmt: skip
+            found.append([edges, *rounds[0][1:], *rounds[1][1:], *(grad[part] for part in parts)])
+            continue
+        out = np.empty((60, 2 * len(SCALES)), F32)
+        hash_grid.encode(points, table, *levels, out)
+        hash_grid.scatter(points, gradient, *levels, 2, grad)
+        moments = zeros((n_rows, 4), F32)
+        of_level, rows = np.zeros((2, max(sizes), 2), F32), np.empty((2, 8 * len(points) + 1), np.uint32)
+        rates = [F32(x) for x in (0.1, 0.9, 0.99, 1e-8)]
+        adam.scatter_and_step(points, gradient, *levels, of_level, rows, table, moments, *rates)
+        found.append([out, *(array[part] for array in (grad, table, moments) for part in parts)])
+    for ours, expected in zip(found[1], found[0], strict=True):
+        np.testing.assert_array_equal(ours, expected)
+        assert expected.any()
+
+
+def test_what_is_counted_in_32_bits_fits() -> None:
+    """Numbers of bricks and the words of live cells; everything else that grows with a grid has 64."""
+    assert MOST_SLOTS * 16 < 2**31
+
+
+def test_more_vertices_than_rows_have_numbers_are_refused() -> None:
+    n_bricks = 2**31 // 512
+    manifest = Manifest(
+        generator="test",
+        resolution=MAX_RESOLUTION,
+        feature_resolution=MAX_RESOLUTION,
+        step=0.1,
+        density_range=(-5, 5),
+        n_channels=1,
+        view_size=(4, 3),
+    )
+    coords = np.broadcast_to(np.uint16(0), (n_bricks, 3))
+    masks = np.broadcast_to(np.uint64(2**64 - 1), (n_bricks, 8))
+    arrays = GridArrays(coords, masks, np.zeros(1, np.uint8), coords, masks, np.zeros((1, 1), np.int8))
+    with pytest.raises(FormatError, match="at most 2147483647 vertices, got 2147483648"):
+        arrays.check(manifest, "")
