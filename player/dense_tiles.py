@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.lanes import BYTE, FLOAT, INT, LANES, LONG, Lanes, address, load, splat, store, vector
+from player.lanes import FLOAT, INT, LANES, LONG, Lanes, address, load, splat, store, vector
+from player.processor import multiplies_bytes
 
 ROWS = 12 if LANES == 16 else 6
 """32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
@@ -26,10 +27,10 @@ QUAD = 4
 MOST_BYTES = 256
 """Inputs of a layer in 8 bits, at most: bytes from a pixel to the next. A number that the compiler knows
 saves it a register for each row."""
-_features = binding.get_host_cpu_features()
-MULTIPLIES_BYTES = bool(_features.get("avx512vnni" if LANES == 16 else "avxvnni"))
+MULTIPLIES_BYTES = multiplies_bytes(QUAD * LANES)
 """Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
+"""Its operands are words of QUAD bytes, as until LLVM 21; later ones take that for what they write."""
 
 
 def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any) -> Any:
@@ -131,19 +132,15 @@ def _dense_bytes(
         x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
         x_rows = [builder.bitcast(row, quads) for row in x_rows]
         words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
-        lanes, quartets = vector(INT), ir.VectorType(BYTE, QUAD * LANES)
-        dot = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(lanes, [lanes, quartets, quartets]), _DOT
-        )
+        lanes = vector(INT)
+        dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
         with cgutils.for_range(builder, arguments[7]) as loop:
             at = builder.mul(loop.index, LONG(WIDTH))
             columns = [load(builder, words, builder.add(at, LONG(half * LANES)), INT) for half in range(2)]
-            columns = [builder.bitcast(column.value, quartets) for column in columns]
             for row in range(ROWS):
                 quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
                 for half in range(2):
-                    factors = builder.bitcast(quad.value, quartets), columns[half]
-                    total = builder.call(dot, [sums.get(row, half).value, *factors])
+                    total = builder.call(dot, [sums.get(row, half).value, quad.value, columns[half].value])
                     sums.set(row, half, Lanes(builder, total))
         halves = [load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)]
         sums.write(here, out, lambda x, half: x.to_float() * halves[half])

@@ -12,11 +12,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba.core import cgutils
 
-LANES = 16 if binding.get_host_cpu_features().get("avx512f") else 8
-"""Numbers in a vector: as many as a register of the processor holds."""
+from player.processor import has_wide_registers
+
+LANES = 16 if has_wide_registers() else 8
+"""Numbers in a vector: as many as a register of the processor holds, or two where it holds four."""
 
 FLOAT, INT, LONG, BYTE = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(8)
 _SIZES = {FLOAT: "f32", INT: "i32"}

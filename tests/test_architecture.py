@@ -45,6 +45,7 @@ TOP_LEVEL_EXCEPTIONS = {
             "packet_fetches",
             "packets",
             "prefetch",
+            "processor",
         )
     ),
     ("vfr_bake/options.py", "tyro"),

@@ -26,6 +26,17 @@ def _exp(_: Any, x: Any, out: Any) -> Any:
     return types.void(x, out), generate
 
 
+def _fma(_: Any, x: Any, y: Any, out: Any) -> Any:
+
+    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
+        x, y, out = (_address(context, b, *pair) for pair in zip(signature.args, arguments, strict=True))
+        first, second = load(b, x, LONG(0)), load(b, y, LONG(0))
+        store(out, LONG(0), first.call("fma", second, load(b, out, LONG(0))))
+        return context.get_dummy_value()
+
+    return types.void(x, y, out), generate
+
+
 def _gather(_: Any, words: Any, index: Any, out: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
@@ -42,6 +53,7 @@ def _gather(_: Any, words: Any, index: Any, out: Any) -> Any:
 
 
 exp_lanes: Any = intrinsic(_exp)
+fma_lanes: Any = intrinsic(_fma)
 gather_lanes: Any = intrinsic(_gather)
 
 
@@ -49,6 +61,11 @@ gather_lanes: Any = intrinsic(_gather)
 def exp_of(x, out):
     for first in range(0, x.size, LANES):
         exp_lanes(x[first : first + LANES], out[first : first + LANES])
+
+
+@njit
+def fused(x, y, out):
+    fma_lanes(x, y, out)
 
 
 @njit
@@ -88,3 +105,16 @@ def test_lanes_read_where_they_are_told_to() -> None:
     held = index >= 0
     assert (found[0] == np.where(held, words[index], 0)).all()
     assert (found[1] == np.where(held, words[index + 1], 0)).all()
+
+
+def test_multiply_and_add_are_rounded_once() -> None:
+    """On a processor that has no instruction for it, too: there a function of the C library is called."""
+    random = np.random.default_rng(1)
+    for _ in range(100):
+        x, y = random.normal(size=(2, LANES)).astype(np.float32)
+        z = (-x * y).astype(np.float32)  # what is left is what a product rounded to float32 has lost
+        out = z.copy()
+        fused(x, y, out)
+        exact = x.astype(np.float64) * y + z  # products of float32, and this sum, are exact in float64
+        np.testing.assert_array_equal(out, exact.astype(np.float32))
+        assert np.abs(exact).max() > 0

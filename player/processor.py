@@ -1,0 +1,60 @@
+"""What the processor has that numba compiles for: this machine's, or the one that NUMBA_CPU_NAME and
+NUMBA_CPU_FEATURES name.
+
+LLVM knows which name has which instructions, and does not say so. It is asked by what it makes of a few lines
+that every processor can run: a sum of sixteen numbers tells how wide its registers are, a sum of products of
+bytes whether it multiplies those. Compiled code alone imports this.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Any
+
+from llvmlite import binding
+from numba.core import registry
+
+_SUM = """
+define <16 x float> @sum(<16 x float> %a, <16 x float> %b) {
+  %c = fadd <16 x float> %a, %b
+  ret <16 x float> %c
+}
+"""
+_DOT = """
+declare i32 @llvm.vector.reduce.add.vNi32(<N x i32>)
+define i32 @dot(<N x i8> %a, <N x i8> %b) {
+  %x = zext <N x i8> %a to <N x i32>
+  %y = sext <N x i8> %b to <N x i32>
+  %p = mul nsw <N x i32> %x, %y
+  %s = call i32 @llvm.vector.reduce.add.vNi32(<N x i32> %p)
+  ret i32 %s
+}
+"""
+
+
+@lru_cache(maxsize=1)
+def target() -> tuple[str, str, str]:
+    """What numba tells LLVM to compile for: the kind of machine (a triple), the processor's name, and what it
+    has beyond that name ("+avx2,-avx512f")."""
+    context: Any = registry.cpu_target.target_context
+    return context.codegen().magic_tuple()
+
+
+def has_wide_registers(of: tuple[str, str, str] | None = None) -> bool:
+    """Whether registers hold sixteen float32 (AVX-512), on the processor that numba compiles for, or on that
+    `of` another target."""
+    return bool(re.search(r"vaddps\s.*zmm", _assembly(_SUM, of or target())))
+
+
+def multiplies_bytes(n: int, of: tuple[str, str, str] | None = None) -> bool:
+    """Whether one instruction (VNNI) multiplies `n` bytes, 32 or 64, by as many and adds up fours of the
+    products."""
+    register = {32: "ymm", 64: "zmm"}[n]
+    return bool(re.search(rf"vpdpbusd\s.*{register}", _assembly(_DOT.replace("N", str(n)), of or target())))
+
+
+def _assembly(module: str, of: tuple[str, str, str]) -> str:
+    triple, name, features = of
+    machine = binding.Target.from_triple(triple).create_target_machine(cpu=name, features=features, opt=2)
+    return machine.emit_assembly(binding.parse_assembly(module))

@@ -1,0 +1,77 @@
+"""The tests of compiled code once more, compiled for other processors than this machine's.
+
+    python -m tests.reliability.processors
+
+Code for a processor with less than this one has runs here, so that a new machine finds the faults of the
+others: x86-64-v2 has registers of four numbers and no fused multiply-add (Intel's of 2009), x86-64-v3 eight
+numbers and no products of bytes (of 2013). numba is told by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES, and what
+it compiles is kept in a folder of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from llvmlite import binding
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+NEEDS = {"x86-64-v2": ("sse4.2", "popcnt", "ssse3"), "x86-64-v3": ("avx2", "fma", "bmi2")}
+"""What this machine must have to run code for a processor of that name."""
+TESTS = (
+    *("tests/player/test_lanes.py", "tests/player/test_march.py", "tests/player/test_contracted_march.py"),
+    *("tests/player/test_head_compiled.py", "tests/player/test_scratch.py", "tests/player/test_render.py"),
+    *("tests/numerics", "tests/vfr_bake/field", "tests/vfr_bake/rendering"),
+    "tests/vfr_bake/baking/test_stored_features.py",
+)
+"""Everything that calls compiled code."""
+SHORT = TESTS[:5]
+"""What calls the vectors that are written down for a processor; half a minute."""
+
+
+def processors() -> list[str]:
+    """The processors that this machine can stand for."""
+    here = binding.get_host_cpu_features()
+    return [name for name, needs in NEEDS.items() if all(here.get(feature) for feature in needs)]
+
+
+def run(name: str, tests: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    """Run tests with numba compiling for the processor `name`."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {
+            "NUMBA_CPU_NAME": name,
+            "NUMBA_CPU_FEATURES": "",
+            "NUMBA_CACHE_DIR": cache,
+        }
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
+        return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "tests", nargs="*", default=TESTS, help="files of tests, all of compiled code if none"
+    )
+    tests = tuple(parser.parse_args().tests)
+    failed = 0
+    for name in processors():
+        begin = time.perf_counter()
+        done = run(name, tests)
+        failed += done.returncode != 0
+        last = (done.stdout.strip().splitlines() or ["no output"])[-1]
+        sys.stdout.write(
+            f"{name}: exit code {done.returncode}, {time.perf_counter() - begin:.0f} s: {last}\n"
+        )
+        if done.returncode:
+            sys.stdout.write(done.stdout + done.stderr)
+        sys.stdout.flush()
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
