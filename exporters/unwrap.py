@@ -9,7 +9,6 @@ small parts.
 from __future__ import annotations
 
 import importlib.util
-import json
 import subprocess
 import sys
 import tempfile
@@ -20,14 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from exporters.mesh import TriangleMesh
+from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
 
 GUTTER = 2
 """Texels between two charts."""
-_PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from exporters.unwrap import _child; _child(sys.argv[2])"
-)
 PART = 1000
 """Faces of a part of the mesh at most; parts share no chart."""
 _FILLED = 0.8  # of the picture's edge, for charts alone: what xatlas packs is three quarters full
@@ -79,7 +75,7 @@ def unwrap(
 
 def _run(folder: Path, seconds: float, n_faces: int, progress: Callable[[int, int], object] | None) -> None:
     begin = time.monotonic()
-    command = [sys.executable, "-c", _PROGRAM, json.dumps(sys.path), str(folder)]
+    command = python_command("exporters.unwrap", str(folder))
     with (folder / "errors").open("wb") as errors:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=errors, stderr=errors)
         try:
@@ -160,3 +156,7 @@ def _child(folder: str) -> None:
     np.savez(
         Path(folder) / "atlas.npz", source=np.concatenate(sources), faces=cut, uvs=np.concatenate(places)
     )
+
+
+if __name__ == "__main__":
+    _child(sys.argv[1])

@@ -90,6 +90,28 @@ def test_module_is_short_and_says_what_it_is(path: Path) -> None:
     assert path.stem not in {"utils", "helpers", "common", "misc"}
 
 
+STARTERS = re.compile(
+    r"sys\.(executable|path)\b|\bmultiprocessing\b|ProcessPoolExecutor|DataLoader|LocalCluster|\bdistributed\.Nanny"
+    r"|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*)\b|mp\.spawn"
+)
+"""What starts an interpreter, or decides where one looks for modules."""
+SUBPROCESSES = {"exporters/unwrap.py", "vfr_bake/bench/process.py"}
+
+
+@pytest.mark.parametrize("path", [*MODULES, *sorted((REPOSITORY / "examples").glob("*.py"))], ids=str)
+def test_interpreters_are_started_by_one_function(path: Path) -> None:
+    """Another way would look for modules in the current folder."""
+    name = path.relative_to(REPOSITORY).as_posix()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):  # docstrings may name what code may not
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and ast.get_docstring(node):
+            node.body[0] = ast.Pass()
+    found = {match[0] for match in STARTERS.finditer(ast.unparse(tree))}
+    assert not found or name == "player/child.py", found
+    assert ("subprocess" in set(imported(tree, top_level=False))) == (name in SUBPROCESSES)
+    assert name not in SUBPROCESSES or "python_command(" in ast.unparse(tree)
+
+
 def test_there_are_modules() -> None:
     assert all(any(name.startswith(package) for name in IDS) for package in PACKAGES)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -58,7 +59,8 @@ def test_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_xatlas_says_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PROGRAM", "raise RuntimeError('no memory')")
+    broken = [sys.executable, "-c", "raise RuntimeError('no memory')"]
+    monkeypatch.setattr(module, "python_command", lambda *_: broken)
     with pytest.raises(
         DataError, match="xatlas: expected a layout, got exit code 1: RuntimeError: no memory"
     ):
@@ -73,7 +75,12 @@ def test_without_xatlas(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_seconds_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     """The layout waits first, so that it takes seconds on any machine."""
-    monkeypatch.setattr(module, "_PROGRAM", "import time; time.sleep(2.5); " + module._PROGRAM)
+
+    def slow(name: str, folder: str) -> list[str]:
+        program = f"import time, runpy; time.sleep(2.5); runpy.run_module({name!r}, None, '__main__', True)"
+        return [sys.executable, "-c", program, folder]
+
+    monkeypatch.setattr(module, "python_command", slow)
     seen = []
     unwrap(MESH, 256, 300.0, lambda done, of: seen.append((done, of)))
     assert seen[:2] == [(1, 300), (2, 300)] and seen == sorted(seen)

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any, TextIO
 
+from player.child import python_command
 from player.errors import VfrError
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
@@ -24,7 +24,7 @@ class Process:
     def __init__(self, module: str, *arguments: str) -> None:
         self._name = module.rpartition(".")[2]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            python_command(module, *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
