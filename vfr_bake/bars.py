@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import Any
 
@@ -44,6 +45,9 @@ class Bar:
         if self._bar is None:
             from tqdm import tqdm
 
+            # Its own lock is shared with other processes, and to make one starts a process where
+            # multiprocessing does not fork: needless, and that one looks for modules in the current folder.
+            tqdm.set_lock(threading.RLock())
             layout = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}  {postfix}"
             self._bar = tqdm(total=1.0, desc=self._title, bar_format=layout, file=sys.stderr)
         self._bar.set_postfix_str(text, refresh=False)
