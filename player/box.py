@@ -29,6 +29,10 @@ class Entries(NamedTuple):
         [n_places]."""
         return self.point[:, ray] + s * self.direction[:, ray]
 
+    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """t [n_places], model units."""
+        return self.t[ray] + s
+
     def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Model units [n_places] that samples stand for: a step, wherever they are."""
         return np.full(len(ray), self.step)

@@ -33,6 +33,10 @@ class Places(Protocol):
         """Grid coordinates [3, n_places] at the places `s` [n_places] on the rays `ray` [n_places]."""
         ...
 
+    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """t [n_places] of these places, model units."""
+        ...
+
     def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         """Model units [n_places] that samples at these places stand for."""
         ...

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.asset import Asset
-from player.box import enter_box
 from player.cameras import Camera
-from player.march import collect_samples
+from player.marches import sampled_rays
 
 N_WORST = 10
 APART = 8
@@ -75,9 +74,8 @@ def _ray(asset: Asset, camera: Camera, x: int, y: int) -> tuple[int, float, tupl
     """Samples with weight, opacity, and the heaviest samples of one pixel's ray."""
     index = y * camera.width + x
     rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays(index, index + 1)
-    entries = enter_box(asset.grid, rays_o, rays_d)
-    samples, tau, _ = collect_samples(asset.grid, entries, None)
+    places, samples, tau = sampled_rays(asset.grid, rays_o, rays_d)
     heaviest = np.argsort(-samples.weights, kind="stable")[:N_WEIGHTS]
-    t = (float(entries.t[0]) + samples.s[heaviest]) * asset.scale
+    t = places.distances(samples.ray[heaviest], samples.s[heaviest]) * asset.scale
     weights = tuple(zip(t.tolist(), samples.weights[heaviest].tolist(), strict=True))
     return len(samples.s), float(-np.expm1(-tau[0])), weights

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player.asset import Asset
-from player.manifest import CONTRACTED_AABB
+from player.asset import Asset, GridArrays, write_asset
+from player.bricks import pack_vertices
+from player.cameras import Camera
+from player.manifest import CONTRACTED_AABB, Manifest
 from player.render import render
 from player.transforms import read_cameras, write_cameras
+from tests.player.conftest import head_bytes
+from tests.player.contracted_scene import RANGE, RESOLUTION, STEP, vertices_and_codes
 from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
@@ -261,3 +265,44 @@ def test_worst_pixels_are_those_that_were_spoiled(shells_folder: Path) -> None:
     inside = [pixel for pixel in worst if pixel.view == cameras[1].name]
     for a in inside:
         assert all(a is b or max(abs(a.column - b.column), abs(a.row - b.row)) >= APART for b in inside)
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Asset:
+    """An unbounded scene in closed form: a wall all around, 8 model units from the middle, and little in
+    front of it. A model unit is 2 world units."""
+
+    def log_sigma(points: np.ndarray) -> np.ndarray:
+        return np.where(np.linalg.norm(points, axis=-1) > 8, 8.0, -12.0)
+
+    def keep(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points, axis=-1) < 40
+
+    vertices, _, codes = vertices_and_codes(log_sigma, keep)
+    coords, masks, _ = pack_vertices(vertices)
+    features = np.concatenate([vertices * 4 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
+    manifest = Manifest(
+        generator="tests", resolution=RESOLUTION, feature_resolution=RESOLUTION, step=STEP, near=0.1,
+        density_range=RANGE, n_channels=4, view_size=(24, 20), contracted=True, aabb=CONTRACTED_AABB,
+        world_from_model=((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1)),
+    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("assets") / "walls"
+    arrays = GridArrays(coords, masks, codes, coords, masks, features)
+    write_asset(folder, manifest, arrays, head_bytes(), b"ply\n", write_cameras([]))
+    return Asset.open(folder)
+
+
+def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> None:
+    """The ray is the player's: as opaque as its frame, heaviest where the wall is."""
+    camera = Camera("a", np.eye(4), 24, 20, 20.0, 20.0, 12.0, 10.0)
+    frame = render(walls, camera, march="numpy")
+    wanted = frame.rgb.copy()
+    wanted[5, 7] += 0.5
+    worst, *_ = worst_pixels(walls, [camera], [wanted], [frame.rgb])
+    assert (worst.column, worst.row) == (7, 5)
+    assert worst.opacity == pytest.approx(frame.opacity[5, 7], abs=1e-6) and worst.opacity > 0.9
+    assert worst.n_samples == frame.n_samples[5, 7]
+    heaviest, _ = worst.weights[0]
+    # A cell is 1/12 in contracted space, there 1/r^2 of a unit of the way: 64/12 model units at 8.
+    assert heaviest == pytest.approx(2 * 8, abs=2 * 64 / 12)
+    assert min(t for t, _ in worst.weights) <= frame.depth[5, 7] <= max(t for t, _ in worst.weights)
