@@ -229,7 +229,7 @@ class TrainConfig:
     seed: int = 0
     """Seed of every random number."""
     eval_views: int | None = None
-    """Test views rendered at the end, spread evenly; 0 for none. Objects 25, scenes 3, a view of which takes
+    """Test views rendered at the end, spread evenly; 0 for none. Objects 10, scenes 3, a view of which takes
     half a minute. `vfr-eval` renders them all."""
     checkpoint_minutes: float = 2.0
     """Minutes between two checkpoints, kept beside the model file until training is complete."""
