@@ -10,7 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from vfr_bake.bars import Bar, Bars
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
+    from vfr_bake.training.model_file import Model
     from vfr_bake.training.trainer import Trainer
 
 EVAL_VIEWS = {False: 10, True: 3}
@@ -85,6 +86,7 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
 def _train(options: Any) -> int:
     from vfr_bake.data import load_scene
     from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
+    from vfr_bake.training.model_file import save_model, trained_model
     from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
@@ -105,11 +107,12 @@ def _train(options: Any) -> int:
     figures = _train_steps(trainer, checkpoint)
     interrupted = figures.pop("interrupted")
     if processes.first:
-        _save(options.model, trainer, scene, figures)
+        model = trained_model(trainer, scene, figures)
+        save_model(options.model, model)
         n_views = config.eval_views if config.eval_views is not None else EVAL_VIEWS[scene.unbounded]
         if not interrupted and n_views and scene.test.cameras:
-            figures |= _test_figures(trainer, scene, n_views)
-            _save(options.model, trainer, scene, figures)
+            figures |= _test_figures(model, scene, n_views)
+            save_model(options.model, replace(model, figures=figures))
         checkpoint.unlink(missing_ok=True)
         _report_training(options, figures, interrupted)
     processes.leave()
@@ -206,7 +209,7 @@ def _decibels(error: float) -> float:
     return -10 * log10(error) if error > 0 else float("inf")
 
 
-def _test_figures(trainer: Trainer, scene: Scene, n_views: int) -> dict[str, Any]:
+def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
     import numpy as np
 
     from vfr_bake.training.evaluation import evaluate
@@ -214,26 +217,14 @@ def _test_figures(trainer: Trainer, scene: Scene, n_views: int) -> dict[str, Any
     scores = []
     n_views = min(n_views, len(scene.test.cameras))
     with Bar("test views") as bar:
-        for score in evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), n_views):
+        for score in evaluate(model, scene.test, n_views):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
-    return {"test_psnr": float(np.mean(scores)), "test_views": len(scores)}
-
-
-def _save(path: Path, trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> None:
-    from vfr_bake.training.model_file import Model, save_model
-
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    model = Model(
-        field=trainer.field,
-        sampler=trainer.sampler,
-        world_from_model=scene.world_from_model,
-        cameras=cameras,
-        has_alpha=scene.has_alpha,
-        train={"data": scene.name} | trainer.settings,
-        figures=figures,
-    )
-    save_model(path, model)
+    return {
+        "test_psnr": float(np.mean(scores)),
+        "test_views": len(scores),
+        "background": model.background.tolist(),
+    }
 
 
 def _bake(options: Any) -> int:
@@ -295,7 +286,7 @@ def _eval(options: Any) -> int:
     names = frame_names(views.cameras)
     scores = []
     with Bar("test views") as bar:
-        for view in render_views(model.field, model.sampler, views, model.background):
+        for view in render_views(model, views):
             if options.pictures is not None:
                 picture = comparison(view.photograph, view.rgb)
                 write_png(options.pictures / f"{names[len(scores)]}.png", picture)

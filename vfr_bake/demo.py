@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from player.errors import VfrError
 from player.files import check_target
 
@@ -42,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _demo(output: Path, minutes: float, force: bool) -> int:
     from exporters.cli import main as export
+    from player.asset import Asset
     from player.cli import main as play
     from player.transforms import write_cameras
     from vfr_bake.cli import bake_main, train_main
@@ -74,21 +77,22 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
         "export": run("vfr-export", export, asset, f"{output}/mesh.glb"),
     }  # fmt: skip
     figures = {name: json.loads((output / f"{name}.json").read_text()) for name in ("train", "bake", "play")}
-    picture, played = _side_by_side(scene, Path(frames), output / "side_by_side.png")
+    background = np.array(Asset.open(asset).manifest.background)
+    picture, played = _side_by_side(scene, background, Path(frames), output / "side_by_side.png")
     _summary(output, picture, seconds, figures, played, time.monotonic() - begin)
     return 0
 
 
-def _side_by_side(scene: Any, frames: Path, target: Path) -> tuple[Path, float]:
-    """Photographs above, played frames below; and the mean PSNR of all played test frames."""
-    import numpy as np
+def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path) -> tuple[Path, float]:
+    """Photographs over the `background` [3] above, played frames below; and the mean PSNR of all played test
+    frames."""
     from PIL import Image
 
     from player.transforms import frame_names
     from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 
     names = frame_names(scene.test.cameras)
-    photographs = [to_8_bit(over_background(image, np.ones(3))) for image in scene.test.images]
+    photographs = [to_8_bit(over_background(image, background)) for image in scene.test.images]
     played = [np.asarray(Image.open(frames / f"{name}.png").convert("RGB")) for name in names]
     mean = float(np.mean([psnr(a / 255, b / 255) for a, b in zip(photographs, played, strict=True)]))
     chosen = np.linspace(0, len(names) - 1, N_SHOWN).round().astype(int)

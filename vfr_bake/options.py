@@ -55,7 +55,8 @@ class Bake:
 
 @dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Render the test views with the full model and compare them with the photographs, over white."""
+    """Render the test views with the full model and compare them with the photographs, over the
+    model's background."""
 
     model: Positional[Path]
     """A model file written by vfr-train."""

@@ -22,6 +22,7 @@ from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.trainer import Trainer
 
 ROWS: dict[str, dict[str, Any]] = {
@@ -46,7 +47,7 @@ def train(scene: Scene, row: str, seed: int, options: argparse.Namespace) -> dic
         if sys.stderr.isatty():
             print(f"\r{row} seed {seed} {report.progress:.0%}", end="", file=sys.stderr)
     seconds = time.monotonic() - begin
-    scores = list(evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), options.views))
+    scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
     return {
         "psnr": float(np.mean([score.psnr for score in scores])),
         "ssim": float(np.mean([score.ssim for score in scores])),

@@ -19,6 +19,7 @@ from vfr_bake.config import Compositing, FieldOptions, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.trainer import Trainer
 
 KINDS: tuple[Compositing, ...] = ("features", "colour")
@@ -64,7 +65,7 @@ def main() -> None:
     print("|---|---|---|---|")
     for kind, run in runs.items():
         trainer = run.trainer
-        scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), options.views)
+        scores = evaluate(trained_model(trainer, scene, {}), scene.test, options.views)
         rate = trainer.next_step / trainer.seconds
         psnr = np.mean([score.psnr for score in scores])
         print(f"| {kind} | {trainer.next_step} | {rate:.2f} | {psnr:.2f} |", flush=True)

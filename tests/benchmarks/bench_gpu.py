@@ -22,6 +22,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from vfr_bake.config import TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.trainer import StepReport, Trainer
 
 PARTS = {
@@ -112,7 +113,7 @@ def main() -> None:
         "samples_per_second": n_samples / last.seconds,
         "gigabytes": torch.cuda.max_memory_allocated() / 1e9,
     }
-    scores = list(evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3), options.views))
+    scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
     figures["psnr"] = float(np.mean([score.psnr for score in scores])) if scores else None
     for name, value in figures.items():
         print(f"| {name} | {value if isinstance(value, str) or value is None else format(value, ',.2f')} |")

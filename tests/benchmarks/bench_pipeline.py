@@ -42,10 +42,10 @@ def run(name: str, *arguments: str) -> tuple[float, float]:
     return time.monotonic() - begin, usage.ru_maxrss / 1000
 
 
-def test_photographs(data: Path) -> list[np.ndarray]:
+def test_photographs(data: Path, background: np.ndarray) -> list[np.ndarray]:
     cameras = read_cameras(data / "transforms_test.json", size=(1, 1))
     rgba = [np.asarray(Image.open(data / f"{camera.name}.png").convert("RGBA")) for camera in cameras]
-    return [to_8_bit(over_background(image, np.ones(3))) / 255 for image in rgba]
+    return [to_8_bit(over_background(image, background)) / 255 for image in rgba]
 
 
 def main() -> None:
@@ -83,7 +83,8 @@ def main() -> None:
     # Photographs are read last: a child's peak memory counts what its parent held when it was started.
     names = frame_names(read_cameras(cameras, size=(1, 1)))
     played = [np.asarray(Image.open(frames / f"{name}.png").convert("RGB")) / 255 for name in names]
-    scores = [psnr(a, b) for a, b in zip(played, test_photographs(options.data), strict=True)]
+    photographs = test_photographs(options.data, np.array(full["background"]))
+    scores = [psnr(a, b) for a, b in zip(played, photographs, strict=True)]
     loss = full["psnr"] - np.mean(scores)
     table.append(("played, all test views", f"{np.mean(scores):.2f} dB, bake loss {loss:.2f} dB"))
     for name, value in table:

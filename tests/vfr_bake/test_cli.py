@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,11 +19,15 @@ import torch
 from PIL import Image
 
 from player.errors import DataError
-from vfr_bake.cli import bake_main, eval_main, train_main
+from vfr_bake.cli import EVAL_VIEWS, bake_main, eval_main, train_main
+from vfr_bake.config import TrainConfig
+from vfr_bake.data import load_scene
 from vfr_bake.data.scene import PosedImages
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.evaluation import RenderedView
-from vfr_bake.training.metrics import over_background, to_8_bit
-from vfr_bake.training.model_file import load_model
+from vfr_bake.training.metrics import over_background, psnr, to_8_bit
+from vfr_bake.training.model_file import Model, load_model
+from vfr_bake.training.trainer import MINUTES
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -53,6 +58,49 @@ def test_train_reports_what_it_measured(
     figures = json.loads(capsys.readouterr().out)
     assert figures["steps"] == 25 and figures["test_views"] == 2 and figures["skipped_steps"] == 0
     assert 3 < figures["test_psnr"] < 50
+
+
+def test_the_help_names_the_defaults_that_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train_main(["--help"])
+    said = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert f"Objects {EVAL_VIEWS[False]}, scenes {EVAL_VIEWS[True]}, a view of which" in said
+    assert f"CPU: objects {MINUTES[False]:g}, scenes {MINUTES[True]:g}; GPU" in said
+    cpu, gpu = (TrainConfig().pace(device, False) for device in ("cpu", "cuda"))
+    scenes = TrainConfig().pace("cuda", True)
+    assert f"CPU {cpu.steps:,}, GPU {gpu.steps:,} (scenes {scenes.steps:,})" in said
+    assert f"GPU {gpu.batch_samples:,}, CPU {cpu.batch_samples:,}," in said
+    assert f"GPU {gpu.batch_rays:,}, CPU {cpu.batch_rays:,}," in said
+    assert f"GPU {gpu.max_rays:,}, CPU {cpu.max_rays:,}." in said
+    assert f"GPU {gpu.network_rate:g}, as in the paper, CPU {cpu.network_rate:g}." in said
+    assert (
+        cpu.grid_rate == gpu.grid_rate and f"Adam learning rate of the hash grids; {cpu.grid_rate:g}." in said
+    )
+
+
+def test_trainings_own_score_is_that_of_vfr_eval(small_data: Path, tmp_path: Path) -> None:
+    """Of photographs without alpha and without end, what is missing is no white: training has to score over
+    the background that the model's pictures are shown over, by which the bake counts its losses."""
+    data = tmp_path / "data"
+    shutil.copytree(small_data, data)
+    for path in data.rglob("*.png"):
+        with Image.open(path) as file:
+            picture = over_background(np.asarray(file), np.array([0.1, 0.2, 0.4]))
+        Image.fromarray(to_8_bit(picture)).save(path)
+    model = tmp_path / "model.pt"
+    settings = ["--steps", "30", "--kind", "unbounded", "--batch-rays", "64", "--eval-views", "2", *SMALL]
+    assert train_main([str(data), str(model), *settings, "--json", str(tmp_path / "train.json")]) == 0
+    assert eval_main([str(model), str(data), "--json", str(tmp_path / "eval.json")]) == 0
+    trained, whole = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("train", "eval"))
+    assert max(whole["background"]) < 0.9, "white would be no test"
+    assert trained["test_views"] == whole["n_views"] == 2 and trained["background"] == whole["background"]
+    assert trained["test_psnr"] == pytest.approx(whole["psnr"], abs=1e-4)
+    loaded, scores = load_model(model), []
+    views = load_scene(data).test
+    for camera, photograph in zip(views.cameras, views.images, strict=True):
+        rendered = render_image(loaded.field, loaded.sampler, camera, np.array(whole["background"]))
+        scores.append(psnr(to_8_bit(rendered) / 255, photograph[..., :3] / 255))
+    assert trained["test_psnr"] == pytest.approx(np.mean(scores), abs=1e-4)
 
 
 def test_eval_has_the_mean_and_every_view(model: Path, small_data: Path, tmp_path: Path) -> None:
@@ -118,9 +166,9 @@ def test_eval_says_what_lpips_lacks_before_any_work(
 def test_a_view_without_error_is_null_in_json(
     model: Path, small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def perfect(field: object, occupancy: object, views: PosedImages, background: np.ndarray):
+    def perfect(model: Model, views: PosedImages):
         for camera, image in zip(views.cameras, views.images, strict=True):
-            rgb = over_background(image, background)
+            rgb = over_background(image, model.background)
             yield RenderedView(camera.name, rgb, rgb)
 
     monkeypatch.setattr("vfr_bake.training.evaluation.render_views", perfect)

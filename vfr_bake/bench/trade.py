@@ -52,6 +52,8 @@ class Views:
 
     cameras: list[Camera]
     """World frame."""
+    background: np.ndarray
+    """[3] float32 in [0, 1], the assets' own."""
     photographs: list[np.ndarray]
     """[h, w, 3] float32 in [0, 1], over the background."""
 
@@ -111,6 +113,7 @@ def measure_trade(plan: Plan, lpips: Distance | None, progress: Progress) -> Tra
         "threads": played["threads"],
         "march": played["march"],
         "front_at": list(own),
+        "background": views.background.tolist(),
         "bits": 8,
     }
     pictures = {name: quality.worst_view for name, quality in zip(assets, qualities, strict=True)}
@@ -268,7 +271,7 @@ def _read_views(plan: Plan, assets: list[Asset], progress: Progress) -> Views:
     if len(backgrounds) > 1:
         raise ConfigError(f"assets: expected one background, got {sorted(backgrounds)}")
     background = np.array(backgrounds.pop(), np.float32)
-    return Views(cameras, [over_background(scene.test.images[i], background) for i in chosen])
+    return Views(cameras, background, [over_background(scene.test.images[i], background) for i in chosen])
 
 
 def _around(size: Size) -> list[Size]:

@@ -71,8 +71,6 @@ class ProposalSampler(nn.Module):
         super().__init__()
         self.near = near
         self.grids = nn.ModuleList(ProposalGrid(resolution) for resolution in RESOLUTIONS)
-        self.exponent = 1.0
-        """Weights are raised to it before they are drawn from: less than 1 early in training."""
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
         """The samples of all rays [n_rays, 3], in the middle of their intervals."""
@@ -98,9 +96,12 @@ class ProposalSampler(nn.Module):
         return features, opacity, depth
 
     def sample_rounds(
-        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, exponent: float = 1.0
     ) -> tuple[Samples, np.ndarray, list[Round]]:
-        """Samples, the borders [n_rays, N_FINAL + 1] of their intervals in s, and what the rounds found."""
+        """Samples, the borders [n_rays, N_FINAL + 1] of their intervals in s, and what the rounds found.
+
+        `exponent`: weights are raised to it before they are drawn from; less than 1 early in training.
+        """
         n_rays = len(rays_o)
         rounds = [_empty_round(n_rays) for _ in RESOLUTIONS]
         edges = np.empty((n_rays, N_FINAL + 1), np.float32)
@@ -109,7 +110,7 @@ class ProposalSampler(nn.Module):
         first, second = rounds
         grids = [grid.kernel_arguments() for grid in self.grids]  # type: ignore[operator]
         kernels.propose(
-            rays_o.numpy(), rays_d.numpy(), jitter.numpy(), borders, np.float32(self.exponent),
+            rays_o.numpy(), rays_d.numpy(), jitter.numpy(), borders, np.float32(exponent),
             grids[0], grids[1], LIMITS, first.edges, first.depths, first.points, first.weights,
             second.edges, second.depths, second.points, second.weights, edges,
         )  # fmt: skip

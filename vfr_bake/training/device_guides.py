@@ -70,7 +70,6 @@ class DeviceProposalGuide(ProposalPace):
             return self._sampler
         copy = ProposalSampler(self._sampler.near)
         copy.load_state_dict(self._sampler.state_dict())
-        copy.exponent = self._sampler.exponent
         return copy
 
     def sample(
@@ -81,13 +80,13 @@ class DeviceProposalGuide(ProposalPace):
         edges = rays_o.new_tensor([near, far]).expand(len(rays_o), 2)
         weights = rays_o.new_ones(len(rays_o), 1)
         for number, grid in enumerate(self._sampler.grids):
-            exponent = self._sampler.exponent if number else 1.0
+            exponent = self._exponent if number else 1.0
             edges = self._resample(edges, weights, exponent, jitter[:, number], N_PROPOSED)
             assert isinstance(grid, ProposalGrid)
             with torch.set_grad_enabled(self._learns):
                 weights = proposal_weights(grid, rays_o, rays_d, edges)
             self._rounds.append((edges, weights))
-        self._edges = self._resample(edges, weights, self._sampler.exponent, jitter[:, 2], N_FINAL)
+        self._edges = self._resample(edges, weights, self._exponent, jitter[:, 2], N_FINAL)
         return field_samples(field, rays_o, rays_d, self._edges)
 
     @staticmethod

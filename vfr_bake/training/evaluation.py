@@ -1,4 +1,4 @@
-"""The full model against photographs."""
+"""The full model against photographs, over its own background."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.render import Sampler, render_image
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import Distance, ViewScore, over_background, score_view
+from vfr_bake.training.model_file import Model
 
 
 @dataclass(frozen=True)
@@ -25,30 +25,23 @@ class RenderedView:
     """As `rgb`."""
 
 
-def render_views(
-    field: VfrField, sampler: Sampler, views: PosedImages, background: np.ndarray, n_views: int = 0
-) -> Iterator[RenderedView]:
+def render_views(model: Model, views: PosedImages, n_views: int = 0) -> Iterator[RenderedView]:
     """Views (model frame) rendered with the full model; `n_views` of them spread evenly, 0 for all."""
     chosen = np.arange(len(views.cameras))
     if 0 < n_views < len(chosen):
         chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
     for index in chosen:
         camera = views.cameras[index]
-        rgb = render_image(field, sampler, camera, background)
-        yield RenderedView(camera.name, rgb, over_background(views.images[index], background))
+        rgb = render_image(model.field, model.sampler, camera, model.background)
+        yield RenderedView(camera.name, rgb, over_background(views.images[index], model.background))
 
 
 def evaluate(
-    field: VfrField,
-    sampler: Sampler,
-    views: PosedImages,
-    background: np.ndarray,
-    n_views: int = 0,
-    lpips: Distance | None = None,
+    model: Model, views: PosedImages, n_views: int = 0, lpips: Distance | None = None
 ) -> Iterator[ViewScore]:
     """The scores of `render_views`' pictures; with `lpips`, that distance as well.
 
     Raises ShapeError: a picture is smaller than SSIM's window.
     """
-    for view in render_views(field, sampler, views, background, n_views):
+    for view in render_views(model, views, n_views):
         yield score_view(view.name, view.rgb, view.photograph, lpips)

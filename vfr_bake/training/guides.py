@@ -146,6 +146,7 @@ class ProposalPace:
         self._config, self._pace, self._sampler = config, pace, sampler
         self._adams: Sequence[TableAdam] = ()
         self._learns = True
+        self._exponent = 1.0
         self._borders = (float(spacing(sampler.near)), float(spacing(FAR)))
         self._span = self._borders[1] - self._borders[0]
 
@@ -154,7 +155,7 @@ class ProposalPace:
 
     def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
-        self._sampler.exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
+        self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0
 
     def observe(self, n_rays: int, n_samples: int) -> None:
@@ -175,7 +176,9 @@ class ProposalGuide(ProposalPace):
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> Samples:
-        samples, self._edges, self._rounds = self.sampler.sample_rounds(field, rays_o, rays_d, jitter)
+        samples, self._edges, self._rounds = self.sampler.sample_rounds(
+            field, rays_o, rays_d, jitter, self._exponent
+        )
         return samples
 
     def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,6 +29,10 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
 from vfr_bake.rendering.render import mean_colour
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
+
+if TYPE_CHECKING:
+    from vfr_bake.data.scene import Scene
+    from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
 VERSION = (2, 0)
@@ -75,6 +79,19 @@ class Model:
         """The training cameras in the model frame."""
         model_from_world = np.linalg.inv(self.world_from_model)
         return [camera.transformed(model_from_world) for camera in self.cameras]
+
+
+def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Model:
+    """The model that `trainer` has by now, of the `scene` that it trains on."""
+    return Model(
+        field=trainer.field,
+        sampler=trainer.sampler,
+        world_from_model=scene.world_from_model,
+        cameras=[camera.transformed(scene.world_from_model) for camera in scene.train.cameras],
+        has_alpha=scene.has_alpha,
+        train={"data": scene.name} | trainer.settings,
+        figures=figures,
+    )
 
 
 def save_model(path: Path, model: Model) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
-from vfr_bake.training.model_file import Model
+from vfr_bake.training.model_file import Model, trained_model
 from vfr_bake.training.trainer import Trainer
 
 
@@ -13,5 +13,4 @@ def trained(scene: Scene, config: TrainConfig) -> Model:
     trainer = Trainer(scene, config)
     for _ in trainer.run():
         pass
-    cameras = [camera.transformed(scene.world_from_model) for camera in scene.train.cameras]
-    return Model(trainer.field, trainer.sampler, scene.world_from_model, cameras, scene.has_alpha, {}, {})
+    return trained_model(trainer, scene, {})

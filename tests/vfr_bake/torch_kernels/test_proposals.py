@@ -122,7 +122,7 @@ def test_rounds_and_samples_are_the_kernels_in_float64(step: int, device: torch.
     rounds = [[np.zeros(shape) for shape in shapes] for _ in range(2)]
     edges, counts, n = np.empty((40, N_FINAL + 1)), np.empty(40, np.int64), 40 * N_FINAL
     compiled.propose(
-        *arrays, guide._borders, np.float64(guide._sampler.exponent), *grids, limits, *rounds[0], *rounds[1],
+        *arrays, guide._borders, np.float64(guide._exponent), *grids, limits, *rounds[0], *rounds[1],
         edges,
     )  # fmt: skip
     t_mid, deltas, points = np.empty(n), np.empty(n), np.empty((n, 3))

@@ -17,7 +17,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.field.pilot import Pilot
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
-from vfr_bake.training.model_file import Model, load_model, save_model
+from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.trainer import Trainer, choose_device
 
@@ -27,7 +27,7 @@ def small_scene(kind: str) -> Scene:
 
 
 def psnr(trainer: Trainer, scene: Scene) -> float:
-    scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3))
+    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
     return float(np.mean([score.psnr for score in scores]))
 
 
@@ -108,17 +108,13 @@ def test_its_model_file_is_any_model_file(kind: str, device: torch.device, tmp_p
     settings = config(steps=3, batch_rays=32, batch_samples=1024, device=device.type)
     trainer = Trainer(scene, settings, backend="torch")
     list(trainer.run())
-    model = Model(
-        field=trainer.field, sampler=trainer.sampler, world_from_model=scene.world_from_model,
-        cameras=scene.train.cameras, has_alpha=scene.has_alpha, train=trainer.settings, figures={},
-    )  # fmt: skip
-    save_model(tmp_path / "model.pt", model)
+    save_model(tmp_path / "model.pt", trained_model(trainer, scene, {}))
     loaded = load_model(tmp_path / "model.pt")
     for name, tensor in trainer.field.state_dict().items():
         assert torch.equal(tensor, loaded.field.state_dict()[name]), name
     assert loaded.train["device"] == device.type and loaded.train["batch_samples"] == 1024
     assert psnr(trainer, scene) == pytest.approx(
-        np.mean([s.psnr for s in evaluate(loaded.field, loaded.sampler, scene.test, np.ones(3))]), abs=1e-6
+        np.mean([score.psnr for score in evaluate(loaded, scene.test)]), abs=1e-6
     )
 
 

@@ -20,6 +20,7 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.trainer import Trainer
 
 SMALL_GRID = {"n_levels": 8, "max_resolution": 64, "log2_table_size": 14, "density_width": 16}
@@ -56,7 +57,7 @@ def psnr(scene: Scene, pilot_steps: int, seed: int) -> float:
     trainer = Trainer(scene, config)
     for _ in trainer.run():
         pass
-    scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3))
+    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
     return float(np.mean([score.psnr for score in scores]))
 
 

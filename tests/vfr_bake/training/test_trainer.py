@@ -15,6 +15,7 @@ from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
+from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.near_gradients import scale_near_gradients
 from vfr_bake.training.trainer import Trainer
 
@@ -40,10 +41,9 @@ def scene() -> Scene:
 
 def test_it_learns_the_scene(scene: Scene) -> None:
     trainer = Trainer(scene, config())
-    white = np.ones(3)
-    before = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    before = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
     reports = list(trainer.run())
-    after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    after = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
     assert len(reports) == 220 and trainer.n_bad_steps == 0
     assert after > before + 6 and after > 18
 
@@ -146,7 +146,7 @@ def test_colours_can_be_composited_instead(scene: Scene) -> None:
     before = [parameter.detach().clone() for parameter in trainer.pilot.parameters()]
     for _ in trainer.run():
         pass
-    scores = evaluate(trainer.field, trainer.sampler, scene.test, np.ones(3))
+    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
     assert np.mean([score.psnr for score in scores]) > 17
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.pilot.parameters(), strict=True))
 
@@ -154,10 +154,9 @@ def test_colours_can_be_composited_instead(scene: Scene) -> None:
 def test_an_unbounded_scene_is_learnt() -> None:
     scene = unbounded(48)
     trainer = Trainer(scene, config(steps=300, pilot_steps=60, batch_rays=128))
-    white = np.ones(3)
-    before = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    before = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
     reports = list(trainer.run())
-    after = np.mean([s.psnr for s in evaluate(trainer.field, trainer.sampler, scene.test, white)])
+    after = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
     assert trainer.n_bad_steps == 0 and len(reports) == 300
     assert after > before + 4
 
