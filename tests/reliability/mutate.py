@@ -1,0 +1,249 @@
+"""How many small mistakes the tests find: one is made at a time, in a copy, and its folder's tests run.
+
+    nice python -m tests.reliability.mutate --count 60 --seed 0 --results mutations.json
+
+Sites are drawn uniformly (`tests.reliability.sites`); equal seeds draw equal sites of equal code. A mutation
+is killed when a test fails or when the tests never end; the tests of the file itself come first, then those
+that import it, then whatever reaches it. Mutations that change nothing that could be told from outside are
+listed with the reason in `tests/reliability/equivalent.json`, and others are drawn in their place. What the
+results hold already is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from tests.reliability.sites import Site, sites_of
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+FOLDERS = ("player", "vfr_bake/baking", "exporters", "vfr_bake/kernels")
+"""Whose sites are drawn; each meets the tests of its package, and those that concern every package."""
+TESTS = {"player": "tests/player", "vfr_bake": "tests/vfr_bake", "exporters": "tests/exporters"}
+EVERYWHERE = ("tests/numerics", "tests/reliability")
+LAST = ("test_viewer", "test_other_programs", "test_reliability", "test_cluster")
+"""Long tests, which start browsers and other programs, and so reach what they do not import."""
+EQUIVALENT = Path(__file__).with_name("equivalent.json")
+LIMIT_SECONDS = 1800.0
+"""Of one mutation's tests: a loop without end is a mistake that was found."""
+
+
+class Imports:
+    """Which files of the repository import which, functions' own imports included."""
+
+    def __init__(self, root: Path) -> None:
+        paths = [
+            p
+            for folder in ("player", "exporters", "vfr_bake", "tests")
+            for p in (root / folder).rglob("*.py")
+        ]
+        self.files = {path.relative_to(root).as_posix() for path in paths}
+        self._imported = {file: set(self._of_file(root, file)) for file in self.files}
+
+    def _of_file(self, root: Path, file: str) -> list[str]:
+        names = []
+        for node in ast.walk(ast.parse((root / file).read_bytes())):
+            if isinstance(node, ast.Import):
+                names += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        found = [path for name in names if (path := name.replace(".", "/") + ".py") in self.files]
+        fixtures = (Path(file).parent / "conftest.py").as_posix()
+        return [*found, *({fixtures} & self.files - {file})]
+
+    def distances(self, file: str) -> dict[str, int]:
+        """How far every file that reaches `file` by its imports is from it; 0 is the file itself."""
+        found = {file: 0}
+        edge = {file}
+        while edge:
+            edge = {
+                other for other, imported in self._imported.items() if imported & edge and other not in found
+            }
+            found.update(dict.fromkeys(edge, max(found.values()) + 1))
+        return found
+
+
+def tests_of(imports: Imports, file: str) -> list[str]:
+    """The tests that a mutation of `file` meets, the likeliest to fail first; its own examples lead."""
+    distances = imports.distances(file)
+    folders = (TESTS[file.split("/")[0]], *EVERYWHERE)
+    reaching = [
+        name
+        for name in imports.files
+        if name.startswith(folders)
+        and Path(name).stem.startswith("test_")
+        and (name in distances or Path(name).stem in LAST)
+    ]
+
+    def order(name: str) -> tuple[bool, bool, bool, int, str]:
+        stem, folder = Path(name).stem, Path(name).parent.name
+        return (
+            stem != f"test_{Path(file).stem}",
+            stem in LAST,
+            folder != Path(file).parent.name,
+            distances.get(name, 0),
+            name,
+        )
+
+    return [file, *sorted(reaching, key=order)]
+
+
+class Copy:
+    """A copy of the repository in which one file at a time is changed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / "repository"
+        self._kept = folder / "compiled"
+        self._kept.mkdir(parents=True)
+        listed = ["git", "ls-files", "-co", "--exclude-standard", "-z"]
+        names = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, check=True).stdout.decode()
+        for name in filter(None, names.split("\0")):
+            if (REPOSITORY / name).is_file():
+                (self.root / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(REPOSITORY / name, self.root / name)
+        self.imports = Imports(self.root)
+
+    def run(self, site: Site, limit: float) -> dict[str, Any]:
+        """What became of the tests with the change."""
+        path = self.root / site.path
+        whole, stat = path.read_bytes(), path.stat()
+        stale = {Path(file).stem for file in self.imports.distances(site.path)}
+        with tempfile.TemporaryDirectory(dir=self._kept.parent, ignore_cleanup_errors=True) as folder:
+            compiled = Path(folder) / "compiled"
+            shutil.copytree(
+                self._kept,
+                compiled,
+                copy_function=os.link,
+                ignore=lambda _, names: [n for n in names if n.split(".")[0] in stale],
+            )
+            path.write_bytes(site.applied(whole))
+            try:
+                outcome = self._pytest(tests_of(self.imports, site.path), compiled, Path(folder), limit)
+            finally:
+                path.write_bytes(whole)
+                os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+            self._keep(compiled, stale)
+        return {"name": site.name, "line": site.line, **outcome}
+
+    def _keep(self, compiled: Path, stale: set[str]) -> None:
+        """What numba compiled of files that the change does not reach holds for the next one."""
+        for path in compiled.rglob("*.nb?"):
+            target = self._kept / path.relative_to(compiled)
+            if path.name.split(".")[0] not in stale and not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                os.link(path, target)
+            elif path.name.split(".")[0] not in stale and path.suffix == ".nbi":
+                path.replace(target)
+
+    def _pytest(self, tests: list[str], compiled: Path, folder: Path, limit: float) -> dict[str, Any]:
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-x",
+            "-q",
+            "--no-header",
+            "--tb=line",
+            "-p",
+            "no:cacheprovider",
+        ]
+        environment = os.environ | {
+            "NUMBA_CACHE_DIR": str(compiled), "PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1",
+            "VFR_DATA": os.environ.get("VFR_DATA", str(REPOSITORY.parent / "shared" / "data")),
+        }  # fmt: skip
+        begin = time.monotonic()
+        arguments = [*command, "--basetemp", str(folder / "pytest"), *tests]
+        with (folder / "said.txt").open("w+") as said:
+            process = subprocess.Popen(
+                arguments,
+                cwd=self.root,
+                env=environment,
+                stdout=said,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            try:
+                code = process.wait(limit)
+            except subprocess.TimeoutExpired:
+                code = -1
+            finally:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    process.wait()
+            said.seek(0)
+            lines = said.read().splitlines()
+        failed = [line.split(" - ")[0] for line in lines if line.startswith(("FAILED", "ERROR"))]
+        reason = "no end" if code == -1 else (failed or lines[-1:] or [str(code)])[0]
+        seconds = round(time.monotonic() - begin)
+        return {"killed": code != 0, "by": reason if code else None, "seconds": seconds}
+
+
+def drawn_sites(seed: int) -> list[Site]:
+    """All sites in the order in which they are drawn: changes of one place count as one site."""
+    places: dict[tuple[str, int, int], Site] = {}
+    for folder in FOLDERS:
+        for path in sorted((REPOSITORY / folder).rglob("*.py")):
+            name = path.relative_to(REPOSITORY).as_posix()
+            for site in sites_of(name, path.read_bytes()):
+                place = (name, site.start, site.end)
+                if place not in places or site.rank(seed) < places[place].rank(seed):
+                    places[place] = site
+    return sorted(places.values(), key=lambda site: site.rank(seed))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, required=True, help="JSON, read and written")
+    parser.add_argument("--again", action="store_true", help="run the survivors again")
+    parser.add_argument("--list", action="store_true", help="say what would be drawn, and run nothing")
+    options = parser.parse_args()
+    equivalent: dict[str, str] = json.loads(EQUIVALENT.read_text(encoding="utf-8"))
+    sites = drawn_sites(options.seed)
+    skipped, chosen = [], []
+    for site in sites:
+        (skipped if site.name in equivalent else chosen).append(site)
+        if len(chosen) == options.count:
+            break
+    if options.list:
+        sys.stdout.write("".join(f"{site.line:4} {site.name}\n" for site in chosen))
+        return 0
+    known = {}
+    if options.results.exists():
+        known = {run["name"]: run for run in json.loads(options.results.read_text())["runs"]}
+    with tempfile.TemporaryDirectory(prefix="vfr-mutate-", ignore_cleanup_errors=True) as folder:
+        copy = Copy(Path(folder))
+        for site in chosen:
+            run = known.get(site.name)
+            if run is None or (options.again and not run["killed"]):
+                known[site.name] = run = copy.run(site, LIMIT_SECONDS)
+                sys.stderr.write(
+                    f"{'killed' if run['killed'] else 'SURVIVED'} {run['seconds']:4} s  {site.name}\n"
+                )
+            runs = [known[other.name] for other in chosen if other.name in known]
+            summary = {
+                "seed": options.seed,
+                "sites": len(sites),
+                "drawn": len(runs),
+                "killed": sum(run["killed"] for run in runs),
+                "survived": [run["name"] for run in runs if not run["killed"]],
+                "equivalent": {site.name: equivalent[site.name] for site in skipped},
+                "runs": runs,
+            }
+            options.results.write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
