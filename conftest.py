@@ -1,10 +1,13 @@
-"""What the tests and the examples in docstrings share: guarded arrays, and a small asset, to be opened as
-"out/" in the latter."""
+"""What the tests and the examples in docstrings share: guarded arrays, a small asset, to be opened as "out/"
+in the latter, and which tests may be skipped."""
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
+import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,88 @@ import pytest
 # Before player is imported, here and in every process that a test starts: compiled code that writes beside
 # its arrays is found out (`player.scratch`).
 os.environ["VFR_CANARIES"] = "1"
+
+LACKING = {
+    "programs": not (sys.platform == "linux" and platform.machine() == "x86_64"),
+    "open3d": sys.platform == "linux" and platform.machine() != "x86_64",
+    "signals": os.name == "nt",
+}
+"""What this platform does not have: the programs that `make` installs from Debian's or Ubuntu's packages,
+Open3D where pyproject.toml does not ask for it, and Ctrl-C that is sent to a process."""
+N_TESTS = {"programs": 13, "open3d": 29, "signals": 1}
+"""Tests marked `needs(...)`: so many are skipped where that is lacking, and no other test anywhere."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "needs(what): skipped on the platforms where conftest.py knows it lacks"
+    )
+    config.pluginmanager.register(Skips(config), "vfr-skips")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    counts: Counter[str] = Counter()
+    for item in items:
+        for what in {mark.args[0] for mark in item.iter_markers("needs")}:
+            counts[what] += 1
+            if LACKING[what]:
+                item.add_marker(pytest.mark.skip(reason=reason_of(what)))
+    if is_whole(config) and dict(counts) != N_TESTS:
+        raise pytest.UsageError(
+            f"tests marked needs(...): expected {N_TESTS} as in conftest.py, got {dict(counts)}"
+        )
+
+
+def reason_of(what: str) -> str:
+    """As the report of a skipped test has it."""
+    return f"this platform lacks {what}"
+
+
+def is_whole(config: pytest.Config) -> bool:
+    """Whether all tests are run, and not some."""
+    options = config.option
+    some = options.keyword or options.markexpr or options.deselect or getattr(options, "lf", False)
+    return config.args_source == pytest.Config.ArgsSource.TESTPATHS and not some
+
+
+class Skips:
+    """Counts tests that are skipped or expected to fail; where that is not what this platform is known to
+    lack, the run fails."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+        self._skipped: list[tuple[str, str]] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.outcome == "skipped":
+            self._note(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.outcome == "skipped":
+            self._note(report)
+
+    def _note(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        said = report.longrepr
+        reason = said[2] if isinstance(said, tuple) else getattr(report, "wasxfail", str(said))
+        self._skipped.append((report.nodeid, str(reason).removeprefix("Skipped: ")))
+
+    def _complaints(self) -> list[str]:
+        expected = {reason_of(what) for what, lacking in LACKING.items() if lacking}
+        found = [f"{test}: {why}" for test, why in self._skipped if why not in expected]
+        n = sum(N_TESTS[what] for what, lacking in LACKING.items() if lacking)
+        if is_whole(self._config) and len(self._skipped) != n:
+            found.append(f"skipped tests: expected {n} on this platform, got {len(self._skipped)}")
+        return found
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        done = session.exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
+        if done and self._complaints() and not hasattr(session.config, "workerinput"):
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        for complaint in self._complaints():
+            terminalreporter.write_line(f"a skip that nobody expects: {complaint}", red=True)
 
 
 @pytest.fixture(scope="session")

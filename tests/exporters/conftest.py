@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import platform
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,10 +14,7 @@ from tests.exporters.meshes import box
 from tests.exporters.solids import ball, cube, write_solid
 from tests.player import conftest as shells
 
-# One runs inside Blender; the other asks programs that `make` installs from Debian's or Ubuntu's packages.
-collect_ignore = ["blender_look.py"]
-if not (sys.platform == "linux" and platform.machine() == "x86_64"):
-    collect_ignore.append("test_other_programs.py")
+collect_ignore = ["blender_look.py"]  # runs inside Blender
 
 BOX = ((1.25, 2.25, 3.0), (1.75, 2.5, 4.0))
 """Corners of the asset's mesh, world frame: three edges of different length."""

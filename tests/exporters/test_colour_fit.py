@@ -13,7 +13,7 @@ from exporters.mesh import take_faces
 from exporters.training_views import DepthView
 from player.errors import MissingExtraError
 from tests.exporters.meshes import sphere
-from tests.exporters.test_training_views import HAS_OPEN3D, all_around, joined
+from tests.exporters.test_training_views import all_around, joined
 
 
 def colour_of(places: np.ndarray) -> np.ndarray:
@@ -35,9 +35,8 @@ def pictures(bias: float = 0.0) -> list[DepthView]:
     return views
 
 
+@pytest.mark.needs("open3d")
 def test_the_colours_of_a_ball() -> None:
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(24)
     shares: list[tuple[int, int]] = []
     rgb, known = fit_colours(mesh, pictures(), 0.05, lambda done, of: shares.append((done, of)))
@@ -47,20 +46,18 @@ def test_the_colours_of_a_ball() -> None:
     assert again.tobytes() == rgb.tobytes()
 
 
+@pytest.mark.needs("open3d")
 def test_no_other_colours_are_nearer_to_the_pictures() -> None:
     """Pictures that contradict each other have their mean, opposite sides being seen by one alone."""
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(24)
     rgb, _ = fit_colours(mesh, pictures(0.1), 0.05)
     above = rgb - colour_of(mesh.vertices)
     assert above.min() > -0.04 and above.max() < 0.14 and 0.03 < above.mean() < 0.07
 
 
+@pytest.mark.needs("open3d")
 def test_what_does_not_count() -> None:
     """A mesh that is not where the pictures have something, and a part that nobody sees."""
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(24)
     rgb, known = fit_colours(replace(mesh, vertices=mesh.vertices * 1.2), pictures(), 0.05)
     assert not known.any() and rgb.shape == (len(mesh.vertices), 3)
@@ -69,10 +66,9 @@ def test_what_does_not_count() -> None:
     assert known[: len(mesh.vertices)].all() and not known[len(mesh.vertices) :].any()
 
 
+@pytest.mark.needs("open3d")
 def test_unseen_corners_have_their_neighbours_colours() -> None:
     """From one side half of a ball is seen; the colours at the rim, 0.3 beside those below it, go on."""
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(24)
     upper = take_faces(mesh, mesh.vertices[mesh.faces, 2].min(axis=1) > -0.3)
     rgb, known = fit_colours(upper, pictures()[4:5], 0.05)

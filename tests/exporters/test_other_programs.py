@@ -24,6 +24,7 @@ from exporters.vdb import parse_vdb
 from player.cli import main as play
 from tests.exporters import block
 
+pytestmark = pytest.mark.needs("programs")
 LOOK = Path(__file__).with_name("blender_look.py")
 EXPORTS = {
     "glb": ["block.glb"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import sys
 from dataclasses import replace
 
@@ -13,12 +12,9 @@ from exporters.simplify import simplify_mesh
 from player.errors import ConfigError, MissingExtraError
 from tests.exporters.meshes import box, sphere
 
-HAS_OPEN3D = sys.platform != "linux" or platform.machine() == "x86_64"
 
-
+@pytest.mark.needs("open3d")
 def test_a_sphere_keeps_its_shape_and_colours() -> None:
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(60)
     few = simplify_mesh(mesh, 800)
     assert len(few.faces) <= 800 < len(mesh.faces)
@@ -34,18 +30,16 @@ def test_a_sphere_keeps_its_shape_and_colours() -> None:
     assert abs(volume / (4 / 3 * np.pi) - 1) < 0.04
 
 
+@pytest.mark.needs("open3d")
 def test_the_same_again_and_every_vertex_used() -> None:
-    if not HAS_OPEN3D:
-        return
     first, second = simplify_mesh(sphere(30), 200), simplify_mesh(sphere(30), 200)
     for name in ("vertices", "faces", "normals", "colours"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
     assert np.array_equal(np.unique(first.faces), np.arange(len(first.vertices)))
 
 
+@pytest.mark.needs("open3d")
 def test_alpha_is_that_of_the_nearest_vertex() -> None:
-    if not HAS_OPEN3D:
-        return
     mesh = sphere(30)
     colours = mesh.colours.copy()
     colours[:, 3] = np.where(mesh.vertices[:, 2] > 0, 255, 100)

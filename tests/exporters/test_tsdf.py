@@ -10,12 +10,11 @@ import pytest
 from exporters.training_views import DepthView
 from exporters.tsdf import fuse_depth, reliable_depth
 from player.errors import DataError, MissingExtraError
-from tests.exporters.test_training_views import BLACK, HAS_OPEN3D, all_around, camera, sphere_view
+from tests.exporters.test_training_views import BLACK, all_around, camera, sphere_view
 
 
+@pytest.mark.needs("open3d")
 def test_a_ball_again() -> None:
-    if not HAS_OPEN3D:
-        return
     vertices, faces, normals = fuse_depth(all_around(1.0), 0.06)
     radius = np.linalg.norm(vertices, axis=-1)
     # Depth is taken from the nearest pixel, and a pixel here is as wide as a voxel.
@@ -48,9 +47,8 @@ def test_depth_along_the_axis_and_jumps() -> None:
     assert (near[0, 1:3] > 0).all()  # beside nothing is no jump
 
 
+@pytest.mark.needs("open3d")
 def test_nothing_in_view(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not HAS_OPEN3D:
-        return
     nothing = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), np.inf, np.float32), BLACK)
     with pytest.raises(DataError, match="expected a surface in the training cameras' views, got none"):
         fuse_depth([nothing], 0.06)

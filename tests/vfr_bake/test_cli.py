@@ -272,7 +272,7 @@ def test_usage_is_2() -> None:
     assert caught.value.code == 2
 
 
-@pytest.mark.skipif(os.name == "nt", reason="SIGINT is not sent like this on Windows")
+@pytest.mark.needs("signals")
 def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
     path = tmp_path / "model.pt"
     code = "import sys; from vfr_bake import bars, cli; bars.SECONDS_BETWEEN_LINES = 0.2"
