@@ -6,12 +6,13 @@ python examples/layers.py out/ layers.png
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from player import Asset, Frame
 from player.cameras import orbit
+from player.images import write_png
 from player.render import render
 from player.transforms import read_cameras
 
@@ -35,7 +36,7 @@ def main(folder: str, target: str) -> None:
     trained = read_cameras(asset.path("cameras.json"))
     camera = orbit(trained, n_frames=8, size=(400, 400))[3]  # a view that nobody has photographed
     frame = render(asset, camera)
-    Image.fromarray(side_by_side(frame)).save(target)
+    write_png(Path(target), side_by_side(frame))
     print(f"{target}: {np.mean(frame.opacity > 0.5):.0%} of the pixels show the scene, "
           f"{frame.depth[frame.opacity > 0.5].min():.3g} or more units away")  # fmt: skip
 

@@ -19,6 +19,7 @@ from player.errors import FormatError, IntegrityError, OutputError
 from player.files import new_folder
 from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
 from player.packing import pack_codes, pack_masks, unpack_codes, unpack_masks
+from player.replace import clear_up
 from player.sparse_grid import SparseGrid, build_grid
 
 _DTYPES = {
@@ -276,6 +277,8 @@ def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
 
 def _read_manifest(folder: Path) -> Manifest:
     path = folder / NAME
+    if not folder.is_dir():
+        clear_up(folder.parent)  # it may be there, if whoever replaced it was killed
     if not folder.is_dir():
         raise FormatError(
             f"{folder}: expected the folder of an asset, got {'a file' if folder.exists() else 'nothing'}"

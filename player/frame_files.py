@@ -22,6 +22,7 @@ from player.files import check_target, write_bytes
 from player.images import ENCODERS, read_key
 from player.manifest import NAME
 from player.options import PICTURES, VIDEO
+from player.replace import clear_up
 from player.transforms import frame_names
 from player.video import load_av, write_video
 
@@ -79,6 +80,7 @@ class Target:
         if self.is_video:
             load_av()
         if not self.is_picture:
+            clear_up(self.folder)
             self._check_folder(force or resume)
 
     def _check_folder(self, allowed: bool) -> None:

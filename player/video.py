@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from player.errors import MissingExtraError, OutputError
+from player.files import new_file
 
 QUALITY = 18
 """x264's constant rate factor: 0 is lossless, 18 looks it, 23 is its default."""
@@ -43,13 +43,10 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
         OutputError: FFmpeg refuses, or the disk is full.
     """
     av = load_av()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        temporary = Path(folder) / path.name
+    with new_file(path) as temporary:
         try:
             with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
                 _encode(av, container, pictures, fps)
-            temporary.replace(path)
         except (av.FFmpegError, OSError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise OutputError(f"{path}: cannot write: {reason}") from error

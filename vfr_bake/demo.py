@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from player.errors import VfrError
-from player.files import check_target
+from player.files import check_target, write_bytes
 
 TRAIN_MINUTES = 2.0
 """Leaves room for compiling, baking and playing within five minutes on two cores."""
@@ -53,9 +53,8 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     check_target(output / "model.pt", force)
     begin = time.monotonic()
     scene = load_scene("demo")
-    output.mkdir(parents=True, exist_ok=True)
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]
-    (output / "cameras_test.json").write_bytes(write_cameras(cameras))
+    write_bytes(output / "cameras_test.json", write_cameras(cameras))
     forced = ["--force"] if force else []
 
     def run(name: str, command: Callable[[list[str]], int], *arguments: str) -> float:
@@ -88,6 +87,7 @@ def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path
     frames."""
     from PIL import Image
 
+    from player.images import write_png
     from player.transforms import frame_names
     from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 
@@ -97,7 +97,7 @@ def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path
     mean = float(np.mean([psnr(a / 255, b / 255) for a, b in zip(photographs, played, strict=True)]))
     chosen = np.linspace(0, len(names) - 1, N_SHOWN).round().astype(int)
     rows = [np.concatenate([pictures[i] for i in chosen], axis=1) for pictures in (photographs, played)]
-    Image.fromarray(np.concatenate(rows)).save(target)
+    write_png(target, np.concatenate(rows))
     return target, mean
 
 

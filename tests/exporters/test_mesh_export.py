@@ -145,7 +145,7 @@ def test_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(OutputError, match="two: cannot write: No space left on device"):
+    with pytest.raises(OutputError, match="one: cannot write: No space left on device"):
         write_together({tmp_path / "one": b"1", tmp_path / "two": b"2"})
     assert [path.name for path in tmp_path.iterdir()] == ["one"] and (tmp_path / "one").read_text() == "old"
     monkeypatch.undo()

@@ -63,6 +63,12 @@ def old(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def no_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A system, or a disk, that cannot exchange two names in one step."""
+    monkeypatch.setattr("player.replace.exchange", lambda one, other: False)
+
+
+@pytest.fixture
 def read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "read only"
     folder.mkdir()
@@ -201,7 +207,12 @@ def test_a_folder_that_exists_is_refused_before_the_work(old: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_force_replaces_at_the_end(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("in_one_step", [True, False])
+def test_force_replaces_at_the_end(
+    kind: str, in_one_step: bool, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if not in_one_step:
+        request.getfixturevalue("no_exchange")
     path = tmp_path / "result"
     if kind == "folder":
         path.mkdir()
@@ -216,7 +227,7 @@ def test_force_replaces_at_the_end(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("failing", [1, 2])
 def test_a_failure_in_replacing_restores_the_old_folder(
-    failing: int, old: Path, monkeypatch: pytest.MonkeyPatch
+    failing: int, old: Path, no_exchange: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first rename puts the old folder aside, the second would put the new one in its place."""
     rename, calls = Path.replace, []
@@ -232,7 +243,9 @@ def test_a_failure_in_replacing_restores_the_old_folder(
     assert tree(old) == {"old": b"old"} and names(old.parent) == ["result"]
 
 
-def test_an_old_folder_that_cannot_be_restored_is_kept(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_folder_that_cannot_be_restored_is_kept(
+    old: Path, no_exchange: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rename, calls = Path.replace, []
 
     def replace(self: Path, target: Path) -> Path:
@@ -245,7 +258,7 @@ def test_an_old_folder_that_cannot_be_restored_is_kept(old: Path, monkeypatch: p
     kept = Path(calls[0])
     assert str(caught.value).startswith(f"{old}: cannot put the old one back: ")
     assert str(caught.value).endswith(f"it is in {kept}")
-    assert tree(kept) == {"old": b"old"} and names(old.parent) == [kept.parent.name]
+    assert tree(kept) == {"old": b"old"} and names(old.parent) == [kept.name]
 
 
 def test_new_folder_in_a_read_only_folder(read_only: Path) -> None:
