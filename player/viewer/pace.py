@@ -24,6 +24,9 @@ SHARP_SECONDS = 0.5
 LEAST = 64 * 48
 """Pixels of the smallest picture: with less nobody knows where he is."""
 
+MOST = 1920 * 1080
+"""Pixels of the largest picture while moving, however fast they come."""
+
 
 class Pace:
     """Sizes of pictures for one window.
@@ -41,7 +44,7 @@ class Pace:
         """Learn from a picture that was rendered while moving."""
         wanted = pixels * SHARE * FRAME_SECONDS / max(seconds, 1e-4)
         # At most twice or half of it at a time: one hiccup of the machine does not blur the next ten.
-        self._pixels = max(min(wanted, 2 * self._pixels), self._pixels / 2, LEAST)
+        self._pixels = min(max(min(wanted, 2 * self._pixels), self._pixels / 2, LEAST), MOST)
 
     def moving(self, width: int, height: int) -> tuple[int, int]:
         """Size of the next picture while the camera moves, for a window of `width` x `height`."""

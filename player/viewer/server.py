@@ -37,7 +37,7 @@ def serve(arguments: argparse.Namespace) -> None:
     files = f"vfr-play {arguments.asset} --orbit 60 --output frames/"
     if arguments.background == "transparent":
         raise ConfigError("--background: expected a colour for the viewer, got transparent")
-    viser = _viser(files)
+    _need_viser(files)
     import_ahead()
     assets = [Asset.open(folder) for folder in (arguments.asset, *arguments.others)]
     host = arguments.host or HOST
@@ -46,8 +46,7 @@ def serve(arguments: argparse.Namespace) -> None:
         renderers = [
             stack.enter_context(Renderer(asset, arguments.threads, arguments.march)) for asset in assets
         ]
-        with redirect_stdout(io.StringIO()):  # its banner: ours is the one line that scripts read
-            server = local_server(viser)(host=host, port=port, label=_title(assets[0]), verbose=False)
+        server = guarded_server(host, port, _title(assets[0]))
         try:
             windows = open_windows(server, renderers, arguments.samples, arguments.background)
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
@@ -64,11 +63,34 @@ def serve(arguments: argparse.Namespace) -> None:
                 server.stop()
 
 
+def guarded_server(host: str, port: int, title: str = "") -> Any:
+    """viser's server, with `player.viewer.guard` before every connection.
+
+    Raises MissingExtraError for a viser that cannot be guarded.
+    """
+    import viser
+
+    from player.viewer.guard import Guard, every_connection_checked
+
+    server = None
+    try:
+        # its banner: ours is the one line that scripts read
+        with every_connection_checked(Guard(host, viser.__version__)), redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    except MissingExtraError:
+        if server is not None:
+            server.stop()
+        raise
+    return server
+
+
 def open_windows(
     server: Any, renderers: Sequence[Renderer], samples: int | None, background: Any
 ) -> dict[int, Window]:
-    """Give every client of a viser server a window, and end it when the client is gone; returns those that
+    """Give every client of a guarded server a window, and end it when the client is gone; returns those that
     are open. Cameras are those of the first asset."""
+    from player.viewer.guard import CONNECTION
+
     asset = renderers[0].asset
     width, height = asset.manifest.view_size
     trained = read_cameras(asset.path("cameras.json"), (width, height))
@@ -80,11 +102,12 @@ def open_windows(
     server.initial_camera.look_at = focus
     server.initial_camera.fov = fov = float(2 * np.arctan(first.height / 2 / first.fy))
     windows: dict[int, Window] = {}
+    whole = threading.Lock()
 
     @server.on_client_connect
-    def _(client: Any) -> None:
+    async def _(client: Any) -> None:  # awaited where its connection is known; a plain function is not
         client.camera.fov = fov
-        window = Window(client, renderers, trained, focus, samples, background)
+        window = Window(client, CONNECTION.get(), renderers, trained, focus, samples, background, whole)
         windows[client.client_id] = window
         window.start()
 
@@ -117,26 +140,14 @@ def free_port(host: str, asked: int | None) -> int:
     raise ConfigError(f"viewer: {what} at {host}: expected a free port, got: {reason}")
 
 
-def _viser(files: str) -> Any:
+def _need_viser(files: str) -> None:
     try:
-        import viser
+        import viser  # noqa: F401
     except ImportError as error:
         raise MissingExtraError(
             "viewer: expected the package viser, which is not installed: pip install 'vfr-bake[viewer]'; "
             f"or render files: {files}"
         ) from error
-    return viser
-
-
-def local_server(viser: Any) -> type:
-    """viser's server, but deaf to a client that asks for a way in from the internet (share.viser.studio): to
-    hide the button does not keep a client from asking."""
-
-    class LocalServer(viser.ViserServer):
-        def request_share_url(self, verbose: bool = True) -> None:
-            return None
-
-    return LocalServer
 
 
 def _title(asset: Asset) -> str:

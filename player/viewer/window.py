@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +19,23 @@ from player.images import png_bytes
 from player.keyframes import smooth_path
 from player.render import Frame, Renderer
 from player.viewer.layers import LAYERS, layer_picture
-from player.viewer.pace import STILL_SECONDS, Pace
+from player.viewer.pace import STILL_SECONDS, Pace, fitted
+
+if TYPE_CHECKING:
+    from player.viewer.guard import GuardedConnection
+    from player.viewer.messages import Check
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 PATH_FPS = 30
 STRIP_PIXELS = 50_000
 """The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
+MOST_PIXELS = 3840 * 2160
+"""Of a whole picture, whatever size a window says it has."""
+MOST_SIDE = 8192
+MOST_VIEWS = 200
+"""Of a recorded path."""
+HANDED_OVER_SECONDS = 0.2
+"""By then viser has given a file to the connection."""
 
 
 class Window:
@@ -32,13 +44,19 @@ class Window:
     def __init__(
         self,
         client: Any,
+        connection: GuardedConnection,
         renderers: Sequence[Renderer],
         trained: Sequence[Camera],
         focus: np.ndarray,
         samples: int | None,
         background: tuple[float, float, float] | None,
+        whole: threading.Lock,
     ) -> None:
+        """`whole` is held by the one window that makes a whole picture: memory for many is not needed."""
         self._client = client
+        self._connection = connection
+        self._whole = whole
+        self._saving = threading.Lock()
         self._renderers = _named(renderers)
         self._renderer = renderers[0]
         self._trained = trained
@@ -77,12 +95,15 @@ class Window:
     # --- controls ---
 
     def _add_controls(self, samples: int, background: Sequence[float]) -> None:
+        from player.viewer.messages import colour, one_of
+
         gui = self._client.gui
         with gui.add_folder("Picture"):
             if len(self._renderers) > 1:
                 names = list(self._renderers)
                 self._asset = gui.add_dropdown("Asset", names, initial_value=names[0])
                 self._asset.on_update(lambda _: self._switch())
+                self._takes(self._asset, one_of(names))
             self._layer = gui.add_dropdown("Show", LAYERS, initial_value="colour")
             self._samples = gui.add_slider(
                 "Fetches",
@@ -116,6 +137,25 @@ class Window:
         record.on_click(lambda _: self._record())
         self._save.on_click(lambda _: self._save_path())
         self._clear.on_click(lambda _: self._clear_path())
+        self._takes(self._layer, one_of(LAYERS))
+        self._takes(self._background, colour)
+        self._let_use(
+            sliders=(self._samples, self._fov, self._view, self._seconds),
+            buttons=(jump, picture, record, self._save, self._clear),
+        )
+
+    def _let_use(self, sliders: Sequence[Any], buttons: Sequence[Any]) -> None:
+        from player.viewer.messages import pressed, within
+
+        for slider in sliders:
+            whole = isinstance(slider.value, int)
+            self._takes(slider, within(lambda slider=slider: (slider.min, slider.max), whole))
+        for button in buttons:
+            self._takes(button, pressed)
+
+    def _takes(self, control: Any, check: Check) -> None:
+        """Let the client set a control, to what the check makes of it."""
+        self._connection.controls[control._impl.uuid] = check
 
     def _switch(self) -> None:
         """To another asset, with the fetches that it was baked for."""
@@ -141,12 +181,28 @@ class Window:
         self._set_fov()
 
     def _screenshot(self) -> None:
-        frame = self._frame(self._camera())
-        data = png_bytes(layer_picture(frame, self._layer.value))
-        self._client.send_file_download("screenshot.png", data, save_immediately=True)
+        def picture() -> bytes:
+            with self._whole:
+                return png_bytes(layer_picture(self._frame(self._camera()), self._layer.value))
+
+        self._send_file("screenshot.png", picture)
+
+    def _send_file(self, name: str, make: Callable[[], bytes]) -> None:
+        """Send a file once the client has taken what it was sent before; clicks meanwhile do nothing."""
+        if not self._saving.acquire(blocking=False):
+            return
+        try:
+            while self._connection.n_sending and not self._closed:
+                time.sleep(HANDED_OVER_SECONDS)
+            if not self._closed:
+                self._client.send_file_download(name, make(), save_immediately=True)
+                time.sleep(HANDED_OVER_SECONDS)
+        finally:
+            self._saving.release()
 
     def _record(self) -> None:
-        self._views.append(self._camera())
+        if len(self._views) < MOST_VIEWS:
+            self._views.append(self._camera())
         self._show_path()
 
     def _clear_path(self) -> None:
@@ -159,21 +215,25 @@ class Window:
         self._save.label = f"Save path of {n} views" if n else "Save path"
 
     def _save_path(self) -> None:
-        steps = max(1, round(self._seconds.value * PATH_FPS))
-        data = write_camera_path(smooth_path(self._views, steps), PATH_FPS)
-        self._client.send_file_download("camera_path.json", data, save_immediately=True)
+        views, steps = list(self._views), max(1, round(self._seconds.value * PATH_FPS))
+        if len(views) >= 2:  # the button is disabled, which does not keep a client from pressing it
+            self._send_file(
+                "camera_path.json", lambda: write_camera_path(smooth_path(views, steps), PATH_FPS)
+            )
 
     # --- pictures ---
 
     def _camera(self) -> Camera:
-        """The camera of the window as it is now, in the world frame."""
+        """The camera of the window as it is now, in the world frame, with no more pixels than allowed."""
         seen = self._client.camera
         c2w = np.eye(4)
         c2w[:3, :3] = _matrix(seen.wxyz) @ OPENGL_FROM_OPENCV
         c2w[:3, 3] = seen.position
         width, height = max(int(seen.image_width), 1), max(int(seen.image_height), 1)
         focal = height / 2 / math.tan(seen.fov / 2)
-        return Camera("viewer", c2w, width, height, focal, focal, width / 2, height / 2)
+        camera = Camera("viewer", c2w, width, height, focal, focal, width / 2, height / 2)
+        width, height = fitted(min(width, MOST_SIDE), min(height, MOST_SIDE), MOST_PIXELS)
+        return camera.resized(width, height)
 
     def _frame(self, camera: Camera) -> Frame:
         red, green, blue = (value / 255 for value in self._background.value)
@@ -190,6 +250,9 @@ class Window:
                 self._sharpen(version)
             except VfrError as error:
                 self._state.value = str(error)
+            except Exception:  # a bug: it is told, and does not end the window
+                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
+                self._state.value = "failed: the terminal of vfr-play says why"
 
     def _wait(self, version: int, seconds: float | None) -> bool:
         """Wait for something newer than `version`; whether there is, and the window still open."""
@@ -215,12 +278,24 @@ class Window:
         window = (camera.width, camera.height)
         size = self._pace.sharp(*window)
         for width, height in dict.fromkeys([size, window]):
+            if not self._have_turn(version):
+                return
             start = time.perf_counter()
-            picture = self._in_strips(camera.resized(width, height), version)
+            try:
+                picture = self._in_strips(camera.resized(width, height), version)
+            finally:
+                self._whole.release()
             if picture is None:
                 return
             seconds = time.perf_counter() - start
             self._send(picture, 95, f"{width}x{height}, {seconds * 1000:.0f} ms")
+
+    def _have_turn(self, version: int) -> bool:
+        """Wait until no other window makes a whole picture; False if something changed meanwhile."""
+        while not self._whole.acquire(timeout=0.05):
+            if self._closed or self._version != version:
+                return False
+        return True
 
     def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
         """The picture, or None if something changed meanwhile."""

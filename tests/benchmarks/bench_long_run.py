@@ -48,10 +48,11 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
     """Connect, read, vanish; the server's memory and whether it still answers."""
     import viser
     from websockets.sync.client import connect
-    from websockets.typing import Subprotocol
+    from websockets.typing import Origin, Subprotocol
 
     spoken = [Subprotocol(f"viser-v{viser.__version__}")]
     port = free_port("127.0.0.1", None)
+    origin = Origin(f"http://127.0.0.1:{port}")
     program = "import sys, player.cli as c; sys.exit(c.main())"
     command = [sys.executable, "-c", program, str(folder), "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -61,7 +62,11 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
             some = []
             for _ in range(n_clients):
                 some.append(
-                    _patiently(lambda: connect(f"ws://127.0.0.1:{port}", subprotocols=spoken, max_size=None))
+                    _patiently(
+                        lambda: connect(
+                            f"ws://127.0.0.1:{port}", subprotocols=spoken, origin=origin, max_size=None
+                        )
+                    )
                 )
             for client in some:
                 for _ in range(20):

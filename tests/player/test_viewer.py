@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
-import re
 import shutil
-import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,12 +22,10 @@ from player.render import Renderer
 from player.transforms import read_cameras
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.pace import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, Pace, fitted
-from player.viewer.server import free_port, local_server
+from player.viewer.server import free_port
 from tests.player.conftest import write_shells
+from tests.player.viewer_client import SECONDS, Server
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-SECONDS = 120.0
-"""Patience with a browser without a graphics card on a busy machine; nothing waits that long in vain."""
 WINDOW = {"width": 900, "height": 500}
 
 
@@ -63,25 +57,6 @@ def test_one_hiccup_halves_the_picture_at_most() -> None:
 
 def test_the_sharp_picture_is_there_within_a_second() -> None:
     assert SHARP_SECONDS + 0.15 < 1 and fitted(1, 1, 0.0) == (1, 1) and fitted(3000, 2, 600) == (949, 1)
-
-
-# --- who gets in ---
-
-
-def test_a_client_cannot_open_a_way_in_from_the_internet(monkeypatch: pytest.MonkeyPatch) -> None:
-    import viser
-    from viser import _messages, _viser
-
-    asked = []
-    monkeypatch.setattr(_viser, "ViserTunnel", lambda *address: asked.append(address))
-    server = local_server(viser)(host="127.0.0.1", port=free_port("127.0.0.1", None), verbose=False)
-    try:
-        for handler in server._websock_server._incoming_handlers[_messages.ShareUrlRequest]:
-            handler(0, _messages.ShareUrlRequest())
-        server._thread_executor.shutdown(wait=True)
-    finally:
-        server.stop()
-    assert not asked
 
 
 # --- layers ---
@@ -145,35 +120,6 @@ def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.Captu
 
 
 # --- in a browser ---
-
-
-class Server:
-    """`vfr-play ASSET ...` as a process."""
-
-    def __init__(self, errors: Path, *folders: Path) -> None:
-        environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-        self.errors = errors
-        with errors.open("w") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "player", *map(str, folders)],
-                env=environment | {"PYTHONPATH": str(REPOSITORY)},
-                stdout=subprocess.PIPE,
-                stderr=file,
-                text=True,
-            )
-        assert self.process.stdout is not None
-        self.line = self.process.stdout.readline()
-        found = re.search(r"http://\S+", self.line)
-        assert found, self.line + errors.read_text()
-        self.address = found[0]
-
-    def stop(self) -> int:
-        """End it, by Ctrl-C; the exit code."""
-        self.process.send_signal(signal.SIGINT)
-        code = self.process.wait(SECONDS)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-        return code
 
 
 @pytest.fixture(scope="module")
