@@ -54,7 +54,7 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
     except ImportError as error:
         raise MissingExtraError("ONNX: needs the package onnx: pip install 'vfr-bake[export]'") from error
     source = asset.path("head.onnx")
-    data = source.read_bytes()
+    data = asset.read("head.onnx")
     arrays = read_head(data, str(source))  # a head that is none has its own message
     model = onnx.load_from_string(data)
     if arrays.may_saturate:

@@ -10,6 +10,7 @@ from typing import Any
 
 from exporters.formats import FOLDERS, FORMATS, POINTS, ExportOptions
 from player.errors import VfrError
+from player.options import MAX_MEMORY, gigabytes
 
 _DESCRIPTION = """\
 Write a baked asset, or a part of it, for another program.
@@ -79,7 +80,9 @@ def main(argv: list[str] | None = None) -> int:
 
         summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), _bar)
     except VfrError as error:
-        print(f"vfr-export: error: {error}", file=sys.stderr)
+        from player.terminal import printable
+
+        print(f"vfr-export: error: {printable(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("vfr-export: interrupted", file=sys.stderr)
@@ -107,6 +110,7 @@ def _options(arguments: argparse.Namespace) -> ExportOptions:
         colour=arguments.colour,
         decode=arguments.decode,
         force=arguments.force,
+        max_memory=arguments.max_memory,
     )
 
 
@@ -147,6 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
     add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
     add("--force", action="store_true", help="replace FILE if it exists")
+    add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
     add("--json", action="store_true", help="print the summary as one line of JSON")
     return parser
 

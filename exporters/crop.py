@@ -11,7 +11,6 @@ rough as a face is long, and nothing sticks out.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 from exporters.mesh import TriangleMesh, take_faces
 from player.cameras import check_pose
 from player.errors import ConfigError, FormatError
+from player.json_files import brief, parse_json, read_json
 
 _FORM = "X,Y,Z,W,D,H[,YAW] (centre, size, degrees about Z) or a .json file"
 
@@ -83,12 +83,7 @@ def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
 
 
 def _read_box(path: Path) -> CropBox:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FormatError(f"{path}: cannot read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise FormatError(f"{path}: expected JSON, got something else: {error}") from error
+    document = parse_json(read_json(path, "a box to crop to"), str(path))
     keys = set(document) if isinstance(document, dict) else set()
     if keys == {"matrix", "size"}:
         matrix = _array(path, document, "matrix", (4, 4))
@@ -98,7 +93,9 @@ def _read_box(path: Path) -> CropBox:
             float(_array(path, {"yaw": 0.0, **document}, "yaw", ())),
         )
     else:
-        raise FormatError(f"{path}: expected matrix and size, or centre, size and yaw, got {sorted(keys)}")
+        raise FormatError(
+            f"{path}: expected matrix and size, or centre, size and yaw, got {brief(sorted(keys))}"
+        )
     return _box(str(path), matrix, _array(path, document, "size", (3,)).tolist())
 
 

@@ -51,7 +51,8 @@ def export_asset(
         `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
 
     Raises:
-        ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop.
+        ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
+            asset that takes more memory than it may.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.
@@ -64,7 +65,7 @@ def export_asset(
     for path in [path for level in mesh_paths(target, options, name) for path in level] if is_mesh else []:
         _check_target(asset_path, path, name, options.force)
     force = _check_target(asset_path, target, name, options.force)
-    asset = Asset.open(asset_path, verify=True)
+    asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
     if name not in ("exr", "json", "onnx"):
         asset = inner_region(asset)
     if is_mesh:

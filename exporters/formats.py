@@ -88,6 +88,8 @@ class ExportOptions:
     """Colours in a volume."""
     decode: bool = False
     force: bool = False
+    max_memory: float | None = None
+    """Gigabytes that the asset may take when it is opened; a share of the machine's if None."""
 
 
 def check_options(target: Path, options: ExportOptions) -> str:

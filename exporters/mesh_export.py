@@ -82,7 +82,7 @@ def export_mesh(
 def world_mesh(scene: Scene, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh in the world's frame, cropped, and what to say about it: as baked, unless `method` or `level`
     asks for it to be made again: then it is white, and what is said has a `method`."""
-    from exporters.ply import read_ply
+    from exporters.ply import parse_ply
 
     box = None
     if options.crop is not None:
@@ -91,7 +91,7 @@ def world_mesh(scene: Scene, options: ExportOptions) -> tuple[TriangleMesh, dict
         box = parse_crop(options.crop)
     facts: dict[str, Any] = {"frame": options.frame or "world"}
     if options.method is None and options.level is None:
-        mesh = read_ply(scene.asset.path("mesh.ply"))
+        mesh = parse_ply(scene.asset.read("mesh.ply"), str(scene.asset.path("mesh.ply")))
     else:
         method = options.method or "density"
         mesh, removed = scene.surface(method, options.level)

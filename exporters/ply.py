@@ -14,7 +14,10 @@ import numpy as np
 
 from exporters.mesh import TriangleMesh
 from player.errors import FormatError, IntegrityError, VfrError
+from player.files import read_bytes
 
+MAX_BYTES = 4 << 30
+"""A hundred million faces. What an asset's mesh may take is compared with its budget when it is opened."""
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 4)])
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
 
@@ -62,11 +65,7 @@ def read_ply(path: Path) -> TriangleMesh:
         FormatError: the file cannot be read, its header is another one, or its content is not a mesh.
         IntegrityError: the file is shorter or longer than its header says.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"{path}: cannot read: {error.strerror or error}") from error
-    return parse_ply(data, str(path))
+    return parse_ply(read_bytes(path, "a mesh", MAX_BYTES), str(path))
 
 
 def parse_ply(data: bytes, where: str) -> TriangleMesh:

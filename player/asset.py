@@ -6,56 +6,31 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 
-from player.bricks import bricks_per_axis, unpack_vertices
-from player.errors import FormatError, IntegrityError, OutputError
-from player.files import new_folder
-from player.manifest import NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
-from player.packing import pack_codes, pack_masks, unpack_codes, unpack_masks
+from player.errors import FormatError, IntegrityError
+from player.files import new_folder, open_file, read_bytes
+from player.manifest import MAX_BYTES, NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
+from player.memory import allowed_bytes
+from player.packing import pack_codes, pack_masks
 from player.replace import clear_up
-from player.sparse_grid import SparseGrid, build_grid
-
-_DTYPES = {
-    "brick_coords": "<u2",
-    "brick_masks": "<u8",
-    "density": "|u1",
-    "feature_coords": "<u2",
-    "feature_masks": "<u8",
-    "features": "|i1",
-}
-_FILES = {
-    "brick_coords": "brick_coords.npy",
-    "brick_masks": "brick_masks.bits",
-    "density": "density.codes",
-    "feature_coords": "feature_coords.npy",
-    "feature_masks": "feature_masks.bits",
-    "features": "features.codes",
-}
-
-
-_HEADER_ERRORS = (
-    ValueError,
-    EOFError,
-    OSError,
-    SyntaxError,
-    TypeError,
-    OverflowError,
-    RecursionError,
-    TokenError,
+from player.sparse_grid import SparseGrid, build_grid, most_samples
+from player.unpacking import (
+    DENSITIES,
+    DTYPES,
+    FEATURES,
+    PLACES,
+    Names,
+    check_bricks,
+    check_files,
+    check_size,
+    n_vertices,
+    read_arrays,
 )
-"""What numpy raises for broken .npy files; the last one where it tries the header again as Python 2 wrote
-it."""
-
-Names = tuple[str, str, str]
-_DENSITIES: Names = ("brick_coords", "brick_masks", "density")
-_FEATURES: Names = ("feature_coords", "feature_masks", "features")
 
 MAX_VERTICES = 2**31 - 1
 """Stored vertices of a grid, whose rows are numbered in 32 bits (`player.vertex_rows`)."""
@@ -74,46 +49,32 @@ class GridArrays:
 
     def check(self, manifest: Manifest, where: str) -> None:
         """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
-        self._check_grid(_DENSITIES, (), manifest.resolution, where)
-        self._check_grid(_FEATURES, (manifest.n_channels,), manifest.feature_resolution, where)
+        self._check_grid(DENSITIES, (), manifest.resolution, where)
+        self._check_grid(FEATURES, (manifest.n_channels,), manifest.feature_resolution, where)
 
     def _check_grid(self, names: Names, of_a_vertex: tuple[int, ...], resolution: int, where: str) -> None:
         coords_name, masks_name, codes_name = names
         coords, masks = getattr(self, coords_name), getattr(self, masks_name)
         n_bricks = len(coords) if coords.ndim else 0
-        n_vertices = int(np.bitwise_count(masks).sum()) if masks.dtype.kind == "u" else 0
-        if n_vertices > MAX_VERTICES:
+        n_rows = n_vertices(masks) if masks.dtype.kind == "u" else 0
+        if n_rows > MAX_VERTICES:
             raise FormatError(
-                f"{where}{_FILES[masks_name]}: expected at most {MAX_VERTICES} vertices, got {n_vertices}"
+                f"{where}{PLACES[masks_name]}: expected at most {MAX_VERTICES} vertices, got {n_rows}"
             )
         shapes = {
             coords_name: (n_bricks, 3),
             masks_name: (n_bricks, 8),
-            codes_name: (n_vertices, *of_a_vertex),
+            codes_name: (n_rows, *of_a_vertex),
         }
         for name, shape in shapes.items():
             array = getattr(self, name)
-            dtype = np.dtype(_DTYPES[name])
+            dtype = np.dtype(DTYPES[name])
             if array.dtype != dtype or array.shape != shape:
                 raise FormatError(
-                    f"{where}{_FILES[name]}: expected {dtype.name} {list(shape)}, "
+                    f"{where}{PLACES[name]}: expected {dtype.name} {list(shape)}, "
                     f"got {array.dtype.name} {list(array.shape)}"
                 )
-        coords = np.asarray(coords, np.int64)
-        keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
-        if (np.diff(keys) <= 0).any():
-            raise FormatError(f"{where}{_FILES[coords_name]}: expected bricks sorted by x, y, z, each once")
-        n = bricks_per_axis(resolution)
-        if (coords >= n).any():
-            raise FormatError(
-                f"{where}{_FILES[coords_name]}: expected coordinates below {n}, got {coords.max()}"
-            )
-        edge = (coords == n - 1).any(axis=1)
-        beyond = unpack_vertices(coords[edge], masks[edge]).max(initial=0)
-        if beyond > resolution:
-            raise FormatError(
-                f"{where}{_FILES[masks_name]}: expected vertices up to {resolution}, got one at {beyond}"
-            )
+        check_bricks(coords, masks, names, resolution, where)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,32 +86,37 @@ class Asset:
     arrays: GridArrays
 
     @classmethod
-    def open(cls, folder: str | Path, verify: bool = False) -> Asset:
+    def open(cls, folder: str | Path, verify: bool = False, max_memory: float | None = None) -> Asset:
         """Open the asset in `folder`.
 
         Args:
-            folder: the asset's folder.
+            folder: the asset's folder; its files are regular ones inside it.
             verify: compare every checksum first, which reads every byte.
+            max_memory: gigabytes that the asset may take, unpacked and arranged for marching; half of what
+                the machine has if None.
 
         Raises:
             FormatError: not an asset, or one that breaks the format; VersionError if it is a newer one.
             IntegrityError: a file is cut short or changed.
+            ConfigError: it takes more memory than it may.
         """
-        folder = Path(folder)
-        manifest = _read_manifest(folder)
-        for name, entry in manifest.files.items():
-            _check_size(folder / name, entry)
-            if verify:
-                _check_sum(folder / name, entry)
-        arrays = _read_arrays(folder, manifest)
-        arrays.check(manifest, f"{folder}/")
-        return cls(folder, manifest, arrays)
+        folder, allowed = Path(folder), allowed_bytes(max_memory)
+        manifest = read_manifest(folder)
+        check_files(folder, manifest, allowed)
+        if verify:
+            for name, entry in manifest.files.items():
+                _check_sum(folder, name, entry)
+        return cls(folder, manifest, GridArrays(*read_arrays(folder, manifest, allowed)))
 
     def path(self, name: str) -> Path:
         """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
         if name not in self.manifest.files:
             raise FormatError(f"{self.folder}: expected one of {sorted(self.manifest.files)}, got {name}")
         return self.folder / name
+
+    def read(self, name: str) -> bytes:
+        """The content of one of the asset's files. Raises FormatError."""
+        return read_bytes(self.path(name), "a file of an asset", self.manifest.files[name].bytes, self.folder)
 
     def verify(self) -> None:
         """Compare every file with its checksum; raises IntegrityError that names the first that differs."""
@@ -174,6 +140,12 @@ class Asset:
             m.near,
         )
 
+    @property
+    def most_samples(self) -> int:
+        """Samples that a ray can have; more feature fetches than that are as good as one at every sample."""
+        low, high = self.manifest.aabb
+        return most_samples(math.dist(low, high), self.manifest.step)
+
     @cached_property
     def world_from_model(self) -> np.ndarray:
         """[4, 4] float64."""
@@ -189,8 +161,8 @@ def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatErr
     """Every file's name with what is wrong with it, or None; reads each byte once."""
     for name, entry in sorted(manifest.files.items()):
         try:
-            _check_size(folder / name, entry)
-            _check_sum(folder / name, entry)
+            check_size(folder, name, entry)
+            _check_sum(folder, name, entry)
         except FormatError as error:
             yield name, error
         else:
@@ -198,8 +170,21 @@ def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatErr
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """The manifest alone, for looking at an asset whose other files may be broken."""
-    return _read_manifest(Path(folder))
+    """The manifest alone, for looking at an asset whose other files may be broken.
+
+    Raises FormatError: not an asset, or a manifest that breaks the format.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        clear_up(folder.parent)  # it may be there, if whoever replaced it was killed
+    if not folder.is_dir():
+        raise FormatError(
+            f"{folder}: expected the folder of an asset, got {'a file' if folder.exists() else 'nothing'}"
+        )
+    path = folder / NAME
+    if not path.exists() and not path.is_symlink():
+        raise FormatError(f"{folder}: not an asset: expected {NAME} in it, got none")
+    return parse_manifest(read_bytes(path, "a manifest", MAX_BYTES, folder), str(path))
 
 
 def write_asset(
@@ -232,13 +217,13 @@ def write_asset(
     arrays.check(manifest, "")
     with new_folder(folder, force) as new:
         for name in ("brick_coords", "feature_coords"):
-            with (new / _FILES[name]).open("wb") as file:
-                array = np.ascontiguousarray(getattr(arrays, name), _DTYPES[name])
+            with (new / PLACES[name]).open("wb") as file:
+                array = np.ascontiguousarray(getattr(arrays, name), DTYPES[name])
                 np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
         for name in ("brick_masks", "feature_masks"):
-            (new / _FILES[name]).write_bytes(pack_masks(getattr(arrays, name)))
+            (new / PLACES[name]).write_bytes(pack_masks(getattr(arrays, name)))
         for name in ("density", "features"):
-            (new / _FILES[name]).write_bytes(pack_codes(getattr(arrays, name)))
+            (new / PLACES[name]).write_bytes(pack_codes(getattr(arrays, name)))
         for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
             (new / name).write_bytes(data)
         _write_manifest(new, manifest)
@@ -251,81 +236,27 @@ def write_asset(
 def _write_manifest(folder: Path, manifest: Manifest) -> None:
     """The manifest of what is in the folder."""
     paths = sorted(path for path in folder.iterdir() if path.name != NAME)
-    files = {path.name: FileEntry(path.stat().st_size, _digest(path)) for path in paths}
+    files = {path.name: _entry(path) for path in paths}
     data = manifest_bytes(replace(manifest, files=files))
     parse_manifest(data, NAME)
     (folder / NAME).write_bytes(data)
 
 
-def _read_arrays(folder: Path, manifest: Manifest) -> GridArrays:
-    """Both grids at the same time: what unpacks them leaves the interpreter to others. Headers of .npy files
-    are read before, because Python 3.11 parses on one thread at a time."""
-
-    def grid(coords: np.ndarray, names: Names, *of_a_vertex: int) -> list[np.ndarray]:
-        _, masks_name, codes_name = names
-        path = folder / _FILES[masks_name]
-        masks = unpack_masks(path.read_bytes(), len(coords) if coords.ndim else 0, str(path))
-        path, shape = folder / _FILES[codes_name], (int(np.bitwise_count(masks).sum()), *of_a_vertex)
-        return [coords, masks, unpack_codes(path.read_bytes(), shape, _DTYPES[codes_name], str(path))]
-
-    of_densities, of_features = (_map_array(folder / _FILES[names[0]]) for names in (_DENSITIES, _FEATURES))
-    with ThreadPoolExecutor(1) as other:
-        features = other.submit(grid, of_features, _FEATURES, manifest.n_channels)
-        densities = grid(of_densities, _DENSITIES)
-        return GridArrays(*densities, *features.result())
+def _entry(path: Path) -> FileEntry:
+    size = path.stat().st_size
+    return FileEntry(size, _digest(path, size, path.parent))
 
 
-def _read_manifest(folder: Path) -> Manifest:
-    path = folder / NAME
-    if not folder.is_dir():
-        clear_up(folder.parent)  # it may be there, if whoever replaced it was killed
-    if not folder.is_dir():
-        raise FormatError(
-            f"{folder}: expected the folder of an asset, got {'a file' if folder.exists() else 'nothing'}"
-        )
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise FormatError(f"{folder}: not an asset: expected {NAME} in it, got none") from None
-    except OSError as error:
-        raise FormatError(f"{path}: cannot read: {error.strerror}") from error
-    return parse_manifest(data, str(path))
-
-
-def _check_size(path: Path, entry: FileEntry) -> None:
-    try:
-        size = path.stat().st_size
-    except OSError:
-        raise FormatError(f"{path}: expected a file of {entry.bytes} bytes, got none") from None
-    if size != entry.bytes:
-        raise IntegrityError(f"{path}: size: expected {entry.bytes} bytes, got {size}")
-
-
-def _check_sum(path: Path, entry: FileEntry) -> None:
-    digest = _digest(path)
+def _check_sum(folder: Path, name: str, entry: FileEntry) -> None:
+    path = folder / name
+    digest = _digest(path, entry.bytes, folder)
     if digest != entry.sha256:
         raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Path, most: int, inside: Path) -> str:
     digest = hashlib.sha256()
-    try:
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot read: {error.strerror}") from error
+    with open_file(path, "a file of an asset", most, inside) as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
     return digest.hexdigest()
-
-
-def _map_array(path: Path) -> np.ndarray:
-    try:
-        array = np.lib.format.open_memmap(path, mode="r")
-    except _HEADER_ERRORS as error:
-        raise FormatError(f"{path}: expected a numpy array, got something else: {error}") from error
-    if not isinstance(array, np.memmap) or not array.flags.c_contiguous:
-        raise FormatError(f"{path}: expected one plain array in C order")
-    explained = array.offset + array.nbytes
-    if explained != path.stat().st_size:
-        raise FormatError(f"{path}: expected {explained} bytes as its header says, got {path.stat().st_size}")
-    return array

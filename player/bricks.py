@@ -123,12 +123,12 @@ def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: 
     [[0, 0, 0], [1, 0, 0]]
     """
     found = np.zeros((n_per_axis,) * 3, bool)
-    coords = np.asarray(brick_coords, np.int64)
+    coords, masks = np.asarray(brick_coords, np.int64), np.asarray(brick_masks, np.uint64)
+    some = (np.bitwise_or.reduce(masks, axis=1), masks[:, 0])  # a corner at any x of a brick; at its first
     for offset in np.ndindex(2, 2, 2):
-        words = np.asarray(brick_masks, np.uint64)[:, :1] if offset[0] else np.asarray(brick_masks, np.uint64)
-        words = words & (_Y_FIRST if offset[1] else _ALL) & (_Z_FIRST if offset[2] else _ALL)
+        words = some[offset[0]] & (_Y_FIRST if offset[1] else _ALL) & (_Z_FIRST if offset[2] else _ALL)
         before = coords - offset
-        wanted = (words != 0).any(axis=1) & (before >= 0).all(axis=1)
+        wanted = (words != 0) & (before >= 0).all(axis=1)
         found[tuple(before[wanted].T)] = True
     return np.argwhere(found)
 

@@ -27,7 +27,9 @@ def main(argv: list[str] | None = None) -> int:
             return _view(arguments)
         return _play(arguments)
     except VfrError as error:
-        print(f"vfr-play: error: {error}", file=sys.stderr)
+        from player.terminal import printable
+
+        print(f"vfr-play: error: {printable(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"vfr-play: stopped{_kept(arguments)}", file=sys.stderr)
@@ -74,18 +76,24 @@ def _write_json(target: str | None, document: dict[str, Any]) -> None:
 def _check(arguments: argparse.Namespace) -> int:
     from player.asset import Asset, checksums, read_manifest
     from player.head import read_head_file
+    from player.memory import allowed_bytes
+    from player.terminal import printable
+    from player.unpacking import check_total
 
     manifest = read_manifest(arguments.asset)
+    check_total(arguments.asset, manifest, allowed_bytes(arguments.max_memory))
     results = {}
     for name, error in checksums(arguments.asset, manifest):
         results[name] = "ok" if error is None else str(error)
         if arguments.json != "-":
-            print(f"{'ok    ' if error is None else 'FAILED'}  {name}{'' if error is None else f'  {error}'}")
+            found = "" if error is None else f"  {printable(str(error))}"
+            print(f"{'ok    ' if error is None else 'FAILED'}  {name}{found}")
     failed = sum(result != "ok" for result in results.values())
     _write_json(arguments.json, {"ok": not failed, "files": results})
     if failed:
         raise VfrError(f"{arguments.asset}: {failed} of {len(results)} files failed")
-    asset = Asset.open(arguments.asset)  # the checksums hold; now the content
+    # the checksums hold; now the content
+    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
     read_head_file(asset.path("head.onnx"), manifest.n_channels)
     return 0
 
@@ -94,7 +102,7 @@ def _info(arguments: argparse.Namespace) -> int:
     from player.asset import Asset
     from player.info import facts, page
 
-    asset = Asset.open(arguments.asset)
+    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
     known = facts(asset)
     if arguments.json is not None:
         _write_json(arguments.json, known)

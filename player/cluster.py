@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from player.asset import Asset
-from player.errors import ConfigError, IntegrityError, MissingExtraError, VfrError
-from player.manifest import NAME
+from player.errors import ConfigError, FormatError, IntegrityError, MissingExtraError, VfrError
+from player.files import read_bytes
+from player.manifest import MAX_BYTES, NAME
 from player.play import Done, Job, PlaySettings, render_job
 from player.render import Renderer
 
@@ -94,14 +95,11 @@ def _task(folder: str, digest: str, job: Job, index: int, settings: PlaySettings
 @lru_cache(maxsize=1)
 def _renderer(folder: str, digest: str, settings: PlaySettings) -> Renderer:
     """The worker's renderer, kept for its next frames."""
-    return Renderer(Asset.open(folder), settings.threads, settings.march)
+    return Renderer(Asset.open(folder, max_memory=settings.max_memory), settings.threads, settings.march)
 
 
 def _digest(folder: Path) -> str:
     try:
-        return hashlib.sha256((folder / NAME).read_bytes()).hexdigest()
-    except OSError as error:
-        raise IntegrityError(
-            f"{folder / NAME}: cannot read: {error.strerror}: "
-            "expected the asset at the same path on every worker"
-        ) from error
+        return hashlib.sha256(read_bytes(folder / NAME, "a manifest", MAX_BYTES, folder)).hexdigest()
+    except FormatError as error:
+        raise IntegrityError(f"{error}: expected the asset at the same path on every worker") from error

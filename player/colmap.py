@@ -17,6 +17,7 @@ import numpy as np
 
 from player.cameras import Camera
 from player.errors import DataError, FormatError
+from player.files import read_bytes
 from player.rotations import rotation_matrix
 
 MODELS = {
@@ -27,6 +28,9 @@ MODELS = {
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
 }
 """Number, name and parameters of the camera models that are a pinhole behind OpenCV's lens."""
+MAX_FILE_BYTES = 1 << 30
+"""Of each file of a model: ten thousand pictures of a thousand points each that several pictures share take
+half of it."""
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -194,11 +198,9 @@ def _text_images(path: Path) -> list[RegisteredImage]:
 def _lines(path: Path, empty: bool = False) -> list[tuple[int, str]]:
     """Lines that are no comments, with their numbers."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise FormatError(f"{path}: no such file: expected a COLMAP model") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+        text = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: cannot read: {error}") from error
     lines = ((number, line.strip()) for number, line in enumerate(text.split("\n"), start=1))
     return [(number, line) for number, line in lines if not line.startswith("#") and (line or empty)]
 
@@ -218,9 +220,7 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        if not path.is_file():
-            raise FormatError(f"{path}: no such file: expected a COLMAP model in binary form")
-        self._data = path.read_bytes()
+        self._data = read_bytes(path, "a COLMAP model in binary form", MAX_FILE_BYTES)
         self._at = 0
 
     def take(self, form: str) -> tuple:

@@ -1,15 +1,101 @@
-"""Writing so that the final name holds either the old content or the complete new one."""
+"""Reading regular files alone, within a size that is stated; and writing so that the final name holds
+either the old content or the complete new one."""
 
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
-from player.errors import OutputError
+from player.errors import FormatError, OutputError
 from player.replace import PART, clear_up, held, put_folder, put_together, remove, sync, sync_all
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+"""A pipe that nobody writes to is opened at once, and then refused, instead of waited for."""
+
+
+def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> BinaryIO:
+    """Open a regular file of at most `most` bytes for reading; every file of a user is opened here.
+
+    Args:
+        path: the file; it may be a link.
+        what: what is expected there, for the message.
+        most: bytes.
+        inside: a folder that the file must lie in, once links are followed.
+
+    Raises:
+        FormatError: there is no such file, it is a folder, a pipe, a device or a socket, it is too large, it
+            lies outside the folder, or it cannot be read.
+
+    >>> open_file(Path("surely/not/there.json"), "cameras", 1000)
+    Traceback (most recent call last):
+    player.errors.FormatError: surely/not/there.json: no such file: expected cameras
+    """
+    with _told(path, what):
+        place = path if inside is None else _inside(path, inside)
+        _check_regular(path, what, place.stat())  # before it is opened, which a device may notice
+        handle = os.open(place, _FLAGS)
+        try:
+            size = _check_regular(path, what, os.fstat(handle))  # another file may be there by now
+            if size > most:
+                raise FormatError(f"{path}: size: expected at most {most} bytes for {what}, got {size}")
+            return os.fdopen(handle, "rb")
+        except BaseException:
+            os.close(handle)
+            raise
+
+
+def read_bytes(path: Path, what: str, most: int, inside: Path | None = None) -> bytes:
+    """The content of a file that `open_file` opens, with its arguments. Raises FormatError."""
+    with open_file(path, what, most, inside) as file, _told(path, what):
+        return file.read(os.fstat(file.fileno()).st_size)
+
+
+def file_size(path: Path, what: str, inside: Path | None = None) -> int:
+    """Bytes of a regular file, which is not opened; arguments as `open_file`. Raises FormatError."""
+    with _told(path, what):
+        place = path if inside is None else _inside(path, inside)
+        return _check_regular(path, what, place.stat())
+
+
+@contextmanager
+def _told(path: Path, what: str) -> Iterator[None]:
+    """Failures of the system as one FormatError."""
+    try:
+        yield
+    except FormatError:
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        raise FormatError(f"{path}: no such file: expected {what}") from None
+    except (OSError, ValueError, RuntimeError) as error:  # a null in the name, links that lead to themselves
+        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _check_regular(path: Path, what: str, found: os.stat_result) -> int:
+    """The size of what was found, if it is a regular file."""
+    if not stat.S_ISREG(found.st_mode):
+        got = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+        raise FormatError(f"{path}: cannot read: expected a file, {what}, got {got}")
+    return found.st_size
+
+
+def _inside(path: Path, folder: Path) -> Path:
+    """The place of `path` once links are followed, which must be in `folder`."""
+    place = path.resolve(strict=True)
+    if not place.is_relative_to(folder.resolve()):
+        raise FormatError(f"{path}: expected a file inside {folder}, got a link to {place}")
+    return place
 
 
 def check_target(path: Path, force: bool = False) -> None:

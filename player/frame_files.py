@@ -18,9 +18,9 @@ import numpy as np
 from player.asset import Asset
 from player.cameras import Camera
 from player.errors import ConfigError, OutputError
-from player.files import check_target, write_bytes
-from player.images import ENCODERS, read_key
-from player.manifest import NAME
+from player.files import check_target, read_bytes, write_bytes
+from player.images import ENCODERS, open_picture, read_key
+from player.manifest import MAX_BYTES, NAME
 from player.options import PICTURES, VIDEO
 from player.replace import clear_up
 from player.transforms import frame_names
@@ -114,16 +114,17 @@ def frame_key(asset: Asset, camera: Camera, samples: int | None, background: obj
     behind = asset.manifest.background if background is None else background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     facts = json.dumps([camera.c2w.tolist(), lens, k, behind])
-    return hashlib.sha256((asset.folder / NAME).read_bytes() + facts.encode()).hexdigest()
+    manifest = read_bytes(asset.folder / NAME, "a manifest", MAX_BYTES, asset.folder)
+    return hashlib.sha256(manifest + facts.encode()).hexdigest()
 
 
-def unfinished(paths: Sequence[Path], keys: Sequence[str]) -> list[int]:
+def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Camera]) -> list[int]:
     """Which frames are not there yet. Raises ConfigError for one that is there and shows something else."""
     missing = []
-    for index, (path, key) in enumerate(zip(paths, keys, strict=True)):
+    for index, (path, key, camera) in enumerate(zip(paths, keys, cameras, strict=True)):
         if not path.exists():
             missing.append(index)
-        elif read_key(path) != key:
+        elif read_key(path, (camera.width, camera.height)) != key:
             raise ConfigError(
                 f"{path}: --resume: expected a frame of this asset, these views and these settings, "
                 "got another: add --force instead to render everything anew"
@@ -142,7 +143,5 @@ def encode_frame(suffix: str, pixels: np.ndarray, key: str) -> bytes:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    from PIL import Image
-
-    with Image.open(path) as picture:
+    with open_picture(path) as picture:
         return np.asarray(picture.convert("RGB"))

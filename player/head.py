@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from player.errors import FormatError
+from player.files import read_bytes
 from player.head_graph import HeadArrays, read_head
+from player.unpacking import MAX_HEAD_BYTES
 
 CHUNK = 2048
 """Pixels a run: the activations of a 256 wide layer (2 MB) stay in the second-level cache, 25-45 % faster
@@ -65,7 +67,7 @@ def read_head_file(path: Path, n_channels: int) -> tuple[bytes, HeadArrays]:
     Raises:
         FormatError: the file is not the graph of a head that takes `n_channels` features.
     """
-    data = path.read_bytes()
+    data = read_bytes(path, "a head", MAX_HEAD_BYTES, path.parent)
     arrays = read_head(data, str(path))
     if arrays.n_channels != n_channels:
         raise FormatError(f"{path}: features: expected float [n, {n_channels}], got [n, {arrays.n_channels}]")

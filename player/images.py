@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from player.errors import OutputError, ShapeError
-from player.files import write_bytes
+from player.errors import FormatError, OutputError, ShapeError, VfrError
+from player.files import open_file, write_bytes
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 KEY = "vfr-play"
 """Name of the entry in a picture's metadata that says what was rendered (`player.frame_files`)."""
@@ -47,16 +53,43 @@ def webp_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
 ENCODERS = {".png": png_bytes, ".webp": webp_bytes}
 
 
-def read_key(path: Path) -> str | None:
-    """The key that a picture was written with; None if there is none, or no whole picture."""
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+"""What a picture may be, whatever its name is: Pillow would start Ghostscript for another."""
+MAX_FILE_BYTES = 1 << 30
+"""Of a picture's file: 178 million pixels, the most that Pillow opens, with six bytes each."""
+
+
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image.Image]:
+    """A picture file, opened by Pillow, as a context manager.
+
+    Raises FormatError: no such file, not a regular one, too large, or no picture that can be read to its
+    end, there or in the block.
+    """
     from PIL import Image
 
+    with open_file(path, "a picture", MAX_FILE_BYTES) as file:
+        try:
+            with Image.open(file, formats=FORMATS) as picture:
+                yield picture
+        except (OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError) as error:
+            if isinstance(error, VfrError):
+                raise
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise FormatError(f"{path}: picture: cannot be read to its end: {reason}") from error
+
+
+def read_key(path: Path, size: tuple[int, int] | None = None) -> str | None:
+    """The key that a picture of `size` (width, height; None: any) was written with; None if there is none,
+    or no whole picture of that size."""
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
+            if size is not None and picture.size != size:
+                return None
             picture.load()
             text = picture.info.get(KEY)
             xmp = picture.info.get("xmp")
-    except (OSError, ValueError, SyntaxError):
+    except FormatError:
         return None
     if isinstance(text, str):
         return text

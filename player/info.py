@@ -13,6 +13,7 @@ from player.asset import Asset
 from player.contracted_rays import MAX_SPEED
 from player.head import read_head_file
 from player.manifest import Manifest
+from player.terminal import printable
 from player.transforms import read_cameras
 
 MANIFEST_KEYS = (
@@ -53,7 +54,7 @@ def facts(asset: Asset) -> dict[str, Any]:
 
 
 def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
-    """The lines of a page for people."""
+    """The lines of a page for people, without control characters, whatever the manifest holds."""
     low, high = known["world_box"]
     scale = known["world_units_per_model_unit"]
     total = known["bytes_total"]
@@ -91,7 +92,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         ("in a browser", f"vfr-play {name}"),
         ("pictures", f"vfr-play {name} --orbit 60 --output frames/"),
     ])  # fmt: skip
-    return lines
+    return [printable(line) for line in lines]
 
 
 def _section(title: str, rows: list[tuple[str, str]]) -> list[str]:

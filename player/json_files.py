@@ -8,8 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from player.errors import FormatError
+from player.files import read_bytes
 
 MAX_FILE_BYTES = 64 * 2**20
+"""Sixty thousand cameras: each takes a kilobyte."""
+MOST_VALUES = 8 << 20
+"""In JSON: each takes a hundred bytes of memory at most, and a camera has thirty."""
 
 
 def read_json(path: str | Path, what: str) -> bytes:
@@ -17,29 +21,19 @@ def read_json(path: str | Path, what: str) -> bytes:
 
     Raises FormatError: no such file, not a plain file, over 64 MB.
     """
-    path = Path(path)
-    try:
-        if path.exists() and not path.is_file():
-            raise FormatError(f"{path}: cannot read: expected a file, {what}, got something else")
-        n_bytes = path.stat().st_size
-        if n_bytes > MAX_FILE_BYTES:
-            raise FormatError(f"{path}: size: expected at most {MAX_FILE_BYTES} bytes, got {n_bytes}")
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such file: expected {what}") from error
-    except FormatError:
-        raise
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+    return read_bytes(Path(path), what, MAX_FILE_BYTES)
 
 
-def parse_json(data: bytes, where: str) -> Any:
-    """What the bytes say; NaN and Infinity are not JSON. Raises FormatError.
+def parse_json(data: bytes, where: str, most_values: int = MOST_VALUES) -> Any:
+    """What the bytes say, if it is at most so many values; NaN and Infinity are not JSON. Raises FormatError.
 
     >>> parse_json(b"[1, NaN]", "numbers")
     Traceback (most recent call last):
     player.errors.FormatError: numbers: expected JSON, got NaN, which is not a number of JSON
     """
+    n_values = 1 + sum(map(data.count, (b",", b"[", b"{")))
+    if n_values > most_values:
+        raise FormatError(f"{where}: expected at most {most_values} values in JSON, got about {n_values}")
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:

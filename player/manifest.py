@@ -1,12 +1,12 @@
 """The format `vfr-asset`, version 3.1: this docstring is its specification, the module parses and writes
 the manifest.
 
-An asset is a folder. It holds no absolute path and plays wherever it is moved. What is packed is so as
-`player.packing` describes.
+An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved. What is
+packed is so as `player.packing` describes; .npy files have version 1.0 and the header that numpy writes.
 
 | file | content |
 |---|---|
-| `manifest.json` | what is described below; UTF-8, keys sorted, at most 16 MiB |
+| `manifest.json` | what is described below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
 | `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
 | `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed |
 | `density.codes` | uint8 [n_vertices], codes, packed |
@@ -91,6 +91,7 @@ FILES = (
     "cameras.json",
 )
 MAX_BYTES = 16 << 20
+MAX_VALUES = 1 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
@@ -155,8 +156,13 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     """
     if len(data) > MAX_BYTES:
         raise FormatError(f"{where}: size: expected at most {MAX_BYTES} bytes, got {len(data)}")
+    n_values = 1 + sum(map(data.count, (b",", b"[", b"{")))
+    if n_values > MAX_VALUES:
+        raise FormatError(f"{where}: expected at most {MAX_VALUES} values, got about {n_values}")
     try:
-        document = json.loads(data.decode(), parse_constant=_refuse, parse_float=_finite)
+        document = json.loads(
+            data.decode(), parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_each_once
+        )
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{where}: expected JSON, got something else: {error}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
@@ -197,6 +203,13 @@ def manifest_bytes(manifest: Manifest) -> bytes:
 
 def _refuse(text: str) -> float:
     raise ValueError(f"{text} is not a number of JSON")
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key that is there twice")
+    return found
 
 
 def _finite(text: str) -> float:

@@ -9,6 +9,11 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 PICTURES = (".png", ".webp")
 VIDEO = ".mp4"
 
+MAX_MEMORY = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
+
+MOST_VIEWS = 100_000
+"""Pictures of an orbit: an hour of a video at 30 frames a second has 108,000."""
+
 EXAMPLES = """examples:
   vfr-play out/                                                        look at it in a browser
   vfr-play fidelity/ balanced/ fast/                                   and switch between bakes of a scene
@@ -42,7 +47,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="FILE",
         help="those of a transforms.json, a nerfstudio camera_path.json or a COLMAP folder",
     )
-    views.add_argument("--orbit", type=positive, metavar="N", help="a turn around the scene in N pictures")
+    views.add_argument("--orbit", type=_orbit, metavar="N", help="a turn around the scene in N pictures")
     views.add_argument(
         "--view", type=_number, metavar="N", help="training view N, from 0; -1 is the last one"
     )
@@ -60,6 +65,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--samples", type=_count, metavar="K", help="fetches a ray (the asset's own); 0: at every sample")
     add("--threads", type=positive, metavar="N", help="threads (one for each core)")
     add("--march", choices=("auto", "numpy", "numba"), default="auto", help="implementation (numba if there)")
+    add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
     add = parser.add_argument_group("viewer").add_argument
     add("--host", metavar="ADDRESS", help="address to serve at (127.0.0.1: this machine alone)")
     add("--port", type=_port, metavar="N", help="port to serve at (8080, or the next that is free)")
@@ -125,6 +131,28 @@ def _whole(text: str, least: int, what: str) -> int:
 
 def positive(text: str) -> int:
     return _whole(text, 1, "a whole number from 1 on")
+
+
+def _orbit(text: str) -> int:
+    value = positive(text)
+    if value > MOST_VIEWS:
+        raise argparse.ArgumentTypeError(f"expected at most {MOST_VIEWS} pictures, got {text!r}")
+    return value
+
+
+def gigabytes(text: str) -> float:
+    """An amount of memory.
+
+    >>> gigabytes("1.5")
+    1.5
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"expected gigabytes, more than 0, got {text!r}")
+    return value
 
 
 def _count(text: str) -> int:

@@ -37,6 +37,8 @@ class PlaySettings:
     """Colour 0..1 or "transparent"; the asset's own if None."""
     threads: int | None = None
     march: March = "auto"
+    max_memory: float | None = None
+    """Gigabytes that the asset may take on a worker; a share of its machine's if None."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +69,22 @@ def play(arguments: argparse.Namespace, say: Callable[[str], object]) -> tuple[d
     target = Target.of(arguments.output, arguments.format)
     target.check(arguments.force, arguments.resume)
     import_ahead(scipy=False)
-    asset = Asset.open(arguments.asset)
+    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
     every = _views(asset, arguments)
     cameras, paths = every[arguments.frames], target.paths(every, arguments.frames)
     if not cameras:
         raise ConfigError(f"--frames: expected at least one of the {len(every)} views, got none")
     _check_sizes(cameras, target, say)
     fps = _fps(arguments) if target.is_video else FPS
-    settings = PlaySettings(arguments.samples, arguments.background, arguments.threads, arguments.march)
+    settings = PlaySettings(
+        arguments.samples, arguments.background, arguments.threads, arguments.march, arguments.max_memory
+    )
     keys = [frame_key(asset, camera, settings.samples, settings.background) for camera in cameras]
-    missing = unfinished(paths, keys) if arguments.resume else list(range(len(cameras)))
+    missing = unfinished(paths, keys, cameras) if arguments.resume else list(range(len(cameras)))
     jobs = [Job(cameras[index], keys[index], target.suffix) for index in missing]
+    most = asset.most_samples
+    if settings.samples is not None and settings.samples > most:
+        say(f"--samples {settings.samples}: a ray has {most} samples at most, and every one is taken")
     begin = time.perf_counter()
     done: list[Done] = []
     frames = _on_cluster if arguments.dask else _here

@@ -49,6 +49,8 @@ units."""
 TASK_BLOCKS = {"numba": 256, "numpy": 128}
 """Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks;
 numpy arrays of more blocks do not stay in cache."""
+MOST_THREADS = 16
+"""Threads a core, at most: more finish nothing sooner, and each has scratch arrays of its own."""
 TASKS_A_THREAD = 8
 """Tasks at least, where there are blocks enough: shared out evenly."""
 
@@ -102,15 +104,20 @@ def default_threads() -> int:
     return os.cpu_count() or 1
 
 
+def bounded_threads(n_threads: int) -> int:
+    """So many, but at most MOST_THREADS a core; raises ConfigError for none."""
+    if n_threads < 1:
+        raise ConfigError(f"threads: expected at least 1, got {n_threads}")
+    return min(n_threads, MOST_THREADS * default_threads())
+
+
 class Renderer:
     """An asset ready to render: grid in memory, head open, threads waiting. A context manager; `close` ends
     the threads."""
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
         """Raises MissingExtraError if `march` is "numba" and numba is not installed."""
-        self.n_threads = default_threads() if n_threads is None else n_threads
-        if self.n_threads < 1:
-            raise ConfigError(f"threads: expected at least 1, got {n_threads}")
+        self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
         self.march, self._module = choose_march(march, asset.manifest.contracted)
         self._write_pixels, self._directions = write_pixels, None
@@ -145,7 +152,8 @@ class Renderer:
 
         Args:
             camera: in the WORLD frame.
-            n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
+            n_samples: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
+                can have.
             background: colour 0..1 or "transparent"; the asset's own if None.
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
@@ -156,6 +164,7 @@ class Renderer:
         k = self.asset.manifest.n_samples if n_samples is None else n_samples
         if k < 0:
             raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
+        k = min(k, self._grid.most_samples)
         check_size(camera.width, camera.height)
         if background is None:
             red, green, blue = self.asset.manifest.background

@@ -74,7 +74,12 @@ class SparseGrid:
         """Lattice places on the box's diagonal, and three for rounding: a march ends there, whatever the
         ray."""
         diagonal = float(np.linalg.norm(self.resolution / self.cells_per_unit.astype(np.float64)))
-        return int(diagonal / float(self.step)) + 3
+        return most_samples(diagonal, float(self.step))
+
+
+def most_samples(diagonal: float, step: float) -> int:
+    """Places of a lattice of `step` on so long a diagonal, and three for rounding."""
+    return int(diagonal / step) + 3
 
 
 def build_grid(

@@ -1,16 +1,30 @@
-"""A picture in a terminal that has 16 million colours: two pixels a character, as upper half blocks."""
+"""What is shown in a terminal: text from files without its control characters, and a picture where there are
+16 million colours, two pixels a character, as upper half blocks."""
 
 from __future__ import annotations
 
 import os
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from player.asset import Asset
+if TYPE_CHECKING:
+    from player.asset import Asset
 
 ROWS = 16
 """Lines of the picture on the `--info` page."""
+
+
+def printable(text: str) -> str:
+    """The text in one line, with escapes in place of what a terminal or a browser obeys instead of showing:
+    control characters, ends of lines, changes of the writing direction, halves of characters.
+
+    >>> printable("a\x1b[2Jb\u202ec\n\u00fc \u732b")
+    'a\\x1b[2Jb\\u202ec\\n\u00fc \u732b'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def picture_lines(asset: Asset, stream: TextIO) -> list[str]:

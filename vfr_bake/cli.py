@@ -52,15 +52,21 @@ def _run(name: str, command: Callable[[], int]) -> int:
     try:
         return command()
     except VfrError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
+        print(f"{name}: error: {_printable(error)}", file=sys.stderr)
         return 1
     except OSError as error:  # a full disk, wherever it is met: a temporary folder, numba's cache
         where = f"{error.filename}: " if error.filename else ""
-        print(f"{name}: error: {where}{error.strerror or error}", file=sys.stderr)
+        print(f"{name}: error: {_printable(f'{where}{error.strerror or error}')}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
+
+
+def _printable(text: object) -> str:
+    from player.terminal import printable  # only now: `--help` needs no numpy
+
+    return printable(str(text))
 
 
 def _need_train_extra() -> None:

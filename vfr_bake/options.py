@@ -97,6 +97,8 @@ class Bench:
     """Timed frames of each setting and size."""
     threads: int | None = None
     """Threads of the player; one for each core if not given."""
+    max_memory: float | None = None
+    """Gigabytes of memory that each asset may take when it is opened; half of the machine's if not given."""
     lpips: Literal["alex", "vgg"] | None = None
     """Also measure LPIPS with this network, whose weights have to be on this machine."""
     html: Path | None = None

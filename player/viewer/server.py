@@ -19,6 +19,7 @@ from player.cameras import focus_point, orbit, world_up
 from player.errors import ConfigError, MissingExtraError
 from player.progress import say_first_use
 from player.render import Renderer, import_ahead
+from player.terminal import printable
 from player.transforms import read_cameras
 from player.viewer.window import Window
 
@@ -39,7 +40,8 @@ def serve(arguments: argparse.Namespace) -> None:
         raise ConfigError("--background: expected a colour for the viewer, got transparent")
     _need_viser(files)
     import_ahead()
-    assets = [Asset.open(folder) for folder in (arguments.asset, *arguments.others)]
+    folders = (arguments.asset, *arguments.others)
+    assets = [Asset.open(folder, max_memory=arguments.max_memory) for folder in folders]
     host = arguments.host or HOST
     port = free_port(host, arguments.port)
     with ExitStack() as stack:
@@ -151,7 +153,7 @@ def _need_viser(files: str) -> None:
 
 
 def _title(asset: Asset) -> str:
-    return f"{asset.folder.resolve().name} - vfr-play"
+    return f"{printable(asset.folder.resolve().name)} - vfr-play"
 
 
 def _shown(host: str) -> str:

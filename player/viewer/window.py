@@ -18,6 +18,7 @@ from player.errors import VfrError
 from player.images import png_bytes
 from player.keyframes import smooth_path
 from player.render import Frame, Renderer
+from player.terminal import printable
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.pace import STILL_SECONDS, Pace, fitted
 
@@ -70,7 +71,7 @@ class Window:
         self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
         own = self._renderer.asset.manifest
         self._add_controls(
-            own.n_samples if samples is None else samples,
+            own.n_samples if samples is None else min(samples, self._renderer.asset.most_samples),
             own.background if background is None else background,
         )
         client.camera.on_update(lambda _: self.touch())
@@ -249,7 +250,7 @@ class Window:
                 self._show_moving()
                 self._sharpen(version)
             except VfrError as error:
-                self._state.value = str(error)
+                self._state.value = printable(str(error))
             except Exception:  # a bug: it is told, and does not end the window
                 threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
                 self._state.value = "failed: the terminal of vfr-play says why"
@@ -317,9 +318,9 @@ class Window:
 def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
     """By the name of the asset's folder, or by its path where two have the same."""
     folders = [renderer.asset.folder.resolve() for renderer in renderers]
-    names = [folder.name for folder in folders]
+    names = [printable(folder.name) for folder in folders]
     if len(set(names)) < len(names):
-        names = [str(folder) for folder in folders]
+        names = [printable(str(folder)) for folder in folders]
     return dict(zip(names, renderers, strict=True))
 
 

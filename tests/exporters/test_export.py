@@ -77,7 +77,7 @@ def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None
         ("a.ply --points 0", "--points: expected 1 or more, got 0"),
         ("a.ply --crop 9,9,9,1,1,1", "--crop: expected a box with some of the mesh in it"),
         ("a.ply --crop 1,2", "--crop: expected X,Y,Z,W,D,H[,YAW]"),
-        ("a.glb --crop none.json", "none.json: cannot read"),
+        ("a.glb --crop none.json", "none.json: no such file"),
         ("a.obj --points 5", "--points does nothing for a obj mesh; it takes --crop, --faces, --frame"),
         ("a.ply --points 5 --faces 5", "--faces does nothing for a point cloud"),
         ("a.json --crop 0,0,0,9,9,9", "--crop does nothing for json; it takes --frame"),

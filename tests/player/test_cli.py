@@ -153,7 +153,7 @@ def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr()
     assert len(re.findall(r"^ok ", printed.out, re.M)) == 7
     assert re.search(r"^FAILED  mesh\.ply .*sha256", printed.out, re.M)
-    assert re.search(r"^FAILED  density\.codes .*got none", printed.out, re.M)
+    assert re.search(r"^FAILED  density\.codes .*no such file", printed.out, re.M)
     assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 9 files failed\n"
     assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
     assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"

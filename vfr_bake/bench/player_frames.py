@@ -1,6 +1,6 @@
 """The process that plays one asset for the bench: imports the player alone, as `vfr-play` does.
 
-    python -m vfr_bake.bench.player_frames ASSET CAMERAS THREADS
+    python -m vfr_bake.bench.player_frames ASSET CAMERAS THREADS MAX_MEMORY
 
 Request: `view`, `size` [width, height], `samples`, and `rgb`, a file for the picture or null. Answer:
 milliseconds of the frame and, of them, of march with lookups and of the head (time in their tasks over the
@@ -25,10 +25,10 @@ from player.transforms import read_cameras
 from vfr_bake.bench.process import Answer, Clock, serve
 
 
-def open_player(folder: str, cameras: str, threads: str) -> Answer:
-    """An asset ready to play; `threads` 0 is one for each core."""
+def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Answer:
+    """An asset ready to play; `threads` 0 is one for each core, `max_memory` 0 a share of the machine's."""
     views = read_cameras(Path(cameras))
-    renderer = Renderer(Asset.open(folder), int(threads) or None)
+    renderer = Renderer(Asset.open(folder, max_memory=float(max_memory) or None), int(threads) or None)
     march, head = (Clock(part) for part in (renderer._module.march, renderer._head))
     renderer._module, renderer._head = SimpleNamespace(march=march), head  # type: ignore[assignment]
 
@@ -57,4 +57,4 @@ def open_player(folder: str, cameras: str, threads: str) -> Answer:
 
 
 if __name__ == "__main__":
-    serve(lambda: open_player(*sys.argv[1:4]), sys.stdin, sys.stdout)
+    serve(lambda: open_player(*sys.argv[1:5]), sys.stdin, sys.stdout)

@@ -32,6 +32,8 @@ class Plan:
     frames: int
     """Timed frames of each setting and size."""
     threads: int | None
+    max_memory: float | None
+    """Gigabytes that each asset may take when it is opened; a share of the machine's if None."""
 
     def __post_init__(self) -> None:
         _check(len(self.assets) > 0, "assets", "at least one folder", "none")

@@ -20,6 +20,7 @@ import numpy as np
 from player.asset import Asset
 from player.cameras import Camera
 from player.errors import ConfigError, DataError
+from player.render import bounded_threads
 from player.transforms import write_cameras
 from vfr_bake.bench.commands import bake_command, eval_command, play_command
 from vfr_bake.bench.process import Process
@@ -64,14 +65,14 @@ def measure_trade(plan: Plan, lpips: Distance | None, progress: Progress) -> Tra
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
     """
-    assets = {str(folder): Asset.open(folder) for folder in plan.assets}
+    assets = {str(folder): Asset.open(folder, max_memory=plan.max_memory) for folder in plan.assets}
     views = _read_views(plan, list(assets.values()), progress)
     own = views.cameras[0].width, views.cameras[0].height
     sizes = list(dict.fromkeys([own, *(plan.sizes or _around(own))]))
     ks = set(plan.samples) | {asset.manifest.n_samples for asset in assets.values()}
     samples = sorted(ks, key=lambda k: k or 1e9)
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
-        run = _Run(Path(folder), views, plan.threads, lpips, progress)
+        run = _Run(Path(folder), views, plan, lpips, progress)
         model, full = (None, None) if plan.model is None else run.model(plan.model, sizes, plan.data)
         first = run.first_pictures(list(assets), own)
         players = [stack.enter_context(run.player(name)) for name in assets]
@@ -137,7 +138,7 @@ class _Run:
     """What all measurements share."""
 
     def __init__(
-        self, folder: Path, views: Views, threads: int | None, lpips: Distance | None, progress: Progress
+        self, folder: Path, views: Views, plan: Plan, lpips: Distance | None, progress: Progress
     ) -> None:
         self._views = views
         self._lpips = lpips
@@ -145,10 +146,13 @@ class _Run:
         self._picture = folder / "picture.npy"
         self._cameras = folder / "cameras.json"
         self._cameras.write_bytes(write_cameras(views.cameras))
-        self._threads = str(threads or 0)
+        self._threads = str(bounded_threads(plan.threads) if plan.threads else 0)
+        self._max_memory = str(plan.max_memory or 0)
 
     def player(self, name: str) -> Process:
-        return Process("vfr_bake.bench.player_frames", name, str(self._cameras), self._threads)
+        return Process(
+            "vfr_bake.bench.player_frames", name, str(self._cameras), self._threads, self._max_memory
+        )
 
     def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
         """The full model's row and its pictures, one a view."""

@@ -1,0 +1,218 @@
+"""Assets that are made to hang, to fill the memory or to lead outside, and a process that opens one with
+every command.
+
+    python -m tests.reliability.hostile_files ASSET OUTPUT
+
+runs the commands in this process, with a budget of BUDGET gigabytes, and writes what became of them as JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import resource
+import socket
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.packing import pack_codes, pack_masks
+
+BUDGET = 0.3
+"""Gigabytes that the commands may take for the asset."""
+
+
+def vouch(folder: Path, change: Callable[[dict[str, Any]], object] | None = None) -> None:
+    """Give every file that can be read its right size and checksum in the manifest."""
+    path = folder / "manifest.json"
+    document = json.loads(path.read_text())
+    if change is not None:
+        change(document)
+    for name in document["files"]:
+        if (folder / name).is_file() and (folder / name).stat().st_size < 1 << 30:
+            data = (folder / name).read_bytes()
+            document["files"][name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    path.write_text(json.dumps(document))
+
+
+def sparse(name: str, vouched: bool = False) -> Callable[[Path], None]:
+    """A file of a terabyte that takes no room on the disk."""
+
+    def make(folder: Path) -> None:
+        with (folder / name).open("r+b") as file:
+            file.truncate(1 << 40)
+        if vouched:
+            vouch(folder, lambda document: document["files"][name].update(bytes=1 << 40))
+
+    return make
+
+
+def device(name: str) -> Callable[[Path], None]:
+    """A link to what never ends."""
+
+    def make(folder: Path) -> None:
+        (folder / name).unlink()
+        (folder / name).symlink_to("/dev/zero")
+
+    return make
+
+
+def pipe(name: str) -> Callable[[Path], None]:
+    """A pipe that nobody writes to."""
+
+    def make(folder: Path) -> None:
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+
+    return make
+
+
+def unix_socket(name: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        (folder / name).unlink()
+        before = Path.cwd()
+        os.chdir(folder)  # an address is at most a hundred characters
+        try:
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(name)
+        finally:
+            os.chdir(before)
+
+    return make
+
+
+def elsewhere(name: str) -> Callable[[Path], None]:
+    """A link to the right content outside the folder."""
+
+    def make(folder: Path) -> None:
+        away = folder.with_name(f"{folder.name}-away")
+        (folder / name).rename(away)
+        (folder / name).symlink_to(away)
+
+    return make
+
+
+def bomb(resolution: int, n_channels: int) -> Callable[[Path], None]:
+    """Every brick full: what is packed is small, what it unpacks to is not, and every size and checksum is
+    right."""
+
+    def make(folder: Path) -> None:
+        n = -(-(resolution + 1) // 8)
+        coords = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        masks = np.full((len(coords), 8), 2**64 - 1, np.uint64)
+        for prefix, names in (("brick", "density"), ("feature", "features")):
+            np.save(folder / f"{prefix}_coords.npy", coords.astype(np.uint16))
+            (folder / f"{prefix}_masks.bits").write_bytes(pack_masks(masks))
+            zeros = 512 * len(coords) * (n_channels if prefix == "feature" else 1)
+            stream, parts = zlib.compressobj(), []
+            for _ in range(0, zeros, 1 << 24):
+                parts.append(stream.compress(bytes(min(1 << 24, zeros))))
+                zeros -= min(1 << 24, zeros)
+            (folder / f"{names}.codes").write_bytes(b"".join([*parts, stream.flush()]))
+        vouch(folder, lambda document: document.update(resolution=resolution, feature_resolution=resolution,
+                                                       n_channels=n_channels))  # fmt: skip
+
+    return make
+
+
+def scattered(folder: Path) -> None:
+    """One vertex a brick of features: six bytes each on the disk, 23 kB each where a march looks them up."""
+    resolution, n = 1023, 128
+    axis = np.arange(0, n, 2)
+    coords = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) + 1
+    coords = coords[(coords < n).all(axis=1)]
+    masks = np.zeros((len(coords), 8), np.uint64)
+    masks[:, 0] = 1
+    np.save(folder / "feature_coords.npy", coords.astype(np.uint16))
+    (folder / "feature_masks.bits").write_bytes(pack_masks(masks))
+    (folder / "features.codes").write_bytes(pack_codes(np.zeros((len(coords), 4), np.int8)))
+    vouch(folder, lambda document: document.update(feature_resolution=resolution))
+
+
+def nested(folder: Path) -> None:
+    """A manifest of 15 MB that parses to fifty times as much."""
+    path = folder / "manifest.json"
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b'"psnr": 30.5', b'"psnr": [' + b"{}," * (5 << 20) + b"{}]"))
+
+
+TEXT = "\x1b[2J\x1b]0;owned\x07\u202e\n"
+"""Clears a terminal, names its window, turns the direction of writing and breaks the line."""
+
+
+def obeyed(folder: Path) -> None:
+    """TEXT in what `--info` shows."""
+    vouch(folder, lambda document: document.update(generator=TEXT, provenance={TEXT: {TEXT: TEXT}}))
+
+
+def obeyed_in_errors(folder: Path) -> None:
+    """TEXT in what a message repeats."""
+    document = json.loads((folder / "cameras.json").read_text())
+    document["frames"][0]["camera_model"] = TEXT
+    document["frames"][0]["file_path"] = "a\u202eb\u200b"
+    (folder / "cameras.json").write_text(json.dumps(document))
+    vouch(folder)
+
+
+RECIPES: dict[str, Callable[[Path], None]] = {
+    "a terabyte of manifest": sparse("manifest.json"),
+    "a terabyte of codes": sparse("features.codes"),
+    "a terabyte of codes, vouched for": sparse("features.codes", vouched=True),
+    "a terabyte of mesh, vouched for": sparse("mesh.ply", vouched=True),
+    "a manifest that never ends": device("manifest.json"),
+    "codes that never end": device("density.codes"),
+    "a head that never ends": device("head.onnx"),
+    "a manifest that is a pipe": pipe("manifest.json"),
+    "cameras that are a pipe": pipe("cameras.json"),
+    "a head that is a socket": unix_socket("head.onnx"),
+    "a manifest outside": elsewhere("manifest.json"),
+    "a head outside": elsewhere("head.onnx"),
+    "full bricks that unpack to 450 MB": bomb(383, 8),
+    "a thousand channels that unpack to 270 MB": bomb(63, 1024),
+    "bricks with a vertex each": scattered,
+    "a manifest of five million values": nested,
+    "text that a terminal obeys": obeyed,
+    "text that a terminal obeys, in a message": obeyed_in_errors,
+}
+
+
+def run_all(asset: Path, output: Path) -> dict[str, Any]:
+    """Exit codes and what was printed, by command, and the most memory that was taken."""
+    from exporters.cli import main as export
+    from player.cli import main as play
+
+    budget = ["--max-memory", str(BUDGET)]
+    commands: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {
+        "info": (play, [str(asset), "--info", *budget]),
+        "check": (play, [str(asset), "--check", *budget]),
+        "play": (play, [str(asset), "--view", "0", "--output", str(output / "a.png"), *budget]),
+        "export": (export, [str(asset), str(output / "a.json"), *budget]),
+        "export of the mesh": (export, [str(asset), str(output / "a.ply"), *budget]),
+    }
+    results: dict[str, Any] = {}
+    for name, (command, arguments) in commands.items():
+        printed, told = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(told):
+            code = command(arguments)
+        results[name] = {"code": code, "out": printed.getvalue(), "err": told.getvalue()}
+    results["peak_mb"] = _peak_mb()
+    return results
+
+
+def _peak_mb() -> float:
+    """Most memory of this program; Linux counts that of the program which started it in `getrusage` too."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        return int(status.read_text().partition("VmHWM:")[2].split()[0]) / 1000
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(run_all(Path(sys.argv[1]), Path(sys.argv[2]))))
