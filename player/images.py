@@ -66,12 +66,14 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     Raises FormatError: no such file, not a regular one, too large, or no picture that can be read to its
     end, there or in the block.
     """
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         try:
             with Image.open(file, formats=FORMATS) as picture:
                 yield picture
+        except UnidentifiedImageError:
+            raise FormatError(f"{path}: picture: expected a PNG or JPEG file, got something else") from None
         except (OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError) as error:
             if isinstance(error, VfrError):
                 raise

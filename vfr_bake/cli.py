@@ -134,7 +134,7 @@ def _with_cameras(data: str) -> str:
         return data
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count)
-    print(f"vfr-train: {report.summary()}", file=sys.stderr)
+    print(f"vfr-train: {_printable(report.summary())}", file=sys.stderr)
     return str(report.folder)
 
 
@@ -146,11 +146,11 @@ def _warn_of_folds(scene: Scene) -> None:
     except MissingExtraError:
         return
     if torn:
-        named = ", ".join(f"{first} and {second}" for first, second in torn)
+        named = _printable(", ".join(f"{first} and {second}" for first, second in torn))
         print(
-            f"vfr-train: {scene.name}: {named} match, but their cameras are far apart: the subject seems to "
-            "look the same from several sides, and its cameras are folded. Train on a folder of the pictures "
-            "alone to have the cameras estimated anew",
+            f"vfr-train: {_printable(scene.name)}: {named} match, but their cameras are far apart: the "
+            "subject seems to look the same from several sides, and its cameras are folded. Train on a "
+            "folder of the pictures alone to have the cameras estimated anew",
             file=sys.stderr,
         )
 
@@ -239,7 +239,7 @@ def _bake(options: Any) -> int:
     from vfr_bake.baking.estimate import expected_seconds, make_plan
     from vfr_bake.training.model_file import load_model
 
-    model = load_model(options.model)
+    model = load_model(options.model, options.config.max_memory)
     check_bakeable(model, options.config)
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
@@ -281,7 +281,7 @@ def _eval(options: Any) -> int:
     from vfr_bake.training.model_file import load_model
 
     lpips = None if options.lpips is None else Lpips(options.lpips)
-    model = load_model(options.model)
+    model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
         scene = load_scene(options.data, bar.count, downscale=model.train.get("downscale", 1))
     if not scene.test.cameras:

@@ -67,6 +67,8 @@ class Eval:
     per_view as JSON to this file; - for stdout. A PSNR without bound is null."""
     lpips: Literal["alex", "vgg"] | None = None
     """Also measure LPIPS with this network, whose weights have to be on this machine."""
+    max_memory: float | None = None
+    """Gigabytes of memory that reading the model may take; half of the machine's if not given."""
     pictures: Path | None = None
     """Also write photograph | rendered | error map of every view to this folder, replacing files of equal
     name. The error map is black for none, white for a difference of a quarter of the range or more."""

@@ -14,10 +14,11 @@ GIVEN = ("resolution", "max_mb", "max_loss_db")
 
 
 def bake_command(folder: str, asset: Asset) -> str:
-    """What bakes an asset like this one, out of the settings that it remembers; "" if it remembers none."""
-    settings = asset.manifest.provenance.get("bake", {})
-    preset = settings.get("preset")
-    if preset not in PRESETS:
+    """What bakes an asset like this one, out of the settings that it remembers; "" if it remembers none, or
+    something else."""
+    settings = asset.manifest.provenance.get("bake")
+    preset = settings.get("preset") if isinstance(settings, dict) else None
+    if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
         return ""
     chosen: dict[str, Any] = {name: settings.get(name) for name in GIVEN}
     usual = BakeConfig(preset=preset).choice(asset.manifest.contracted)
@@ -26,6 +27,8 @@ def bake_command(folder: str, asset: Asset) -> str:
             chosen[name] = settings[name]
     if settings.get("k", "auto") != "auto":
         chosen["k"] = settings["k"]
+    if not all(value is None or isinstance(value, int | float) for value in chosen.values()):
+        return ""
     options = [word for name, value in chosen.items() if value is not None
                for word in (f"--{name.replace('_', '-')}", f"{value:g}")]  # fmt: skip
     if settings.get("no_cull"):

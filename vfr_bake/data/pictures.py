@@ -10,7 +10,9 @@ import numpy as np
 from PIL import Image
 
 from player.cameras import Camera
-from player.errors import DataError, MissingExtraError
+from player.errors import DataError, FormatError, MissingExtraError
+from player.files import open_file, read_bytes
+from player.images import MAX_FILE_BYTES, open_picture
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.threads import in_threads
 
@@ -81,7 +83,7 @@ def read_picture(path: Path) -> np.ndarray:
     try:
         if _is_16_bit_colour(path):
             return _read_16_bit_colour(path)
-        with Image.open(path) as file:
+        with open_picture(path) as file:
             file.load()
             if file.mode == "I" or file.mode.startswith("I;16"):
                 # Pillow's own conversion clips 16-bit greys at 255.
@@ -92,15 +94,13 @@ def read_picture(path: Path) -> np.ndarray:
             if file.mode == "F":
                 raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
             return np.asarray(file.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path}: picture: cannot be read to its end: {first_line(error)}") from error
+    except FormatError as error:
+        raise DataError(str(error)) from error
 
 
 def _is_16_bit_colour(path: Path) -> bool:
     """Whether a PNG has 16-bit colour channels, of which Pillow would drop the lower halves."""
-    with path.open("rb") as file:
+    with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         header = file.read(26)
     return (
         header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:25] == b"\x10" and header[25:26] in b"\x02\x04\x06"
@@ -109,7 +109,9 @@ def _is_16_bit_colour(path: Path) -> bool:
 
 def _read_16_bit_colour(path: Path) -> np.ndarray:
     cv2 = _opencv(f"{path}: 16-bit picture: expected OpenCV to read it")
-    values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    data = read_bytes(path, "a picture", MAX_FILE_BYTES)
+    with open_picture(path):  # so that it is no larger than one of 8 bits may be
+        values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None or values.dtype != np.uint16:
         raise DataError(f"{path}: picture: cannot be read to its end")
     values = ((values.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
@@ -173,11 +175,7 @@ def undistort(
 
 def picture_size(path: Path) -> tuple[int, int]:
     try:
-        with Image.open(path) as file:
+        with open_picture(path) as file:
             return file.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: picture: expected a PNG or JPEG file: {first_line(error)}") from error
-
-
-def first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    except FormatError as error:
+        raise DataError(str(error)) from error

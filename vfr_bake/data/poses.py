@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from player.colmap import MAX_FILE_BYTES
 from player.errors import DataError, FormatError
-from player.files import new_folder
+from player.files import new_folder, read_bytes
+from player.images import open_picture
 from vfr_bake.data import video
 from vfr_bake.data.features import Features, find_features, pairs_to_match
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
@@ -231,10 +233,10 @@ def _look_at(
 
 def _sensor(path: Path, width: int, height: int) -> Sensor:
     try:
-        with Image.open(path) as file:
+        with open_picture(path) as file:
             exif = file.getexif()
             details = exif.get_ifd(0x8769)
-    except (OSError, ValueError, SyntaxError):  # damaged EXIF is as good as none
+    except FormatError:  # damaged EXIF is as good as none
         return Sensor(width, height, (), None)
     # Maker, model; focal length, and the same as it would be on 35 mm film.
     device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
@@ -264,11 +266,13 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
                 f"{model}: {name}: expected a complete COLMAP model, got no such file: "
                 f"remove {model} to estimate the cameras anew"
             )
-    points = (model / "points3D.bin").read_bytes()
+    points = read_bytes(model / "points3D.bin", "a COLMAP model", MAX_FILE_BYTES)
     n_registered = n_points = n_seen = 0
     error_sum = 0.0
     try:
-        (n_registered,) = struct.unpack_from("<Q", (model / "images.bin").read_bytes())
+        (n_registered,) = struct.unpack_from(
+            "<Q", read_bytes(model / "images.bin", "a COLMAP model", MAX_FILE_BYTES)
+        )
         (n_points,) = struct.unpack_from("<Q", points)
         at = 8
         for _ in range(n_points):

@@ -148,7 +148,7 @@ def _layer_weights(network: str, n_channels: list[int]) -> list[torch.Tensor]:
 
 
 def _read(path: Path, hint: str) -> dict[str, torch.Tensor]:
-    state = read_tensors(path, f"weights of a network: {hint}")
+    state = read_tensors(path, f"weights of a network: {hint}", from_elsewhere=True)
     if not isinstance(state, dict):
         raise FormatError(f"{path}: expected the weights of a network, got {type(state).__name__}: {hint}")
     return state

@@ -23,8 +23,9 @@ from player.cameras import Camera
 from player.errors import ConfigError, FormatError, VersionError
 from player.json_files import brief
 from player.transforms import parse_transforms, transforms_cameras, write_cameras
-from vfr_bake.config import field_config_from
+from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.field.field import VfrField
+from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
 from vfr_bake.rendering.render import mean_colour
@@ -113,25 +114,28 @@ def save_model(path: Path, model: Model) -> None:
     )
 
 
-def load_model(path: Path) -> Model:
-    """Read a model file. Raises FormatError (not a model, cut short, wrong shapes) or VersionError (too
-    new)."""
-    content = _read(path)
+def load_model(path: Path, max_memory: float | None = None) -> Model:
+    """Read a model file; it takes at most `max_memory` gigabytes, a share of what the machine has if None.
+
+    Raises FormatError (not a model, cut short, wrong shapes), VersionError (too new) or ConfigError (more
+    memory than it may take).
+    """
+    content = _read(path, max_memory)
     try:
         config = field_config_from(content["field"], f"{path}: field")
     except ConfigError as error:
         raise FormatError(str(error)) from None
+    _check_table(config, content["state"], f"{path}: state")
     field = VfrField(config)
     _restore(field, content["state"], f"{path}: state")
     restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
     sampler = restore_sampler(content["sampler"], f"{path}: sampler")
     matrix = content["world_from_model"]
     _check_plain(matrix, matrix.is_floating_point(), "floats", f"{path}: world_from_model")
+    if matrix.shape != (4, 4) or not matrix.isfinite().all():
+        got = matrix.tolist() if matrix.numel() <= 16 else list(matrix.shape)
+        raise FormatError(f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(got)}")
     world_from_model = matrix.double().numpy()
-    if world_from_model.shape != (4, 4) or not np.isfinite(world_from_model).all():
-        raise FormatError(
-            f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(world_from_model.tolist())}"
-        )
     where = f"{path}: cameras"
     cameras = content["cameras"].encode(errors="surrogatepass")  # a reader of UTF-8 refuses half a character
     return Model(
@@ -145,8 +149,8 @@ def load_model(path: Path) -> Model:
     )
 
 
-def _read(path: Path) -> dict[str, Any]:
-    content = read_tensors(path, "a model file written by vfr-train")
+def _read(path: Path, max_memory: float | None) -> dict[str, Any]:
+    content = read_tensors(path, "a model file written by vfr-train", max_memory)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise FormatError(f"{path}: not a model file written by vfr-train: expected format {FORMAT!r}")
     version = content.get("version")
@@ -172,6 +176,20 @@ def _sampler_content(sampler: OccupancyGrid | ProposalSampler) -> dict[str, Any]
     return {"step": sampler.step, "occupied": bits, "resolution": sampler.resolution}
 
 
+def _check_table(config: FieldConfig, state: dict[str, Any], where: str) -> None:
+    """Refuse settings that speak of a larger table than there is, before that is made."""
+    layout = GridLayout(
+        config.n_levels, config.base_resolution, config.max_resolution, config.log2_table_size
+    )
+    table = state.get("grid.table")
+    shape = list(table.shape) if isinstance(table, torch.Tensor) else None
+    if shape != [layout.n_entries, 2]:
+        raise FormatError(
+            f"{where}: the tensors do not fit the settings: grid.table: expected [{layout.n_entries}, 2], "
+            f"got {brief(shape)}"
+        )
+
+
 def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
     _check_kinds(content, {"step": float, "occupied": torch.Tensor, "resolution": int}, where)
     step, resolution = content["step"], content["resolution"]
@@ -181,9 +199,11 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
         raise FormatError(f"{where}: resolution: expected 8 to 512, got {resolution}")
     packed = content["occupied"]
     _check_plain(packed, packed.dtype == torch.uint8, "bytes", f"{where}: occupied")
+    if packed.ndim != 1 or len(packed) != -(-(resolution**3) // 8):
+        raise FormatError(
+            f"{where}: occupied: expected {resolution**3} bits, got {brief(list(packed.shape))}"
+        )
     bits = np.unpackbits(packed.numpy())[: resolution**3]
-    if len(bits) != resolution**3:
-        raise FormatError(f"{where}: occupied: expected {resolution**3} bits, got {len(bits)}")
     occupancy = OccupancyGrid(resolution, step, seed=0)
     occupancy.set_occupied(bits.astype(bool).reshape((resolution,) * 3))
     return occupancy

@@ -7,13 +7,25 @@ always a whole file.
 from __future__ import annotations
 
 import io
+import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from pickletools import genops
+from typing import Any, BinaryIO
+from zipfile import ZIP_STORED, ZipFile
 
 import torch
 
 from player.errors import FormatError
-from player.files import write_bytes
+from player.files import file_size, open_file, write_bytes
+from player.json_files import brief
+from player.memory import allowed_bytes, check_memory
+
+COPIES = 3
+"""Of a file's tensors in memory, at most: what is read, what it is restored into, and what is checked."""
+_PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
+"""What a pickle of tensors and plain values names."""
 
 
 def write_tensors(path: Path, content: dict[str, Any]) -> None:
@@ -23,18 +35,86 @@ def write_tensors(path: Path, content: dict[str, Any]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_tensors(path: Path, what: str) -> Any:
+def read_tensors(path: Path, what: str, max_memory: float | None = None, from_elsewhere: bool = False) -> Any:
     """The content of `path`, on the CPU; `what` it should be goes into the error.
 
-    Raises FormatError: there is no such file, or its bytes are not of that kind.
+    Args:
+        path: the file.
+        what: what is expected there, for the message.
+        max_memory: gigabytes that reading may take; a share of what the machine has if None.
+        from_elsewhere: whether it may be a file that `write_tensors` has not written, as older versions of
+            torch wrote them.
+
+    Raises FormatError: there is no such file, it is not a regular one, or its bytes are not of that kind;
+    ConfigError: it takes more memory than it may.
 
     >>> read_tensors(Path("nowhere.pt"), "a model")
     Traceback (most recent call last):
     player.errors.FormatError: nowhere.pt: no such file: expected a model
     """
-    if not path.is_file():
-        raise FormatError(f"{path}: no such file: expected {what}")
+    allowed = allowed_bytes(max_memory)
+    check_memory(COPIES * file_size(path, what), allowed, str(path))
+    with open_file(path, what, allowed) as file:
+        if not from_elsewhere:
+            _check_archive(file, path, what)
+        try:
+            content = torch.load(file, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch.load has no documented set of errors for bad bytes
+            raise FormatError(f"{path}: not {what}, or cut short") from error
+    if not all(_is_whole(tensor) for tensor in _tensors(content)):
+        raise FormatError(
+            f"{path}: not {what}: expected all numbers of a tensor in the file, got one for many"
+        )
+    return content
+
+
+def _check_archive(file: BinaryIO, path: Path, what: str) -> None:
+    """Refuse an archive with more in it than its bytes, and a pickle that names anything but plain tensors:
+    torch would inflate the one, and make objects of any size for the other."""
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load has no documented set of errors for bad bytes
+        with ZipFile(file) as archive:
+            entries = archive.infolist()
+            packed = any(entry.compress_type != ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
+                raise FormatError(f"{path}: not {what}: expected plain entries in it, got packed ones")
+            pickles = [entry for entry in entries if entry.filename.endswith("data.pkl")]
+            names = {name for entry in pickles for name in _globals(archive.read(entry))}
+    except FormatError:
+        raise
+    except Exception as error:  # nor have zipfile and pickletools
         raise FormatError(f"{path}: not {what}, or cut short") from error
+    finally:
+        file.seek(0)
+    unknown = sorted(name for name in names if not _PLAIN.fullmatch(name))
+    if unknown:
+        raise FormatError(f"{path}: not {what}: expected plain tensors and values, got {brief(unknown[0])}")
+
+
+def _tensors(content: Any) -> Iterator[torch.Tensor]:
+    """Every tensor in plain values, once, however often it is referred to."""
+    left, seen = [content], set()
+    while left:
+        value = left.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        if isinstance(value, torch.Tensor):
+            yield value
+        elif isinstance(value, dict):
+            left += [*value.keys(), *value.values()]
+        elif isinstance(value, list | tuple | set | frozenset):
+            left += value
+
+
+def _is_whole(tensor: torch.Tensor) -> bool:
+    """Whether a tensor has its numbers in memory, each by itself, and not one in many places."""
+    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
+
+
+def _globals(pickle: bytes) -> Iterator[str]:
+    """What a pickle names; the name of what is on its stack is not known, and none is ours."""
+    for operation, argument, _ in genops(pickle):
+        if operation.name == "GLOBAL":
+            yield str(argument)
+        elif operation.name in ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4"):
+            yield operation.name

@@ -110,6 +110,18 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
     assert command(BakeConfig(refine_steps=other, k=3)) == f"{plain} --refine-steps {other} --k 3"
 
 
+@pytest.mark.parametrize(
+    "remembered",
+    [[], "balanced", {"preset": []}, {"preset": {}}, {"preset": "balanced", "k": "many"}, {"preset": "balanced",
+     "max_mb": [1]}, {"preset": "balanced", "resolution": {"a": 1}}],
+)  # fmt: skip
+def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Path) -> None:
+    """What an asset remembers is free in its form."""
+    asset = Asset.open(shells_folder)
+    manifest = replace(asset.manifest, provenance={"bake": remembered})
+    assert bake_command("out", replace(asset, manifest=manifest)) == ""
+
+
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
     """The photographs are the asset's own pictures: nothing is lost with every sample, more with fewer."""
     rows = {row["samples"]: row["scores"] for row in results[0]["settings"]}

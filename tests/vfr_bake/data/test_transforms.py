@@ -227,7 +227,7 @@ def test_a_truncated_picture(tmp_path: Path, suffix: str, n_bytes: int):
 def test_a_picture_that_is_not_one(tmp_path: Path):
     folder = make_folder(tmp_path / "a", 3)
     (folder / "r_2.png").write_text("hello")
-    assert message(folder).startswith(f"{folder / 'r_2.png'}: picture: expected a PNG or JPEG file: ")
+    assert message(folder).startswith(f"{folder / 'r_2.png'}: picture: expected a PNG or JPEG file, got ")
 
 
 def test_pictures_of_different_sizes(tmp_path: Path):

@@ -1,0 +1,92 @@
+"""Files of tensors that would take more memory than they have bytes, or make what is no tensor."""
+
+from __future__ import annotations
+
+import collections
+import pickle
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from player.errors import ConfigError, FormatError
+from vfr_bake.training.tensor_files import read_tensors, write_tensors
+
+
+def repacked(path: Path, method: int) -> None:
+    with zipfile.ZipFile(path) as archive:
+        entries = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+
+
+def test_numbers_that_were_packed(tmp_path: Path) -> None:
+    """torch would inflate them: a thousand times the size of the file."""
+    path = tmp_path / "model.pt"
+    write_tensors(path, {"a": torch.zeros(10_000_000)})
+    repacked(path, zipfile.ZIP_STORED)
+    assert len(read_tensors(path, "a model")["a"]) == 10_000_000
+    repacked(path, zipfile.ZIP_DEFLATED)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(FormatError, match=r"not a model: expected plain entries in it, got packed ones"):
+        read_tensors(path, "a model")
+
+
+def test_one_number_in_ten_thousand_million_places(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    write_tensors(path, {"a": [torch.zeros(1)], "b": (torch.zeros(1).expand(10_000_000_000),)})
+    assert path.stat().st_size < 10_000
+    with pytest.raises(FormatError, match=r"expected all numbers of a tensor in the file, got one for many"):
+        read_tensors(path, "a model")
+
+
+def test_values_that_refer_to_each_other(tmp_path: Path) -> None:
+    """Thirty lists, each twice in the next: a thousand million ways to the first."""
+    inner: list = [torch.zeros(2)]
+    for _ in range(30):
+        inner = [inner, inner]
+    path = tmp_path / "model.pt"
+    write_tensors(path, {"a": inner})
+    read_tensors(path, "a model")
+
+
+def test_what_is_no_tensor(tmp_path: Path) -> None:
+    """Ten gigabytes of zeros out of thirty bytes, which torch's own list of what is safe lets pass."""
+
+    class Zeros:
+        def __reduce__(self) -> tuple:
+            return bytearray, (10_000_000_000,)
+
+    path = tmp_path / "model.pt"
+    torch.save({"a": Zeros(), "b": collections.OrderedDict(c=torch.zeros(2))}, path)
+    with pytest.raises(FormatError, match=r"expected plain tensors and values, got \w+ bytearray"):
+        read_tensors(path, "a model")
+
+
+def test_what_older_versions_of_torch_wrote(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    torch.save({"a": torch.zeros(2)}, path, _use_new_zipfile_serialization=False)
+    with pytest.raises(FormatError, match="not a model, or cut short"):
+        read_tensors(path, "a model")
+    assert len(read_tensors(path, "a model", from_elsewhere=True)["a"]) == 2
+    path.write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(FormatError, match="not a model, or cut short"):
+        read_tensors(path, "a model")
+
+
+def test_memory(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    write_tensors(path, {"a": torch.zeros(1_000_000)})
+    read_tensors(path, "a model", max_memory=0.013)
+    with pytest.raises(ConfigError, match=r"model\.pt: memory: expected at most 0\.011 GB, got 0\.012 GB"):
+        read_tensors(path, "a model", max_memory=0.011)
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(ConfigError, match="memory: expected at most"):
+        read_tensors(path, "a model")
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(FormatError, match="expected a file, a model, got a device"):
+        read_tensors(path, "a model")
