@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,15 @@ try:
     from numba.core import config
 except ImportError:  # an extra: without it the numpy twin of whatever is compiled runs
     numba = None
+else:
+    # numba reads settings from a file in the current folder. One of them is the folder of compiled code,
+    # which is unpickled: whoever writes that file runs code. Without a name there is no such file.
+    config._config_fname = ""  # pyright: ignore[reportAttributeAccessIssue]
+    config.reload_config()
+    from player.kept_code import keep, place
+
+SOURCES = Path(__file__).parent
+"""Of all compiled code of the player: whatever lies in this folder and below."""
 
 
 def available() -> bool:
@@ -22,30 +29,20 @@ def available() -> bool:
 
 def first_use() -> bool:
     """Whether numba is there and has kept no march yet: the first picture waits until it is compiled."""
-    if numba is None or os.environ.get("NUMBA_CACHE_DIR"):
+    if numba is None:
         return False
-    return not any((Path(__file__).parent / "__pycache__").glob("*march_compiled*.nbi"))
+    folder = place(SOURCES).folder
+    return folder is None or not any(folder.glob("*march_compiled*.nbi"))
 
 
-def forget_outdated(folder: Path, *others: Path) -> None:
-    """Remove compiled code that numba kept in `folder` if any of the sources there, or in `others` that they
-    take functions from, is not what it was then.
-
-    numba looks at the file of a function alone: after an update it would go on with what the function took
-    from other files as they were, and compute something else without a word. Times are compared for
-    equality: a clock that was wrong does no harm.
-    """
-    paths = [path for place in (folder, *others) for path in sorted(place.glob("*.py"))]
-    files = [(path.name, path.stat()) for path in paths]
-    sources = "\n".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in files)
-    note = folder / "__pycache__" / "compiled_from.txt"
-    with suppress(OSError):  # nothing kept yet; or somebody else removed it, or it is not ours to remove
-        if note.is_file() and note.read_text() == sources:
-            return
-        for kept in folder.glob("__pycache__/*.nbi"):
-            kept.unlink(missing_ok=True)
-        note.parent.mkdir(exist_ok=True)
-        note.write_text(sources)
+def not_kept() -> str | None:
+    """Why compiled code is not kept, in a line for people; None where it is."""
+    if numba is None or (refused := place(SOURCES).refused) is None:
+        return None
+    return (
+        f"{refused}: expected a folder that nobody else may write to: "
+        "compiled code is not kept there, and is compiled again every time"
+    )
 
 
 def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
@@ -58,20 +55,9 @@ def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[...
     if numba is None:
         return function
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": inline}
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder to keep the compiled code in: compile again in every process
-        return numba.njit(**options)(function)
+    return keep(numba.njit(**options)(function), SOURCES)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """A part of a compiled function, inlined: a call would pass 60 words."""
     return compiled(function, inline=True)
-
-
-if numba is not None:
-    # numba reads settings from a file in the current folder. One of them is the folder of compiled code,
-    # which is unpickled: whoever writes that file runs code. Without a name there is no such file.
-    config._config_fname = ""  # pyright: ignore[reportAttributeAccessIssue]
-    config.reload_config()
-    forget_outdated(Path(__file__).parent)

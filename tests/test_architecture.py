@@ -41,6 +41,7 @@ TOP_LEVEL_EXCEPTIONS = {
             "activations",
             "dense_tiles",
             "eight_rows",
+            "kept_code",
             "lanes",
             "packet_fetches",
             "packets",

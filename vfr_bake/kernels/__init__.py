@@ -6,14 +6,29 @@ training runs in float32, `gradcheck` in float64. Constants are cast to the type
 `1.0` would silently turn float32 arithmetic into float64.
 """
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numba
 from numba import config
 
 import player
-from player.compiling import forget_outdated
+from player.kept_code import keep
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
 config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore[reportAttributeAccessIssue]
-forget_outdated(Path(__file__).parent, Path(player.__file__).parent)
+
+SOURCES = Path(__file__).parent, Path(player.__file__).parent
+"""Of all kernels: they take functions from the player."""
+
+
+def njit(cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`, whose `cache` asks for all sources (`player.kept_code`)."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        return keep(dispatcher, *SOURCES) if cache else dispatcher
+
+    return compiled

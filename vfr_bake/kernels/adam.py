@@ -4,9 +4,10 @@ step."""
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from player.prefetch import prefetch
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
 
 AHEAD = 16

@@ -8,8 +8,9 @@ deltas[i], tau_i its running sum, T_i = exp(-tau_{i-1}), w_i = T_i (1 - exp(-d_i
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.contraction import contracted_unit
 
 

@@ -7,8 +7,8 @@ the hash grids. Points are contracted where they are looked up; a contracted poi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS
 
 

@@ -9,9 +9,10 @@ one each.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from player.prefetch import prefetch
+from vfr_bake.kernels import njit
 
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)

@@ -9,8 +9,9 @@ occupied cell (0: occupied), so that d - 1 whole cells around an empty one can b
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, encode_point
 
 

@@ -10,8 +10,9 @@ features, absorbed into the table.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from vfr_bake.kernels import njit
 from vfr_bake.kernels.contraction import contracted_unit
 from vfr_bake.kernels.hash_grid import FLAGS, corners, encode_point, prefetch_point
 from vfr_bake.kernels.march import density_logit

@@ -13,9 +13,10 @@ latent as if there were no rounding (straight through).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from player.prefetch import prefetch
+from vfr_bake.kernels import njit
 
 BLOCK = 64
 """Rays that a thread takes at a time."""

@@ -112,7 +112,13 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
 
 @pytest.mark.parametrize(
     "remembered",
-    [[], "balanced", {"preset": []}, {"preset": "balanced", "k": "many"}, {"preset": "balanced", "max_mb": []}],
+    [
+        [],
+        "balanced",
+        {"preset": []},
+        {"preset": "balanced", "k": "many"},
+        {"preset": "balanced", "max_mb": []},
+    ],
 )
 def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Path) -> None:
     """What an asset remembers is free in its form."""

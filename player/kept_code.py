@@ -1,0 +1,171 @@
+"""Where compiled code is kept, so that it is compiled once, and when it is run again.
+
+numba keeps what it has compiled and looks, before it runs that again, at the file of the function alone: what
+the function took from other files stays as it was. Here the folder's name and the index have a digest of
+every source that compiled code is made from, and of the versions of what compiles it. What was kept of
+another source is not found, wherever it lies and whatever its times are.
+
+What is kept is loaded with pickle, that is, run: whoever may write there may run programs as whoever plays.
+So a folder of ours is made for its owner alone, and one that others may write to is not used.
+
+A folder is looked for where numba looks: in NUMBA_CACHE_DIR, beside the sources, and in the user's caches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.misc.appdirs import AppDirs
+
+N_KEPT = 4
+"""Folders of other sources that stay, those used last: versions that are used in turns keep their code."""
+
+
+class Place(NamedTuple):
+    """Where code that is compiled from some sources is kept."""
+
+    folder: Path | None
+    """None where it cannot be kept."""
+    digest: str
+    """Of the sources and of what compiles them."""
+    refused: Path | None
+    """A folder that is not used because others may write to it."""
+
+
+def keep(dispatcher: Any, *packages: Path) -> Any:
+    """Let a function of numba's be loaded where it was kept, and kept where it was not.
+
+    Args:
+        dispatcher: as `numba.njit` gives it.
+        packages: folders of all sources that the function is made from, its own first. A function of another
+            file is not kept, because nobody would know when that has changed.
+    """
+    function = dispatcher.py_func
+    where = place(*packages)
+    if where.folder is not None and Path(function.__code__.co_filename).is_relative_to(packages[0]):
+        dispatcher._cache = _KeptCode(function, where)
+    return dispatcher
+
+
+@lru_cache(maxsize=8)
+def place(*packages: Path) -> Place:
+    """Where code of the sources in `packages` is kept; its folder is made if it is not there."""
+    digest = sources_digest(*packages)
+    if digest is None:
+        return Place(None, "", None)
+    told, beside = getattr(config, "CACHE_DIR", ""), packages[0] / "__pycache__"
+    of_user = Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir)
+    refused = None
+    for root in (*([Path(told)] if told else []), beside, of_user):
+        folder = root / f"compiled-{digest[:16]}"
+        try:
+            _make(root)
+            new = _make(folder)
+            # Who may write beside the sources may as well change the sources.
+            if _is_ours(folder) and (root == beside or _is_ours(root)):
+                tempfile.TemporaryFile(dir=folder).close()
+                os.utime(folder)  # used now
+                if new:
+                    _remove_old(root, folder)
+                return Place(folder, digest, None)
+        except OSError:  # nothing can be written there
+            continue
+        refused = root
+        if told:
+            break  # somebody has said where, and should know
+    return Place(None, digest, refused)
+
+
+@lru_cache(maxsize=8)
+def sources_digest(*packages: Path) -> str | None:
+    """Of all sources below the folders `packages`, and of what compiles them; None if there are none."""
+    versions = sys.version, numba.__version__, llvmlite.__version__, np.__version__
+    total, n_files = hashlib.sha256("\n".join(versions).encode()), 0
+    for package in packages:
+        for path in sorted(package.rglob("*.py")):
+            content = path.read_bytes()
+            total.update(f"\n{path.relative_to(package).as_posix()} {len(content)}\n".encode())
+            total.update(content)
+            n_files += 1
+    return total.hexdigest() if n_files else None
+
+
+def _make(folder: Path) -> bool:
+    """Make a folder for its owner alone; whether it was not there."""
+    if folder.is_dir():
+        return False
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return True
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether nobody but us and the system's administrator may write to a folder."""
+    if os.name != "posix":
+        return True  # a user's folders are that user's alone
+    found = folder.stat()
+    return found.st_uid in (os.geteuid(), 0) and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+def _remove_old(root: Path, used: Path) -> None:
+    """Remove what was kept of other sources, but for the folders used last."""
+    with suppress(OSError):  # somebody else removes it, too
+        others = [path for path in root.glob("compiled-*") if path != used and path.is_dir()]
+        for path in sorted(others, key=lambda path: path.stat().st_mtime)[:-N_KEPT]:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+class _Locator(_CacheLocator):
+    def __init__(self, function: Callable[..., Any], where: Place) -> None:
+        self._py_file = function.__code__.co_filename  # numba names it in a warning
+        self._line, self._where = function.__code__.co_firstlineno, where
+
+    def get_cache_path(self) -> str:
+        return str(self._where.folder)
+
+    def get_source_stamp(self) -> str:
+        return self._where.digest
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Files(CompileResultCacheImpl):
+    def __init__(self, function: Callable[..., Any], where: Place) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        self._locator = _Locator(function, where)
+        name = f"{function.__module__}.{function.__qualname__}"
+        self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+
+class _KeptCode(FunctionCache):
+    def __init__(self, function: Callable[..., Any], where: Place) -> None:
+        self._impl_class = partial(_Files, where=where)
+        super().__init__(function)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # a file cut short or broken raises anything; it is written again
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # a full disk: it is compiled again the next time
+            super().save_overload(sig, data)
