@@ -132,8 +132,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_together(files: dict[Path, bytes]) -> None:
-    """Write files that belong together, all in one folder, beside their places; when all are complete, move
-    them there.
+    """Write files that belong together beside their places; when all are complete, move them there.
+
+    They are in one folder, and up to their first dots their names are the same: `a.obj`, `a.lod1.obj`.
 
     A process that is killed while it moves them leaves some of the old and some of the new: the next one that
     writes in this folder, or looks whether it may (`check_target`), moves the rest.
@@ -141,6 +142,8 @@ def write_together(files: dict[Path, bytes]) -> None:
     Raises OutputError: full disk, read-only folder, ...
     """
     first = next(iter(files))
+    if len({(path.parent, path.name.split(".")[0]) for path in files}) > 1:
+        raise ValueError(f"{[str(path) for path in files]}: expected names that begin alike, in one folder")
     with _writing(first):
         if len(files) == 1:
             _write_one(first, files[first])

@@ -136,7 +136,7 @@ def test_files_beside_the_target_are_not_overwritten(
 
 
 def test_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "one").write_text("old")
+    (tmp_path / "a.obj").write_text("old")
     written = []
 
     def fsync(handle: int) -> None:
@@ -145,9 +145,11 @@ def test_together_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(OutputError, match="one: cannot write: No space left on device"):
-        write_together({tmp_path / "one": b"1", tmp_path / "two": b"2"})
-    assert [path.name for path in tmp_path.iterdir()] == ["one"] and (tmp_path / "one").read_text() == "old"
+    with pytest.raises(OutputError, match=r"a\.obj: cannot write: No space left on device"):
+        write_together({tmp_path / "a.obj": b"1", tmp_path / "a.mtl": b"2"})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.obj"] and (
+        tmp_path / "a.obj"
+    ).read_text() == "old"
     monkeypatch.undo()
-    write_together({tmp_path / "one": b"1", tmp_path / "two": b"2"})
-    assert (tmp_path / "one").read_bytes() == b"1" and (tmp_path / "two").read_bytes() == b"2"
+    write_together({tmp_path / "a.obj": b"1", tmp_path / "a.mtl": b"2"})
+    assert (tmp_path / "a.obj").read_bytes() == b"1" and (tmp_path / "a.mtl").read_bytes() == b"2"
