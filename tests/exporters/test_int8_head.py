@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import onnxruntime
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, head_onnx
 from player.errors import ShapeError
+from tests.reference import gelu, spherical_harmonics
 
 N_CHANNELS, WIDTH, N_SH = 12, 64, 4
 
@@ -62,19 +65,65 @@ def test_a_pixel_does_not_depend_on_its_neighbours(weights: HeadWeights) -> None
         np.testing.assert_array_equal(np.asarray(together)[index], np.asarray(alone)[0])
 
 
-def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights) -> None:
+Squeeze = Callable[[int, np.ndarray], np.ndarray]
+"""What becomes of the activation of a number, which a layer in 8 bits takes in."""
+
+
+def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) -> np.ndarray:
+    """The head in float64, without rounding, with `squeeze` on what its 8-bit layers take in."""
+    h = seen["features"].astype(np.float64)
+    for weight, bias in weights.spatial:
+        h = gelu(h @ weight + bias)
+    h = squeeze(0, h)
+    basis = spherical_harmonics(seen["dirs"].astype(np.float64), weights.sh_degree)
+    encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * np.repeat(basis, weights.n_sh_features, axis=1)
+    d_bottleneck, d_sh, bias = weights.directional_first
+    z = gelu(h @ d_bottleneck + encoded @ d_sh + bias)
+    for number, (weight, bias) in enumerate(weights.directional, start=1):
+        z = gelu(squeeze(number, z) @ weight + bias)
+    return 1 / (1 + np.exp(-(z @ weights.output[0] + weights.output[1])))
+
+
+@pytest.mark.parametrize("size", [4.0, 1e4])
+def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: float) -> None:
+    """Codes that wrapped around, as a cast to 8 bits does, would be those of quite another activation."""
     seen = inputs(100, seed=4)
-    seen["features"] *= 1e4
+    seen["features"] *= size
+    ranges = activation_ranges(weights, **inputs(4000))
     (rgb,) = session(weights, eight=True).run(None, seen)
-    assert np.isfinite(np.asarray(rgb)).all()
-    assert np.asarray(rgb).min() >= 0 and np.asarray(rgb).max() <= 1
+    outside = []
+
+    def clipped(number: int, x: np.ndarray) -> np.ndarray:
+        low, high = ranges[number]
+        outside.append(float(((x < low) | (x > high)).mean()))
+        return np.clip(x, low, high)
+
+    def wrapped(number: int, x: np.ndarray) -> np.ndarray:
+        low, high = ranges[number]
+        return low + (x - low) % (high - low)
+
+    error = np.abs(np.asarray(rgb) - oracle(weights, seen, clipped))
+    assert outside[0] > 0.1, "there is something to clip"
+    assert error.max() < 0.04 and np.sqrt(np.mean(error**2)) < 0.01, "256 levels in each of four layers"
+    assert np.abs(oracle(weights, seen, wrapped) - oracle(weights, seen, clipped)).mean() > 0.05
 
 
 def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None:
+    """Of inputs that they were not made from: two in ten thousand are left out, where they were."""
     ranges = activation_ranges(weights, **inputs(4000))
     assert len(ranges) == 3
-    for low, high in ranges:
-        assert -0.18 < low <= 0 < high
+    found: dict[int, np.ndarray] = {}
+
+    def kept(number: int, x: np.ndarray) -> np.ndarray:
+        found[number] = x
+        return x
+
+    oracle(weights, inputs(4000, seed=5), kept)
+    for number, (low, high) in enumerate(ranges):
+        assert low <= 0 < high
+        inside = ((found[number] >= low) & (found[number] <= high)).mean()
+        assert 0.9995 < inside < 1, "the rare largest ones would make every step coarser"
+        assert high < found[number].max() and low > found[number].min() - 5e-4, "within the tanh form of GELU"
 
 
 def test_one_range_for_each_activation(weights: HeadWeights) -> None:
