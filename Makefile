@@ -6,7 +6,11 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-INPUTS := pyproject.toml constraints.txt
+# What is installed: `make test-lowest` has a file of its own.
+CONSTRAINTS ?= constraints.txt
+INPUTS := pyproject.toml $(CONSTRAINTS)
+# The Pythons of `make test-pythons`; with pyenv, PYTHONS="$$(ls -d ~/.pyenv/versions/3.1*/bin/python)" for those it has.
+PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 # What libOpen3D, the independent reader of our meshes, is linked to and a bare machine may lack (readelf -d), and the
 # Debian package of each. Only what is missing is installed, and nothing that is there is upgraded.
 SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6 \
@@ -19,11 +23,13 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check env format system-libraries other-programs clean
+.PHONY: help demo test check env format system-libraries other-programs clean \
+  test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 26
 	@echo "  settings:               PYTHON=$(PYTHON) VENV=$(VENV) TORCH_INDEX=$(TORCH_INDEX)"
+	@echo "                          PYTHONS=\"$(PYTHONS)\" (test-pythons, test-all)"
 
 demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures and figures in demo/
 	$(BIN)/python -m vfr_bake.demo --output demo --force
@@ -36,14 +42,65 @@ check: $(VENV)/.dev  ## style and types alone
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# What takes too long for every change; CONTRIBUTING.md says how long each takes.
+test-all: test-pythons test-lowest test-wheel fuzz kill mutations processors  ## everything below: a day of one machine
+
+test-pythons:  ## make test on each of PYTHONS
+	@set -e; for python in $(PYTHONS); do \
+	  version=$$($$python -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+	  $(MAKE) test PYTHON=$$python VENV=$(VENV)-$$version; \
+	done
+
+# PYTHON is best the oldest: not every lowest version has a wheel for a newer one.
+test-lowest: $(VENV)-lowest.txt  ## make test and test-wheel with the lowest versions that pyproject.toml allows, all together
+	$(MAKE) test test-wheel VENV=$(VENV)-lowest CONSTRAINTS=$(VENV)-lowest.txt
+
+# Every "name>=version" as name==version.
+$(VENV)-lowest.txt: pyproject.toml
+	sed -nE 's/^.*"([A-Za-z][A-Za-z0-9_-]*)(\[[a-z,]*\])?>=([0-9.]+).*/\1==\3/p' pyproject.toml > $@
+
+# First alone: what the player needs, and what the tests themselves import. Tests that are marked "extra" need an extra;
+# files that import numba or the viewer are left out by name. Then with the player's extras: all of its tests. They
+# run in a folder that has the tests alone, so that nothing but the installed package can be imported.
+WHEEL := $(abspath $(VENV)-wheel)
+WHEEL_PIP := $(WHEEL)/bin/python -m pip --disable-pip-version-check install --quiet -c $(CONSTRAINTS)
+WHEEL_TESTS := cd $(WHEEL)/checkout && VFR_DATA="$${VFR_DATA:-$(abspath ../shared/data)}" $(WHEEL)/bin/python -m pytest tests/player
+TOOLS_OF_TESTS := pytest hypothesis onnx scipy opencv-python-headless pycolmap
+FILES_OF_EXTRAS := compiling contracted_march head_compiled lanes march viewer
+test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## build, check the packages, run the player's tests on the wheel
+	rm -rf build dist $(WHEEL)
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv $(WHEEL)
+	$(WHEEL_PIP) dist/*.whl
+	$(WHEEL_PIP) $(TOOLS_OF_TESTS)
+	mkdir $(WHEEL)/checkout
+	cp -R tests conftest.py pyproject.toml $(WHEEL)/checkout
+	cd $(WHEEL)/checkout && $(WHEEL)/bin/python -c 'import player, sys; assert player.__file__.startswith(sys.prefix + "/lib")'
+	$(WHEEL_TESTS) -m 'not extra' $(FILES_OF_EXTRAS:%=--ignore=tests/player/test_%.py)
+	$(WHEEL_PIP) "$$(echo dist/*.whl)[fast,viewer,video,cluster]" playwright
+	$(WHEEL_TESTS)
+
+fuzz: $(VENV)/.dev  ## a million broken inputs to every reader
+	$(BIN)/python -m tests.reliability.fuzz --inputs 1000000
+
+kill: $(VENV)/.dev  ## commands that are killed, that share an output, whose disk is full
+	$(BIN)/python -m tests.reliability.kill --runs 200
+
+mutations: $(VENV)/.dev system-libraries other-programs  ## faults put into the source that the tests must notice
+	$(BIN)/python -m tests.reliability.mutate --n 60
+
+processors: $(VENV)/.dev  ## the compiled player as on older processors
+	$(BIN)/python -m tests.reliability.processors
+
 format: $(VENV)/.dev  ## put the code into the house's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 env: $(VENV)/.dev  ## the environment for development, in .venv
 
-clean:  ## remove the environment and what tools left behind (not demo/)
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+clean:  ## remove the environments and what tools left behind (not demo/)
+	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 
 # The end of a recipe that has put Debian packages into $$missing.
 define INSTALL_MISSING
@@ -84,15 +141,15 @@ $(VENV)/.gltf-validator: $(VENV)/.dev
 	@touch $@
 
 # The stamps: an extra is installed again only when what it is installed from has changed.
-$(VENV)/.dev $(VENV)/.train: $(VENV)/.%: $(VENV)/.torch $(INPUTS)
-	$(PIP) install --quiet -c constraints.txt -e '.[$*]'
+$(VENV)/.dev $(VENV)/.train $(VENV)/.release: $(VENV)/.%: $(VENV)/.torch $(INPUTS)
+	$(PIP) install --quiet -c $(CONSTRAINTS) -e '.[$*]'
 	@touch $@
 
 # torch alone and first: with a GPU from PyPI, else from TORCH_INDEX (one retry, then pip falls back to its other indexes).
-$(VENV)/.torch: $(BIN)/python constraints.txt
+$(VENV)/.torch: $(BIN)/python $(CONSTRAINTS)
 	@if test "$$(uname -s)" != Linux || nvidia-smi >/dev/null 2>&1; then index=; \
 	else index="--retries 1 --extra-index-url $(TORCH_INDEX)"; fi; set -x; \
-	$(PIP) install --quiet --no-deps -c constraints.txt $$index torch
+	$(PIP) install --quiet --no-deps -c $(CONSTRAINTS) $$index torch
 	@touch $@
 
 $(BIN)/python:

@@ -158,7 +158,13 @@ def replace_head(folder: Path, data: bytes) -> None:
     rewrite(folder, lambda document: document["files"].update({"head.onnx": entry}))
 
 
-@pytest.mark.parametrize("command", [["--info"], ["--check"], ["--view", "0", "--output", "O"], []])
+COMMANDS = [
+    *(["--info"], ["--check"], ["--view", "0", "--output", "O"]),
+    pytest.param([], marks=pytest.mark.extra, id="viewer"),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_an_asset_from_the_future(
     command: list[str], broken_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,7 +177,7 @@ def test_an_asset_from_the_future(
 
 
 @pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "a/b", "..", "C:x", "nul\x00", "manifest.json"])
-@pytest.mark.parametrize("command", [["--info"], ["--check"], ["--view", "0", "--output", "O"], []])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_a_manifest_that_points_outside_its_folder(
     name: str, command: list[str], broken_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

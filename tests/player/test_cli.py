@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player import cli, files
+from player import cli, compiling, files
 from player.render import Renderer
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -39,7 +39,8 @@ def test_one_picture_a_frame_and_figures(
         "ms_median", "ms_p95", "frames", "width", "height", "threads", "march", "peak_rss_mb", "samples",
     }  # fmt: skip
     assert (got["frames"], got["width"], got["height"], got["threads"], got["samples"]) == (5, 48, 40, 2, 5)
-    assert got["march"] == "numba" and 0 < got["ms_median"] <= got["ms_p95"]
+    assert got["march"] == ("numba" if compiling.available() else "numpy")
+    assert 0 < got["ms_median"] <= got["ms_p95"]
     assert got["peak_rss_mb"] is None or got["peak_rss_mb"] > 10
     printed = capsys.readouterr()
     assert printed.err == "" and printed.out.count("\n") == 1 and str(out) in printed.out
@@ -244,6 +245,7 @@ def test_ctrl_c_keeps_finished_frames(
     assert f"kept in {tmp_path / 'o'}; --resume goes on" in capsys.readouterr().err
 
 
+@pytest.mark.extra
 @pytest.mark.parametrize("first", [False, True])
 def test_progress_on_a_terminal(
     first: bool, shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -74,6 +74,7 @@ def play(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.extra
 def test_every_frame_arrives_once_though_a_worker_dies(
     cluster: Cluster, shells_folder: Path, tmp_path: Path
 ) -> None:
@@ -98,6 +99,7 @@ def test_every_frame_arrives_once_though_a_worker_dies(
         assert (out / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.extra
 def test_what_is_said_when_it_cannot_be(
     cluster: Cluster,
     shells_folder: Path,

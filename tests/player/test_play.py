@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -132,7 +131,7 @@ def test_resume_replaces_no_stranger(
     assert (out / "r_1.png").read_text() == "mine" and len(list(out.iterdir())) == 1
 
 
-@pytest.mark.parametrize("name", ["frames", "turn.mp4"])
+@pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
 def test_ctrl_c_in_the_middle_then_resume(name: str, shells_folder: Path, tmp_path: Path) -> None:
     """A real interrupt of a real process, at some frame."""
     target = tmp_path / name
@@ -172,14 +171,19 @@ def test_ctrl_c_in_the_middle_then_resume(name: str, shells_folder: Path, tmp_pa
 
 
 def decode(path: Path) -> list[np.ndarray]:
+    import av
+
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
+@pytest.mark.extra
 def test_a_video_shows_the_frames_at_the_paths_rate(
     asset: Asset, shells_folder: Path, tmp_path: Path
 ) -> None:
     """An odd size, which H.264 cannot store: filled up by copies of the last column and row."""
+    import av
+
     turn = orbit(read_cameras(asset.path("cameras.json")), 6, (65, 49))
     path = tmp_path / "path.json"
     path.write_bytes(write_camera_path(turn, 12))
@@ -200,6 +204,7 @@ def test_a_video_shows_the_frames_at_the_paths_rate(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["path.json", "turn.mp4"]
 
 
+@pytest.mark.extra
 def test_plain_colours_of_a_video_are_right(tmp_path: Path) -> None:
     colours = [(255, 255, 255), (0, 0, 0), (200, 30, 30), (30, 200, 30), (30, 30, 200)]
     write_video(tmp_path / "a.mp4", [np.full((32, 32, 3), c, np.uint8) for c in colours], 29.97)
@@ -207,6 +212,7 @@ def test_plain_colours_of_a_video_are_right(tmp_path: Path) -> None:
         assert np.abs(frame.mean(axis=(0, 1)) - colour).max() < 4
 
 
+@pytest.mark.extra
 def test_videos_that_cannot_be(
     shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

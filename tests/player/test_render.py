@@ -32,7 +32,7 @@ def inside_camera() -> Camera:
     return Camera("inside", look_at((1, 2, 3.2), (3, 2, 3)), 50, 37, 30.0, 30.0, 25.0, 18.5)
 
 
-@pytest.mark.parametrize("module", ["numpy", "numba"])
+@pytest.mark.parametrize("module", ["numpy", pytest.param("numba", marks=pytest.mark.extra)])
 def test_picture_is_the_naive_loop(module: str, asset: Asset, scene: Scene, camera: Camera) -> None:
     """World camera, rotated and scaled model, head, background, depth: the whole chain for every 37th
     pixel."""
@@ -59,7 +59,7 @@ def test_the_picture_shows_something(asset: Asset, camera: Camera) -> None:
     assert frame.rgb.shape == (40, 48, 3) and frame.opacity.shape == frame.n_samples.shape == (40, 48)
 
 
-@pytest.mark.parametrize("module", ["numpy", "numba"])
+@pytest.mark.parametrize("module", ["numpy", pytest.param("numba", marks=pytest.mark.extra)])
 def test_threads_and_tasks_do_not_change_a_bit(
     module: str, asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
