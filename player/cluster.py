@@ -94,7 +94,11 @@ def _task(folder: str, digest: str, job: Job, index: int, settings: PlaySettings
 
 @lru_cache(maxsize=1)
 def _renderer(folder: str, digest: str, settings: PlaySettings) -> Renderer:
-    """The worker's renderer, kept for its next frames."""
+    """The worker's renderer, kept for its next frames. What would end the worker is found out before."""
+    if settings.march != "numpy":
+        from player.proof import prove
+
+        prove(lambda _: None)
     return Renderer(Asset.open(folder, max_memory=settings.max_memory), settings.threads, settings.march)
 
 

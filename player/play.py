@@ -17,7 +17,7 @@ from player.cameras import Camera, orbit
 from player.errors import ConfigError
 from player.files import write_bytes
 from player.frame_files import Target, encode_frame, frame_key, unfinished
-from player.progress import Bar, duration, say_first_use
+from player.progress import Bar, duration
 from player.render import FRAME_BYTES, Background, March, Renderer, check_size, import_ahead
 from player.transforms import read_cameras
 from player.views import frame_rate, read_views
@@ -85,6 +85,10 @@ def play(arguments: argparse.Namespace, say: Callable[[str], object]) -> tuple[d
     most = asset.most_samples
     if settings.samples is not None and settings.samples > most:
         say(f"--samples {settings.samples}: a ray has {most} samples at most, and every one is taken")
+    if jobs and not arguments.dask and settings.march != "numpy":
+        from player.proof import prove
+
+        prove(say)
     begin = time.perf_counter()
     done: list[Done] = []
     frames = _on_cluster if arguments.dask else _here
@@ -111,7 +115,6 @@ def _here(asset: Asset, jobs: list[Job], settings: PlaySettings, _: str | None) 
     if not jobs:
         return
     with Renderer(asset, settings.threads, settings.march) as renderer:
-        say_first_use(renderer.march)
         # compiles, or reads what was compiled before
         renderer.render(jobs[0].camera.resized(64, 64), settings.samples, settings.background)
         for index, job in enumerate(jobs):

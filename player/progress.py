@@ -36,16 +36,6 @@ class Bar:
         sys.stderr.flush()
 
 
-def say_first_use(march: str) -> None:
-    """On a terminal, why the first picture of a compiled `march` takes its time."""
-    if march != "numba" or not sys.stderr.isatty():
-        return
-    from player.compiling import first_use  # imports numba, which is there by now
-
-    if first_use():
-        sys.stderr.write("vfr-play: compiling for this processor: up to a minute, once\n")
-
-
 def duration(seconds: float) -> str:
     """Seconds in words that a person reads at a glance.
 

@@ -116,7 +116,7 @@ class Renderer:
     the threads."""
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
-        """Raises MissingExtraError if `march` is "numba" and numba is not installed."""
+        """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here."""
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
         self.march, self._module = choose_march(march, asset.manifest.contracted)
@@ -288,15 +288,17 @@ def check_size(width: int, height: int) -> None:
 def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
     """Name and module of a march through a box, or through contracted space."""
     if name != "numpy":
-        from player import compiling
+        from player import compiling, proof
 
-        if compiling.available():
+        if compiling.available() and not proof.refuted():
             from player import contracted_march_compiled, march_compiled
 
             return "numba", contracted_march_compiled if contracted else march_compiled
         if name == "numba":
             raise MissingExtraError(
-                "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
+                "march: expected compiled code that runs on this processor, got some that does not"
+                if compiling.available()
+                else "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
             )
     from player import contracted_march, march
 
@@ -353,7 +355,8 @@ def render(
         n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
         background: colour, 3 numbers 0..1, or "transparent"; the asset's own if None.
         n_threads: one for each core if None.
-        march: "numba", "numpy", or "auto": numba where it is installed.
+        march: "numba", "numpy", or "auto": numba where it is installed and was not found to be wrong
+            (`player.proof`).
 
     Returns:
         The frame: `rgb` [h, w, 3], `opacity` [h, w], `depth` [h, w] in world units, `normals` [h, w, 3].
@@ -361,7 +364,7 @@ def render(
     Raises:
         ConfigError: a picture over MAX_PIXELS, or a setting out of range.
         FormatError: the asset's head is not one.
-        MissingExtraError: `march` is "numba", which is not installed.
+        MissingExtraError: `march` is "numba", which is not installed or does not run here.
 
     >>> from player.transforms import read_cameras
     >>> asset = Asset.open("out/")

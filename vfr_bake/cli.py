@@ -235,6 +235,7 @@ def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
 
 def _bake(options: Any) -> int:
     check_target(options.asset, options.force)
+    from player.proof import prove
     from vfr_bake.baking.bake import bake, check_bakeable
     from vfr_bake.baking.estimate import expected_seconds, make_plan
     from vfr_bake.training.model_file import load_model
@@ -249,6 +250,7 @@ def _bake(options: Any) -> int:
         f"about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )
+    prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # at its end the bake plays the asset
     with Bars() as bars:
         result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6

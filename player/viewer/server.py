@@ -17,7 +17,6 @@ import numpy as np
 from player.asset import Asset
 from player.cameras import focus_point, orbit, world_up
 from player.errors import ConfigError, MissingExtraError
-from player.progress import say_first_use
 from player.render import Renderer, import_ahead
 from player.terminal import printable
 from player.transforms import read_cameras
@@ -44,6 +43,10 @@ def serve(arguments: argparse.Namespace) -> None:
     assets = [Asset.open(folder, max_memory=arguments.max_memory) for folder in folders]
     host = arguments.host or HOST
     port = free_port(host, arguments.port)
+    if arguments.march != "numpy":
+        from player.proof import prove
+
+        prove(lambda text: sys.stderr.write(f"vfr-play: {text}\n"))
     with ExitStack() as stack:
         renderers = [
             stack.enter_context(Renderer(asset, arguments.threads, arguments.march)) for asset in assets
@@ -54,7 +57,6 @@ def serve(arguments: argparse.Namespace) -> None:
             sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
             sys.stdout.flush()
             sys.stderr.write(_advice(files, server.get_port()))
-            say_first_use(renderers[0].march)
             forever = threading.Event()
             while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
                 pass

@@ -1,0 +1,167 @@
+"""Whether compiled code runs on this processor and computes what it states, found out before work that takes
+long.
+
+LLVM ends the process that asks it for an instruction which the processor does not have, and the processor
+ends one that runs such an instruction: nothing can be caught. So a process of its own compiles every vector
+that is written down for a processor, and compares what it computes with numpy. What it has compiled is kept
+for whoever asked, and so is its verdict, beside it: for these sources, these versions and this processor it
+is asked once. Where compiled code is wrong, marches run in numpy and heads in onnxruntime, which give the
+same pictures, slower.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.compiling import SOURCES, available, first_use, not_kept
+
+RIGHT, WRONG = "right", "wrong: "
+DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
+"""What ends a process that runs wrong code; anything else says nothing about the code."""
+CHILD = """
+import importlib.util, sys
+where = sys.argv[1]
+spec = importlib.util.spec_from_file_location(
+    "player", where + "/__init__.py", submodule_search_locations=[where]
+)
+sys.modules["player"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sys.modules["player"])
+from player.proof import verdict
+print(verdict())
+"""
+"""It takes no module from the current folder, and the player from where it is running."""
+
+_verdicts: dict[Path | None, str] = {}
+
+
+def prove(say: Any) -> None:
+    """Have compiled code proven, if that was not done before; at most a minute.
+
+    Args:
+        say: called with a line for people, before it takes long, and where something is wrong.
+    """
+    if not available():
+        return
+    if (reason := not_kept()) is not None:
+        say(reason)
+    known = _known()
+    if known is None:
+        known = _asked(say)
+    if known is not None and known.startswith(WRONG):
+        say(
+            f"compiled code does not run on this processor ({known[len(WRONG) :]}): "
+            "going on with numpy and onnxruntime, which are slower"
+        )
+
+
+def refuted() -> bool:
+    """Whether compiled code was found to be wrong on this processor."""
+    known = _known()
+    return known is not None and known.startswith(WRONG)
+
+
+def _known() -> str | None:
+    record = _record()
+    if record not in _verdicts and record is not None:
+        with suppress(OSError, UnicodeDecodeError):
+            _verdicts[record] = record.read_text(encoding="utf-8")
+    return _verdicts.get(record)
+
+
+def _record() -> Path | None:
+    """The file of the verdict; None where nothing can be kept."""
+    from player.kept_code import place
+    from player.processor import target
+
+    folder = place(SOURCES).folder
+    key = hashlib.sha256(repr(target()).encode()).hexdigest()[:16]
+    return None if folder is None else folder / f"proof-{key}.txt"
+
+
+def _asked(say: Any) -> str | None:
+    """The verdict of a process of its own; None if it could not say."""
+    if not sys.executable:
+        return None
+    if first_use() and sys.stderr.isatty():
+        say("compiling for this processor: up to a minute, once")
+    command = [sys.executable, "-I", "-c", CHILD, str(SOURCES)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    except OSError:
+        return None
+    found = (done.stdout.strip().splitlines() or [""])[-1]
+    if (died := _deadly(done.returncode)) is not None:
+        said = done.stderr.strip().splitlines()
+        found = f"{WRONG}{died}{': ' + said[-1][:200] if said else ''}"
+    if found != RIGHT and not found.startswith(WRONG):
+        return None
+    record = _record()
+    _verdicts[record] = found
+    if record is not None:
+        with suppress(OSError):
+            record.write_text(found, encoding="utf-8")
+    return found
+
+
+def _deadly(code: int) -> str | None:
+    """What ended a process, if that is what wrong code does."""
+    if sys.platform == "win32":
+        return f"exit code {code:#x}" if code == 3 or code >= 0xC0000000 else None
+    name = signal.Signals(-code).name if code < 0 else None
+    return name if name in DEADLY else None
+
+
+def verdict() -> str:
+    """RIGHT, or WRONG and what; the process ends where LLVM or the processor end it."""
+    from player import contracted_march, contracted_march_compiled, march, march_compiled, proof_head
+
+    for name, compiled, plain, contracted in (
+        ("the march", march_compiled, march, False),
+        ("the contracted march", contracted_march_compiled, contracted_march, True),
+    ):
+        grid, rays = _grid(contracted), _rays()
+        for k in (0, 3):
+            got, expected = compiled.march(grid, *rays, k), plain.march(grid, *rays, k)
+            alike = all(
+                ours.shape == theirs.shape and np.allclose(ours, theirs, rtol=1e-4, atol=2e-3)
+                for ours, theirs in zip(got, expected, strict=True)
+            )
+            if not alike or not len(expected.hits):
+                return f"{WRONG}{name} gives other pictures than numpy"
+    wrong = proof_head.wrong()
+    return RIGHT if wrong is None else WRONG + wrong
+
+
+def _grid(contracted: bool) -> Any:
+    """Sixteen vertices an axis of codes and features that vary, some of them not stored."""
+    from player.bricks import pack_vertices
+    from player.contracted_rays import MAX_SPEED
+    from player.sparse_grid import build_grid
+
+    vertices = np.argwhere(np.ones((16, 16, 16)))
+    vertices = vertices[(vertices * (5, 3, 1)).sum(axis=1) % 29 != 0]
+    coords, masks, order = pack_vertices(vertices)
+    x, y, z = vertices[order].T
+    codes = (120 + 8 * x - 5 * y + 3 * z).astype(np.uint8)
+    features = np.stack([x * 8 - 60, y * 7 - 50, z * 5 - (x * y) // 4], axis=-1).astype(np.int8)
+    half = 2.0 if contracted else 1.0
+    box = np.array([[-half] * 3, [half] * 3])
+    step = 4 / 48 / float(MAX_SPEED) if contracted else 0.05
+    where, both = (coords, masks), (15, 15)
+    return build_grid((*where, codes), (*where, features), both, box, step, (-3.0, 4.0), contracted)
+
+
+def _rays() -> tuple[np.ndarray, np.ndarray]:
+    angle = np.arange(45) * 0.7
+    rays_o = 1.4 * np.stack([np.cos(angle), np.sin(angle), np.cos(angle * 0.3)], axis=-1)
+    rays_d = 0.3 * np.stack([np.sin(angle * 3), np.cos(angle * 5), np.sin(angle * 2)], axis=-1) - rays_o
+    rays_d /= np.linalg.norm(rays_d, axis=-1, keepdims=True)
+    return rays_o.astype(np.float32), rays_d.astype(np.float32)

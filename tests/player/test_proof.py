@@ -1,0 +1,175 @@
+"""Compiled code is proven before it is used, by a process of its own, and left where it is wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from player import kept_code, march, march_compiled, proof, proof_head
+from player.asset import Asset
+from player.cli import main
+from player.errors import MissingExtraError
+from player.render import Renderer, choose_march
+from player.transforms import read_cameras
+
+DIES = "import os; os.abort()"
+WRONG = "print('wrong: 2 where 6 is right')"
+
+
+@pytest.fixture(autouse=True)
+def nothing_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(kept_code.config, "CACHE_DIR", str(tmp_path / "told"))
+    monkeypatch.setattr(proof, "_verdicts", {})
+    kept_code.place.cache_clear()
+    yield
+    kept_code.place.cache_clear()
+
+
+def lines() -> list[str]:
+    said: list[str] = []
+    proof.prove(said.append)
+    return said
+
+
+def test_this_machine_s_code_is_right_and_asked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert proof.verdict() == proof.RIGHT
+    monkeypatch.setattr(proof, "CHILD", f"print({proof.RIGHT!r})")
+    assert lines() == [] and not proof.refuted()
+    monkeypatch.setattr(proof, "CHILD", DIES)
+    monkeypatch.setattr(proof, "_verdicts", {})  # another process
+    assert lines() == [] and not proof.refuted()
+
+
+def test_the_process_of_its_own_finds_the_player_and_nothing_beside_it(tmp_path: Path) -> None:
+    """Files of the current folder, and of the player's, are not taken for modules that it imports."""
+    for name in ("numba", "numpy", "player", "cameras"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('taken')")
+    command = [
+        sys.executable,
+        "-I",
+        "-c",
+        proof.CHILD.replace("print(verdict())", "import cameras"),
+        str(proof.SOURCES),
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert "No module named 'cameras'" in done.stderr
+
+
+@pytest.mark.parametrize(("child", "reason"), [(DIES, "SIGABRT"), (WRONG, "2 where 6 is right")])
+def test_wrong_code_is_left(
+    child: str, reason: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    shells_folder: Path, tmp_path: Path,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(proof, "CHILD", child)
+    asset = Asset.open(shells_folder)
+    camera = read_cameras(shells_folder / "cameras.json")[0]
+    with Renderer(asset) as renderer:
+        assert renderer.march == "numba"
+        expected = renderer.render(camera)
+    assert main([str(shells_folder), "--view", "0", "--output", str(tmp_path / "out"), "--json", "-"]) == 0
+    out, err = capfd.readouterr()
+    (line,) = err.strip().splitlines()
+    assert line.startswith("vfr-play: compiled code does not run on this processor") and reason in line
+    assert '"march": "numpy"' in out
+    assert proof.refuted() and choose_march("auto") == ("numpy", march)
+    with Renderer(asset) as renderer:
+        assert renderer.march == "numpy"
+        assert np.abs(renderer.render(camera).rgb - expected.rgb).max() < 1 / 255
+    with pytest.raises(MissingExtraError, match="got some that does not"):
+        choose_march("numba")
+    monkeypatch.setattr(proof, "CHILD", "raise SystemExit('asked again')")
+    monkeypatch.setattr(proof, "_verdicts", {})
+    assert len(lines()) == 1 and proof.refuted()
+
+
+@pytest.mark.parametrize(
+    "child", ["raise ImportError('no numba here')", "import os, signal; os.kill(os.getpid(), 9)"]
+)
+def test_a_process_that_could_not_say_anything_says_nothing(
+    child: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proof, "CHILD", child)
+    assert lines() == [] and not proof.refuted() and not proof._verdicts
+    assert choose_march("auto") == ("numba", march_compiled)
+
+
+def test_numpy_alone_asks_nobody(
+    monkeypatch: pytest.MonkeyPatch, shells_folder: Path, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(subprocess, "run", None)
+    assert (
+        main([str(shells_folder), "--march", "numpy", "--view", "0", "--output", str(tmp_path / "out")]) == 0
+    )
+
+
+def test_a_bake_asks_before_it_begins(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from types import SimpleNamespace
+
+    from vfr_bake import cli
+    from vfr_bake.baking import bake, estimate
+    from vfr_bake.training import model_file
+
+    plan = SimpleNamespace(n_bytes=1, resolution=1, feature_resolution=1, n_cells=1, n_rays=lambda n: n)
+    monkeypatch.setattr(proof, "CHILD", DIES)
+    monkeypatch.setattr(model_file, "load_model", lambda path: None)
+    monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)
+    monkeypatch.setattr(estimate, "make_plan", lambda *_: plan)
+    monkeypatch.setattr(estimate, "expected_seconds", lambda *_: 1.0)
+    monkeypatch.setattr(bake, "bake", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    options = SimpleNamespace(asset=tmp_path / "asset", model=None, config=None, force=False)
+    with pytest.raises(KeyboardInterrupt):
+        cli._bake(options)
+    assert "vfr-bake: compiled code does not run on this processor (SIGABRT)" in capfd.readouterr().err
+
+
+def careless(module: Any, name: str, change: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    inner = getattr(module, name)
+
+    def changed(*arguments: Any) -> Any:
+        got = inner(*arguments)
+        return change(got, *arguments)
+
+    monkeypatch.setattr(module, name, changed)
+
+
+def test_what_is_wrong_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def one_off(got: Any, *_: Any) -> Any:
+        got.features[3, 1] += 0.5
+        return got
+
+    def write_one(got: Any, memory: np.ndarray, *_: Any) -> None:
+        memory[-5] += 1
+
+    def write_another(got: Any, codes: np.ndarray, memory: np.ndarray, *_: Any) -> None:
+        memory[7] += 0.5
+
+    with monkeypatch.context() as patch:
+        careless(march_compiled, "march", one_off, patch)
+        assert proof.verdict() == "wrong: the march gives other pictures than numpy"
+    with monkeypatch.context() as patch:
+        careless(proof_head, "_floats", write_one, patch)
+        assert proof.verdict() == "wrong: a layer gives other sums than numpy"
+    if proof_head.MULTIPLIES_BYTES:
+        careless(proof_head, "_bytes", write_another, monkeypatch)
+        assert proof.verdict() == "wrong: products of bytes are others than numpy's"
+
+
+if os.name == "posix":
+
+    def test_a_folder_that_others_may_write_to_is_named(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(proof, "CHILD", f"print({proof.RIGHT!r})")
+        (tmp_path / "told").mkdir()
+        (tmp_path / "told").chmod(0o777)
+        (line,) = lines()
+        assert f"{tmp_path / 'told'}: expected a folder that nobody else may write to" in line
