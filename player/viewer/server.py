@@ -8,6 +8,7 @@ import os
 import socket
 import sys
 import threading
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from typing import Any
@@ -47,7 +48,9 @@ def serve(arguments: argparse.Namespace) -> None:
         from player.proof import prove
 
         prove(lambda text: sys.stderr.write(f"vfr-play: {text}\n"))
-    with ExitStack() as stack:
+    with ExitStack() as stack, warnings.catch_warnings():
+        # what viser says where a client goes while something is sent to it
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         renderers = [
             stack.enter_context(Renderer(asset, arguments.threads, arguments.march)) for asset in assets
         ]

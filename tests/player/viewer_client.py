@@ -47,6 +47,8 @@ class Server:
         """`program`: what to run before, in the process."""
         environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
         self.errors = errors
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell has it for what runs behind
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         code = f"{program}\nimport sys\nfrom player.cli import main\nsys.exit(main())"
         start = ["-c", code] if program else ["-m", "player"]
         with errors.open("w") as file:

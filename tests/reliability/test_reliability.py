@@ -1,4 +1,5 @@
-"""A bounded part of the long scripts: broken inputs, killed commands, one output for two, full disks."""
+"""A bounded part of the long scripts: broken inputs, broken messages to the viewer, killed commands, one
+output for two, full disks."""
 
 from __future__ import annotations
 
@@ -26,6 +27,12 @@ def test_broken_inputs_are_refused_or_read() -> None:
     for counts in result["targets"].values():
         assert counts["inputs"] == counts["refused"] + counts["read"] == 30
         assert counts["refused"] > 5, "inputs that break nothing test nothing"
+
+
+def test_the_viewer_survives_broken_messages() -> None:
+    result = run("tests.reliability.fuzz_viewer", "--inputs", "3600", "--seed", "7")
+    assert result["failures"] == []
+    assert result["messages"] == 3600 and result["connections"] > 6, "some were dropped, and came back"
 
 
 def test_what_is_killed_leaves_the_old_or_the_new() -> None:
