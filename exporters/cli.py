@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from exporters.formats import FOLDERS, FORMATS, POINTS, ExportOptions
-from player.errors import VfrError
-from player.options import MAX_MEMORY, gigabytes
+from player.commands import run
+from player.option_types import gigabytes, number, part, size, whole
+from player.options import MAX_MEMORY
 
 _DESCRIPTION = """\
 Write a baked asset, or a part of it, for another program.
@@ -74,19 +75,14 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    arguments = _parser().parse_args(_joined_negatives(sys.argv[1:] if argv is None else argv))
-    try:
-        from exporters import export  # only now: `--help` needs no numpy
+    return run("vfr-export", lambda: _export(_joined_negatives(sys.argv[1:] if argv is None else argv)))
 
-        summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), _bar)
-    except VfrError as error:
-        from player.terminal import printable
 
-        print(f"vfr-export: error: {printable(str(error))}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("vfr-export: interrupted", file=sys.stderr)
-        return 130
+def _export(argv: list[str]) -> int:
+    arguments = make_parser().parse_args(argv)
+    from exporters import export  # only now: `--help` needs no numpy
+
+    summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), _bar)
     print(json.dumps(summary) if arguments.json else _sentence(summary))
     return 0
 
@@ -114,7 +110,7 @@ def _options(arguments: argparse.Namespace) -> ExportOptions:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     def table(rows: dict[str, str]) -> str:
         return "\n  ".join(f"{name:8}{text}" for name, text in rows.items())
 
@@ -130,23 +126,48 @@ def _parser() -> argparse.ArgumentParser:
     add("--format", metavar="NAME", help="exr or colmap for a folder; or a suffix without its dot")
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
     add("--crop", metavar="X,Y,Z,W,D,H[,YAW]", help="only what is in this box of the world; or a .json file")
-    add("--faces", type=int, metavar="N", help="simplify the mesh to N faces, or as few as can be reached")
-    add("--lods", type=int, metavar="N", help="levels of detail: N files, each of half the faces of the last")
+    add(
+        "--faces",
+        type=whole(example=100000),
+        metavar="N",
+        help="simplify the mesh to N faces, or as few as can be reached",
+    )
+    add(
+        "--lods",
+        type=whole(example=3),
+        metavar="N",
+        help="levels of detail: N files, each of half the faces of the last",
+    )
     add(
         "--method", choices=("density", "tsdf"), help="make the surface again: marching cubes, or fused depth"
     )
     add(
         "--level",
-        type=float,
+        type=number("a density", "12.5"),
         metavar="X",
         help="density of the surface, 1/model unit (half opaque: two steps)",
     )
-    add("--texture", type=int, metavar="N", help="obj, glb: colours in a picture of N x N (needs xatlas)")
-    add("--time-limit", type=float, metavar="S", help="seconds that laying out a texture may take (300)")
-    add("--points", type=int, metavar="N", help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})")
+    add(
+        "--texture",
+        type=whole(example=2048),
+        metavar="N",
+        help="obj, glb: colours in a picture of N x N (needs xatlas)",
+    )
+    add(
+        "--time-limit",
+        type=number("seconds", "300"),
+        metavar="S",
+        help="seconds that laying out a texture may take (300)",
+    )
+    add(
+        "--points",
+        type=whole(example=200000),
+        metavar="N",
+        help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})",
+    )
     add("--cameras", type=Path, metavar="FILE", help="views of a transforms.json (the training cameras)")
-    add("--views", type=_slice, metavar="A:B", help="a slice of the views, as in Python")
-    add("--size", type=_size, metavar="WxH", help="size of the pictures (the cameras' own)")
+    add("--views", type=part, metavar="A:B", help="a slice of the views, as in Python")
+    add("--size", type=size, metavar="WxH", help="size of the pictures (the cameras' own)")
     add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
     add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
     add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
@@ -168,27 +189,6 @@ def _joined_negatives(argv: list[str]) -> list[str]:
         if words[index] in ("--crop", "--views") and value[:1] == "-" and value[1:2] in set(".0123456789"):
             words[index : index + 2] = [f"{words[index]}={value}"]
     return words
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, height = (int(part) for part in text.lower().split("x"))
-    if min(width, height) < 1:
-        raise ValueError
-    return width, height
-
-
-def _slice(text: str) -> slice:
-    """A slice as Python writes it; one number is one view.
-
-    >>> _slice("0:40"), _slice("-1")
-    (slice(0, 40, None), slice(-1, None, None))
-    """
-    parts = [int(part) if part.strip() else None for part in text.split(":")]
-    if len(parts) == 1 and parts[0] is not None:
-        return slice(parts[0], parts[0] + 1 or None)
-    if not 2 <= len(parts) <= 3 or (len(parts) == 3 and parts[2] == 0):
-        raise ValueError
-    return slice(*parts)
 
 
 def _bar(stage: str, done: int, total: int) -> None:

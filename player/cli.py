@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from player.commands import run
 from player.errors import VfrError
 from player.options import parse
 
@@ -15,33 +16,19 @@ from player.options import parse
 def main(argv: list[str] | None = None) -> int:
     """Run `vfr-play`; returns the exit code: 0 done, 1 an error in one line, 2 usage, 130 Ctrl-C."""
     try:
-        arguments = parse(argv)
+        return run("vfr-play", lambda: _run(parse(argv)))
     except SystemExit as leave:  # argparse has printed why
         return leave.code if isinstance(leave.code, int) else 2
-    try:
-        if arguments.check:
-            return _check(arguments)
-        if arguments.info:
-            return _info(arguments)
-        if arguments.output is None:
-            return _view(arguments)
-        return _play(arguments)
-    except VfrError as error:
-        from player.terminal import printable
-
-        print(f"vfr-play: error: {printable(str(error))}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"vfr-play: stopped{_kept(arguments)}", file=sys.stderr)
-        return 130
 
 
-def _kept(arguments: argparse.Namespace) -> str:
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.check:
+        return _check(arguments)
+    if arguments.info:
+        return _info(arguments)
     if arguments.output is None:
-        return ""
-    from player.play import kept
-
-    return f"; {kept(arguments.output, arguments.format)}"
+        return _view(arguments)
+    return _play(arguments)
 
 
 def _view(arguments: argparse.Namespace) -> int:
@@ -52,9 +39,12 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _play(arguments: argparse.Namespace) -> int:
-    from player.play import play
+    from player.play import kept, play
 
-    figures, sentence = play(arguments, lambda text: print(f"vfr-play: {text}", file=sys.stderr))
+    try:
+        figures, sentence = play(arguments, lambda text: print(f"vfr-play: {text}", file=sys.stderr))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(kept(arguments.output, arguments.format)) from None
     _write_json(arguments.json, figures)
     if arguments.json != "-":
         print(sentence)

@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from player.errors import DataError, MissingExtraError, VfrError
+from player.commands import run
+from player.errors import DataError, MissingExtraError
 from player.files import check_target, write_bytes
 from vfr_bake.bars import Bar, Bars
 
@@ -30,37 +31,22 @@ EVAL_VIEWS = {False: 10, True: 3}
 
 def train_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-train`."""
-    return _run("vfr-train", lambda: _train(_parse("vfr-train", "Train", argv)))
+    return run("vfr-train", lambda: _train(_parse("vfr-train", "Train", argv)))
 
 
 def bake_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-bake`."""
-    return _run("vfr-bake", lambda: _bake(_parse("vfr-bake", "Bake", argv)))
+    return run("vfr-bake", lambda: _bake(_parse("vfr-bake", "Bake", argv)))
 
 
 def eval_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-eval`."""
-    return _run("vfr-eval", lambda: _eval(_parse("vfr-eval", "Eval", argv)))
+    return run("vfr-eval", lambda: _eval(_parse("vfr-eval", "Eval", argv)))
 
 
 def bench_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-bench`."""
-    return _run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
-
-
-def _run(name: str, command: Callable[[], int]) -> int:
-    try:
-        return command()
-    except VfrError as error:
-        print(f"{name}: error: {_printable(error)}", file=sys.stderr)
-        return 1
-    except OSError as error:  # a full disk, wherever it is met: a temporary folder, numba's cache
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"{name}: error: {_printable(f'{where}{error.strerror or error}')}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted", file=sys.stderr)
-        return 130
+    return run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
 
 
 def _printable(text: object) -> str:
@@ -82,11 +68,13 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
     import tyro
 
     from vfr_bake import options as classes
+    from vfr_bake.option_types import registry
 
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    return tyro.cli(
-        getattr(classes, options), prog=name, args=None if argv is None else list(argv), config=config
-    )
+    with registry():
+        return tyro.cli(
+            getattr(classes, options), prog=name, args=None if argv is None else list(argv), config=config
+        )
 
 
 def _train(options: Any) -> int:

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from player.errors import VfrError
+from player.commands import run
 from player.files import check_target, write_bytes
+from player.option_types import number
 
 TRAIN_MINUTES = 2.0
 """Leaves room for compiling, baking and playing within five minutes on two cores."""
@@ -29,17 +30,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("python -m vfr_bake.demo", description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("demo"), help="folder to write (default: demo)")
     parser.add_argument(
-        "--minutes", type=float, default=TRAIN_MINUTES, help="training time (default: %(default)s)"
+        "--minutes",
+        type=number("minutes", "2.5", above=0),
+        default=TRAIN_MINUTES,
+        help="training time (default: %(default)s)",
     )
     parser.add_argument("--force", action="store_true", help="replace what an earlier demo wrote")
     options = parser.parse_args(argv)
-    try:
-        return _demo(options.output, options.minutes, options.force)
-    except VfrError as error:
-        print(f"demo: error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+    return run("demo", lambda: _demo(options.output, options.minutes, options.force))
 
 
 def _demo(output: Path, minutes: float, force: bool) -> int:

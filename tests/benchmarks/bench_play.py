@@ -34,7 +34,7 @@ from player.asset import Asset
 from player.cameras import Camera, orbit
 from player.head_graph import read_head
 from player.march import MIN_OPACITY
-from player.options import positive, size
+from player.option_types import positive, size
 from player.play import peak_rss_mb
 from player.render import Frame, Renderer, default_threads
 from player.transforms import read_cameras

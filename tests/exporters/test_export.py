@@ -18,6 +18,7 @@ from exporters.formats import ExportOptions, check_options
 from exporters.ply import read_ply
 from player.asset import Asset
 from player.errors import ConfigError, ParityError
+from player.option_types import part, size
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -206,10 +207,10 @@ def test_same_bytes_again(shells_asset: Path, tmp_path: Path) -> None:
 
 
 def test_views_and_sizes_are_python_s() -> None:
-    assert [np.arange(9)[cli._slice(text)].tolist() for text in ("2", "-1", "::4", "7:")] == [
+    assert [np.arange(9)[part(text)].tolist() for text in ("2", "-1", "::4", "7:")] == [
         [2], [8], [0, 4, 8], [7, 8]
     ]  # fmt: skip
-    assert cli._size("12X5") == (12, 5)
+    assert size("12X5") == (12, 5)
     for arguments in (["--size", "12"], ["--size", "0x4"], ["--views", "::0"], ["--frame", "unity"]):
         with pytest.raises(SystemExit) as leave:
             cli.main(["asset", "frames", "--format", "exr", *arguments])

@@ -151,7 +151,7 @@ def test_ctrl_c_in_the_middle_then_resume(name: str, shells_folder: Path, tmp_pa
     _, errors = process.communicate()
     assert process.returncode == 130
     assert errors == (
-        f"vfr-play: stopped; the frames that were finished are kept in {folder}; --resume goes on\n"
+        f"vfr-play: interrupted; the frames that were finished are kept in {folder}; --resume goes on\n"
     )
     done = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert 3 <= len(done) < 200 and all(path.startswith("orbit_") for path in done), "no half written file"

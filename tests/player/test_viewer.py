@@ -304,7 +304,7 @@ def test_another_asset_of_the_scene(browser: Browser, shells_folder: Path, tmp_p
 def test_ctrl_c_ends_it(shells_folder: Path, tmp_path: Path) -> None:
     server = Server(tmp_path / "errors.txt", shells_folder)
     assert server.stop() == 130
-    assert server.errors.read_text().endswith("vfr-play: stopped\n")
+    assert server.errors.read_text().endswith("vfr-play: interrupted\n")
 
 
 def test_what_it_prints(server: Server, shells_folder: Path) -> None:

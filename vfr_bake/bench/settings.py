@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from player.errors import ConfigError
-from player.options import size
+from player.option_types import size
 
 Size = tuple[int, int]
 """Width and height in pixels."""

@@ -1,0 +1,115 @@
+"""How every command ends: what it prints of an error, and its exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TextIO
+
+from player.errors import VfrError
+
+READER_GONE = 141
+"""Exit code where nobody reads the output any more (`| head`): what a shell reports of other programs."""
+
+
+def run(name: str, command: Callable[[], int]) -> int:
+    """Run a command and return its exit code: 0 done, 1 an error in one line, 130 Ctrl-C, 141 for output that
+    nobody reads.
+
+    Errors on purpose (VfrError) and those that the system reports (a full disk, a name that is too long, a
+    file that may not be read) are one line on stderr; anything else is a bug and keeps its traceback. An exit
+    that the command line asks for (--help, wrong usage) goes on as SystemExit.
+
+    A KeyboardInterrupt may carry what became of the work.
+
+    >>> run("vfr-play", lambda: 0)
+    0
+    """
+    try:
+        try:
+            return command()
+        finally:
+            _flush()
+    except VfrError as error:
+        _say(f"{name}: error: {_printable(str(error))}")
+        return 1
+    except OSError as error:
+        broken = isinstance(error, BrokenPipeError) or (os.name == "nt" and error.errno == errno.EINVAL)
+        unread = broken and _nobody_reads()
+        _give_up_broken_streams()
+        if unread:
+            return READER_GONE
+        if error.errno is None:  # no disk's: a library's, or ours
+            raise
+        _say(f"{name}: error: {_printable(_described(error))}")
+        return 1
+    except KeyboardInterrupt as stop:
+        _say(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}")
+        return 130
+
+
+def _described(error: OSError) -> str:
+    """With the file if there is one.
+
+    >>> _described(OSError(errno.ENAMETOOLONG, "File name too long", "a" * 3))
+    'aaa: File name too long'
+    """
+    where = "" if error.filename is None else f"{error.filename}: "
+    return f"{where}{error.strerror or error}"
+
+
+def _printable(text: str) -> str:
+    """In one line, without what a file may have made a message say to a terminal."""
+    from player.terminal import printable  # only now: `--help` needs no numpy
+
+    return printable(text)
+
+
+def _streams() -> list[tuple[str, TextIO]]:
+    named = (("standard output", sys.stdout), ("standard error", sys.stderr))
+    return [(name, stream) for name, stream in named if stream is not None]
+
+
+def _flush() -> None:
+    """Here, because at the end of the interpreter an error would be told in its own words."""
+    for name, stream in _streams():
+        try:
+            stream.flush()
+        except OSError as error:
+            error.filename = name
+            raise
+
+
+def _nobody_reads() -> bool:
+    """Whether one of our streams is a pipe with nobody at its other end; where the system does not tell,
+    what broke is taken for one."""
+    if not hasattr(select, "poll"):
+        return True
+    asked = select.poll()
+    for _, stream in _streams():
+        with suppress(OSError):  # a stream that is no file, as in tests
+            asked.register(stream.fileno(), 0)  # errors alone
+    return any(events & (select.POLLERR | select.POLLHUP) for _, events in asked.poll(0))
+
+
+def _give_up_broken_streams() -> None:
+    """Let go nowhere what a stream cannot get rid of: the interpreter would try again at its end."""
+    for _, stream in _streams():
+        try:
+            stream.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+
+
+def _say(text: str) -> None:
+    try:
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+    except OSError:
+        _give_up_broken_streams()
