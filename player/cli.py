@@ -14,7 +14,7 @@ from player.options import parse
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `vfr-play`; returns the exit code: 0 done, 1 an error in one line, 2 usage, 130 Ctrl-C."""
+    """Run `vfr-play`; returns the exit code, those of `player.commands.run` and 2 for wrong usage."""
     try:
         return run("vfr-play", lambda: _run(parse(argv)))
     except SystemExit as leave:  # argparse has printed why

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   vfr-play out/ --cameras transforms_test.json --output frames/ --frames 10:20
   vfr-play out/ --cameras camera_path.json --output turn.mp4 --resume
 
-exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted
+exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 unread output
 """
 
 MODES = {

@@ -26,7 +26,7 @@ FORBIDDEN = {
 }
 # At the top level, where importing the package alone would need them.
 LAZY = {
-    "player": {"numba", "PIL", "onnxruntime", "viser", "av", "distributed"},
+    "player": {"numba", "PIL", "onnxruntime", "viser", "websockets", "msgspec", "av", "distributed"},
     "exporters": {
         *("onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL", "OpenEXR", "open3d", "pxr", "xatlas"),
     },
@@ -50,6 +50,8 @@ TOP_LEVEL_EXCEPTIONS = {
         )
     ),
     ("vfr_bake/options.py", "tyro"),
+    ("player/viewer/guard.py", "websockets"),
+    ("player/viewer/messages.py", "msgspec"),
 }
 
 MODULES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))

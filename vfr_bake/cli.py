@@ -1,7 +1,7 @@
 """`vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench`: settings from the command line, bars on stderr,
 results on stdout.
 
-Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C.
+Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C, 141 output that nobody reads.
 """
 
 from __future__ import annotations
