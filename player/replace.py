@@ -44,7 +44,7 @@ _RENAME_SWAP = 2  # macOS: sys/stdio.h
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Nobody clears up in `folder` while the block writes there; its renames are on the disk when it ends.
+    """Nobody clears up in `folder` while the block writes there.
 
     What an earlier process left there is cleared up when this process first comes to the folder.
     """
@@ -54,8 +54,6 @@ def held(folder: Path) -> Iterator[None]:
         if handle is not None:
             _lock(handle, alone=False)
         yield
-        if handle is not None:
-            sync(handle)
     finally:
         if handle is not None:
             os.close(handle)
@@ -96,7 +94,8 @@ def _clear_up(path: Path, alone: bool) -> None:
 
 
 def put_folder(new: Path, path: Path) -> None:
-    """Give the folder `new` the name `path`. What had that name is removed, or has the name `new` afterwards.
+    """Give the folder `new` the name `path`. What had that name is removed, or has the name `new` afterwards;
+    the names are on the disk before anything is removed.
 
     Raises OSError: the old one is still there. OutputError: it is under another name, which is said.
     """
@@ -104,6 +103,7 @@ def put_folder(new: Path, path: Path) -> None:
         new.replace(path)
         return
     if exchange(new, path):
+        sync(path.parent)
         return
     aside = path.with_name(f".{path.name}.replaced")
     remove(aside)
@@ -114,6 +114,7 @@ def put_folder(new: Path, path: Path) -> None:
         if not path.exists():
             _restore(aside, path)
         raise
+    sync(path.parent)
     remove(aside)
 
 
@@ -163,6 +164,7 @@ def put_together(new: Path, name: str) -> None:
             if not together.is_dir() or not tries_left:
                 raise
             move_out(together)  # of another process that writes the same: its files, then ours
+    sync(together.parent)
     move_out(together)
 
 
@@ -193,21 +195,19 @@ def remove(path: Path) -> None:
             path.unlink()
 
 
-def sync(path: Path | int) -> None:
+def sync(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk; Windows has no such thing for folders."""
-    if isinstance(path, int):
-        try:
-            os.fsync(path)
-        except OSError as error:
-            if error.errno not in _NO_SYNC:
-                raise
+    is_folder = path.is_dir()
+    handle = _opened(path) if is_folder else os.open(path, os.O_RDWR)
+    if handle is None:
         return
-    handle = _opened(path) if path.is_dir() else os.open(path, os.O_RDWR)
-    if handle is not None:
-        try:
-            sync(handle)
-        finally:
-            os.close(handle)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if not is_folder or error.errno not in _NO_SYNC:
+            raise
+    finally:
+        os.close(handle)
 
 
 def sync_all(folder: Path) -> None:

@@ -14,8 +14,18 @@ REPOSITORY = Path(__file__).resolve().parent.parent.parent
 
 def run(module: str, *arguments: str) -> dict[str, Any]:
     """In a process of its own: what is fuzzed may crash, and forks want a process without threads."""
-    command = [sys.executable, "-m", module, *arguments]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
+    return _answer("-m", module, *arguments)
+
+
+def run_program(program: str, *arguments: str) -> dict[str, Any]:
+    """The same with the text of a program."""
+    return _answer("-c", program, *arguments)
+
+
+def _answer(*command: str) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, *command], cwd=REPOSITORY, capture_output=True, text=True, timeout=600
+    )
     assert done.stdout, done.stderr[-2000:]
     return json.loads(done.stdout)
 
