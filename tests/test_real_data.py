@@ -59,7 +59,9 @@ def test_the_frames_look_like_the_photographs(out: Path, lego_400: Path) -> None
         frame = np.asarray(Image.open(out / "frames" / f"{name}.png"))
         photograph = np.asarray(Image.open(lego_400 / "test" / f"{name}.png"))
         assert frame.shape == (400, 400, 3)
-        assert psnr(frame / 255, over_background(photograph, np.ones(3))) > 19
+        assert psnr(frame / 255, over_background(photograph, np.ones(3))) > 21, (
+            "21.8 and 22.3 where it was measured"
+        )
 
 
 def test_the_bake_loses_little(out: Path, lego_400: Path) -> None:
@@ -71,7 +73,7 @@ def test_the_bake_loses_little(out: Path, lego_400: Path) -> None:
         frame = np.asarray(Image.open(out / "frames" / f"{name}.png"))
         photograph = np.asarray(Image.open(lego_400 / "test" / f"{name}.png"))
         played = psnr(frame / 255, over_background(photograph, np.ones(3)))
-        assert played > full[f"./test/{name}"] - 0.5
+        assert played > full[f"./test/{name}"] - 0.2, "0.05 and -0.02 dB are lost"
 
 
 def test_the_report_of_playing_is_complete(out: Path) -> None:

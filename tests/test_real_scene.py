@@ -14,7 +14,9 @@ from player.asset import Asset
 from player.cli import main as play
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
+from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
+from vfr_bake.training.model_file import load_model
 
 TRAIN = [
     *(
@@ -61,11 +63,15 @@ def test_a_played_training_view_is_the_photograph_nearly_as_well_as_the_model_kn
     photograph = load_scene(fox, downscale=8).train.images[0][..., :3] / 255
     frame = np.asarray(Image.open(out / "view.png").convert("RGB")) / 255
     assert frame.shape == photograph.shape
-    known = json.loads((out / "train.json").read_text())["training_psnr"]
-    assert psnr(frame, photograph) > max(known - 3, 17)
+    model = load_model(out / "model.pt")
+    full = render_image(model.field, model.sampler, model.model_cameras()[0], model.background)
+    # The model knows the view to 20.8 dB after so few steps, and 0.3 dB are lost.
+    assert psnr(full, photograph) > 20
+    assert psnr(frame, photograph) > psnr(full, photograph) - 0.6
 
 
 def test_the_bake_says_what_it_lost(out: Path) -> None:
     figures = json.loads((out / "bake.json").read_text())
-    assert figures["psnr_to_full_model"] > 24
+    assert figures["psnr_to_full_model"] > 28.5, "29.9 where it was measured"
+    assert 0 < figures["expected_loss_db"] < 0.7, "0.47"
     assert {"grid", "files"} <= {stage["name"] for stage in figures["stages"]}

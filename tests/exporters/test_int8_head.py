@@ -122,7 +122,7 @@ def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None
     for number, (low, high) in enumerate(ranges):
         assert low <= 0 < high
         inside = ((found[number] >= low) & (found[number] <= high)).mean()
-        assert 0.9995 < inside < 1, "the rare largest ones would make every step coarser"
+        assert 0.9995 < inside < 0.99996, "the rare largest ones would make every step coarser"
         assert high < found[number].max() and low > found[number].min() - 5e-4, "within the tanh form of GELU"
 
 

@@ -79,7 +79,8 @@ class Steps:
             if step == N_WARM:
                 begin = time.monotonic()
             elif step == N_WARM + N_TIMED:
-                pace = (time.monotonic() - begin) / N_TIMED
+                # A clock may stand still for as long as 16 ms.
+                pace = max(time.monotonic() - begin, 1e-9) / N_TIMED
                 self.n = max(int(min(self.n, self._seconds / pace)), step)
             if step % 50 == 0 or step == self.n:
                 self._progress(step, self.n)
