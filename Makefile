@@ -86,9 +86,10 @@ fuzz: $(VENV)/.dev  ## a million broken inputs to every reader
 
 kill: $(VENV)/.dev  ## commands that are killed, that share an output, whose disk is full
 	$(BIN)/python -m tests.reliability.kill --runs 200
+	$(BIN)/python -m tests.reliability.every_call
 
 mutations: $(VENV)/.dev system-libraries other-programs  ## faults put into the source that the tests must notice
-	$(BIN)/python -m tests.reliability.mutate --n 60
+	$(BIN)/python -m tests.reliability.mutate --count 60
 
 processors: $(VENV)/.dev  ## the compiled player as on older processors
 	$(BIN)/python -m tests.reliability.processors
