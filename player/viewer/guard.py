@@ -31,7 +31,7 @@ from websockets.http11 import Request, Response
 from player.errors import MissingExtraError
 from player.viewer.messages import CAMERA_FIELDS, MAX_BYTES, UPDATE_FIELDS, Check, cleaned
 
-MOST_CLIENTS = 16
+MOST_CLIENTS = 24
 MOST_SOCKETS = 128
 """Open connections, with those that have not yet asked for anything."""
 CAMERA_SECONDS = 1 / 60

@@ -90,12 +90,14 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
 
 
 def _patiently(what):
-    """The server takes a while to start."""
+    """The server takes a while to start, and to notice who is gone without a word."""
+    from websockets.exceptions import InvalidStatus
+
     until = time.monotonic() + 120
     while True:
         try:
             return what()
-        except OSError:
+        except (OSError, InvalidStatus):
             if time.monotonic() > until:
                 raise
             time.sleep(0.5)

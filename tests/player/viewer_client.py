@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -160,11 +160,17 @@ class Client:
                 return message["rgb_data"]
         raise AssertionError("no picture")
 
-    def sizes(self, seconds: float) -> list[str]:
-        """Sizes of the pictures that come until there is none for some time."""
-        updates = (m["updates"] for m in self.messages(seconds) if m["type"] == "GuiUpdateMessage")
-        states = (str(update.get("value")) for update in updates)
-        return [state.split(",")[0] for state in states if re.match(r"\d+x\d+,", state)]
+    def sizes(self, last: Callable[[int, int], object]) -> list[tuple[int, int]]:
+        """Sizes of the pictures that come, up to one that is the last."""
+        sizes = []
+        for message in self.messages():
+            state = message["updates"].get("value") if message["type"] == "GuiUpdateMessage" else None
+            found = re.match(r"(\d+)x(\d+),", str(state))
+            if found:
+                sizes.append((int(found[1]), int(found[2])))
+                if last(*sizes[-1]):
+                    return sizes
+        raise AssertionError(f"no picture of the size, but {sizes}")
 
 
 def still_serves(server: Server) -> None:
