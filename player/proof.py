@@ -21,24 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from player.child import python_command
 from player.compiling import SOURCES, available, first_use, not_kept
 
 RIGHT, WRONG = "right", "wrong: "
 DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
 """What ends a process that runs wrong code; anything else says nothing about the code."""
-CHILD = """
-import importlib.util, sys
-where = sys.argv[1]
-spec = importlib.util.spec_from_file_location(
-    "player", where + "/__init__.py", submodule_search_locations=[where]
-)
-sys.modules["player"] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(sys.modules["player"])
-from player.proof import verdict
-print(verdict())
-"""
-"""It takes no module from the current folder, and the player from where it is running."""
-
 _verdicts: dict[Path | None, str] = {}
 
 
@@ -88,13 +76,12 @@ def _record() -> Path | None:
 
 def _asked(say: Any) -> str | None:
     """The verdict of a process of its own; None if it could not say."""
-    if not sys.executable:
-        return None
     if first_use() and sys.stderr.isatty():
         say("compiling for this processor: up to a minute, once")
-    command = [sys.executable, "-I", "-c", CHILD, str(SOURCES)]
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+        done = subprocess.run(
+            python_command("player.proof"), stdin=subprocess.DEVNULL, capture_output=True, text=True
+        )
     except OSError:
         return None
     found = (done.stdout.strip().splitlines() or [""])[-1]
@@ -165,3 +152,7 @@ def _rays() -> tuple[np.ndarray, np.ndarray]:
     rays_d = 0.3 * np.stack([np.sin(angle * 3), np.cos(angle * 5), np.sin(angle * 2)], axis=-1) - rays_o
     rays_d /= np.linalg.norm(rays_d, axis=-1, keepdims=True)
     return rays_o.astype(np.float32), rays_d.astype(np.float32)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(verdict() + "\n")

@@ -268,7 +268,8 @@ def test_progress_on_a_terminal(
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr("player.compiling.first_use", lambda: first)
+    monkeypatch.setattr("player.proof.first_use", lambda: first)
+    monkeypatch.setattr("player.proof._known", lambda: None)  # on a machine that has compiled nothing yet
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o"), "--frames", ":2"]) == 0
     shown = terminal.getvalue()
     assert "frame 2/2" in shown and ("compiling for this processor" in shown) == first

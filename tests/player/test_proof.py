@@ -32,6 +32,10 @@ def nothing_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[N
     kept_code.place.cache_clear()
 
 
+def child_runs(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    monkeypatch.setattr(proof, "python_command", lambda _: [sys.executable, "-I", "-c", program])
+
+
 def lines() -> list[str]:
     said: list[str] = []
     proof.prove(said.append)
@@ -40,26 +44,11 @@ def lines() -> list[str]:
 
 def test_this_machine_s_code_is_right_and_asked_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert proof.verdict() == proof.RIGHT
-    monkeypatch.setattr(proof, "CHILD", f"print({proof.RIGHT!r})")
+    child_runs(monkeypatch, f"print({proof.RIGHT!r})")
     assert lines() == [] and not proof.refuted()
-    monkeypatch.setattr(proof, "CHILD", DIES)
+    child_runs(monkeypatch, DIES)
     monkeypatch.setattr(proof, "_verdicts", {})  # another process
     assert lines() == [] and not proof.refuted()
-
-
-def test_the_process_of_its_own_finds_the_player_and_nothing_beside_it(tmp_path: Path) -> None:
-    """Files of the current folder, and of the player's, are not taken for modules that it imports."""
-    for name in ("numba", "numpy", "player", "cameras"):
-        (tmp_path / f"{name}.py").write_text("raise SystemExit('taken')")
-    command = [
-        sys.executable,
-        "-I",
-        "-c",
-        proof.CHILD.replace("print(verdict())", "import cameras"),
-        str(proof.SOURCES),
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert "No module named 'cameras'" in done.stderr
 
 
 @pytest.mark.parametrize(("child", "reason"), [(DIES, "SIGABRT"), (WRONG, "2 where 6 is right")])
@@ -67,7 +56,7 @@ def test_wrong_code_is_left(
     child: str, reason: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
     shells_folder: Path, tmp_path: Path,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(proof, "CHILD", child)
+    child_runs(monkeypatch, child)
     asset = Asset.open(shells_folder)
     camera = read_cameras(shells_folder / "cameras.json")[0]
     with Renderer(asset) as renderer:
@@ -84,7 +73,7 @@ def test_wrong_code_is_left(
         assert np.abs(renderer.render(camera).rgb - expected.rgb).max() < 1 / 255
     with pytest.raises(MissingExtraError, match="got some that does not"):
         choose_march("numba")
-    monkeypatch.setattr(proof, "CHILD", "raise SystemExit('asked again')")
+    child_runs(monkeypatch, "raise SystemExit('asked again')")
     monkeypatch.setattr(proof, "_verdicts", {})
     assert len(lines()) == 1 and proof.refuted()
 
@@ -95,7 +84,7 @@ def test_wrong_code_is_left(
 def test_a_process_that_could_not_say_anything_says_nothing(
     child: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proof, "CHILD", child)
+    child_runs(monkeypatch, child)
     assert lines() == [] and not proof.refuted() and not proof._verdicts
     assert choose_march("auto") == ("numba", march_compiled)
 
@@ -119,13 +108,15 @@ def test_a_bake_asks_before_it_begins(
     from vfr_bake.training import model_file
 
     plan = SimpleNamespace(n_bytes=1, resolution=1, feature_resolution=1, n_cells=1, n_rays=lambda n: n)
-    monkeypatch.setattr(proof, "CHILD", DIES)
-    monkeypatch.setattr(model_file, "load_model", lambda path: None)
+    child_runs(monkeypatch, DIES)
+    monkeypatch.setattr(model_file, "load_model", lambda *_: None)
     monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)
     monkeypatch.setattr(estimate, "make_plan", lambda *_: plan)
     monkeypatch.setattr(estimate, "expected_seconds", lambda *_: 1.0)
     monkeypatch.setattr(bake, "bake", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    options = SimpleNamespace(asset=tmp_path / "asset", model=None, config=None, force=False)
+    options = SimpleNamespace(
+        asset=tmp_path / "asset", model=None, config=SimpleNamespace(max_memory=None), force=False
+    )
     with pytest.raises(KeyboardInterrupt):
         cli._bake(options)
     assert "vfr-bake: compiled code does not run on this processor (SIGABRT)" in capfd.readouterr().err
@@ -168,7 +159,7 @@ if os.name == "posix":
     def test_a_folder_that_others_may_write_to_is_named(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(proof, "CHILD", f"print({proof.RIGHT!r})")
+        child_runs(monkeypatch, f"print({proof.RIGHT!r})")
         (tmp_path / "told").mkdir()
         (tmp_path / "told").chmod(0o777)
         (line,) = lines()
