@@ -268,8 +268,10 @@ def test_progress_on_a_terminal(
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
+    child = [sys.executable, "-I", "-c", "print('right')"]
+    monkeypatch.setattr("player.proof._record", lambda: tmp_path / "proof.txt")
+    monkeypatch.setattr("player.proof.python_command", lambda _: child)
     monkeypatch.setattr("player.proof.first_use", lambda: first)
-    monkeypatch.setattr("player.proof._known", lambda: None)  # on a machine that has compiled nothing yet
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o"), "--frames", ":2"]) == 0
     shown = terminal.getvalue()
     assert "frame 2/2" in shown and ("compiling for this processor" in shown) == first

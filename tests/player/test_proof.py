@@ -18,6 +18,7 @@ from player.cli import main
 from player.errors import MissingExtraError
 from player.render import Renderer, choose_march
 from player.transforms import read_cameras
+from tests.player.test_march import random_rays
 
 DIES = "import os; os.abort()"
 WRONG = "print('wrong: 2 where 6 is right')"
@@ -120,6 +121,21 @@ def test_a_bake_asks_before_it_begins(
     with pytest.raises(KeyboardInterrupt):
         cli._bake(options)
     assert "vfr-bake: compiled code does not run on this processor (SIGABRT)" in capfd.readouterr().err
+
+
+def test_a_bake_measures_with_numpy_where_compiled_code_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, shells_folder: Path
+) -> None:
+    from vfr_bake.baking.loss import HeldOut
+
+    monkeypatch.setattr(proof, "CHILD", WRONG)
+    assert len(lines()) == 1
+    views = object.__new__(HeldOut)
+    views.rays_o, views.rays_d = random_rays(20)
+    grid = Asset.open(shells_folder).grid
+    np.testing.assert_array_equal(
+        views.march(grid, 3).features, march.march(grid, views.rays_o, views.rays_d, 3).features
+    )
 
 
 def careless(module: Any, name: str, change: Any, monkeypatch: pytest.MonkeyPatch) -> None:

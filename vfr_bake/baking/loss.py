@@ -106,7 +106,7 @@ class HeldOut:
 
     def march(self, grid: SparseGrid, n_samples: int) -> MarchResult:
         """What the rays compose as played."""
-        return choose_march("numba", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_samples)
+        return choose_march("auto", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_samples)
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""
