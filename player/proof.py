@@ -76,6 +76,8 @@ def _record() -> Path | None:
 
 def _asked(say: Any) -> str | None:
     """The verdict of a process of its own; None if it could not say."""
+    if getattr(sys, "frozen", False):  # that is no Python that could be asked
+        return None
     if first_use() and sys.stderr.isatty():
         say("compiling for this processor: up to a minute, once")
     try:
@@ -102,8 +104,7 @@ def _deadly(code: int) -> str | None:
     """What ended a process, if that is what wrong code does."""
     if sys.platform == "win32":
         return f"exit code {code:#x}" if code == 3 or code >= 0xC0000000 else None
-    name = signal.Signals(-code).name if code < 0 else None
-    return name if name in DEADLY else None
+    return next((name for name in DEADLY if getattr(signal, name, None) == -code), None)
 
 
 def verdict() -> str:

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from numba.core import registry
 
 from player import compiling, kept_code
 from player.kept_code import N_KEPT, Place, place, sources_digest
+from player.processor import target
 
 USER = """
 import sys
@@ -177,6 +179,15 @@ def test_first_use_is_known_by_what_is_kept(fresh: Path) -> None:
     assert folder is not None and folder.parent == fresh / "__pycache__"
     (folder / "player.march_compiled._march_rays-33.py311.nbi").touch()
     assert not compiling.first_use() and compiling.not_kept() is None
+
+
+def test_code_for_one_processor_is_not_run_as_another_s() -> None:
+    """Its name and what it has are in the keys of the index, and with them how long vectors are."""
+    from player.march_compiled import _march_rays
+
+    codegen: Any = registry.cpu_target.target_context
+    dispatcher: Any = _march_rays
+    assert dispatcher._cache._index_key((), codegen.codegen())[1] == target()
 
 
 def test_old_code_is_removed(fresh: Path) -> None:
