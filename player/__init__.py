@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,10 @@ try:
     __version__ = version("vfr-bake")
 except PackageNotFoundError:  # the folder alone, copied somewhere: it works there too
     __version__ = "0"
+
+# onnxruntime from 1.31 on looks up and calls its maker's server, also on Linux, unless this is set before its
+# first session; its own function that says so comes too late.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = ["Asset", "Camera", "Frame", "Renderer", "__version__"]
 
