@@ -102,7 +102,7 @@ def _read_box(path: Path) -> CropBox:
 def _array(path: Path, document: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.array(document[key], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.full(1, np.nan)
     if array.shape != shape or not np.isfinite(array).all():
         raise FormatError(f"{path}: {key}: expected {list(shape)} finite numbers, got {document[key]!r:.60}")

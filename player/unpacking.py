@@ -218,6 +218,8 @@ def check_bricks(coords: np.ndarray, masks: np.ndarray, names: Names, resolution
     n = bricks_per_axis(resolution)
     if (coords >= n).any():
         raise FormatError(f"{where}{PLACES[names[0]]}: expected coordinates below {n}, got {coords.max()}")
+    if names is FEATURES and not masks.any():  # every sample that counts is given a feature
+        raise FormatError(f"{where}{PLACES[names[1]]}: expected at least one stored vertex, got none")
     last = resolution - 8 * (n - 1)  # the grid's last vertex in a brick at its edge
     beyond = np.zeros((3, 8), np.uint64)  # bits of vertices behind it, along x, y, z
     bits = np.arange(512)

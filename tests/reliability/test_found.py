@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 import struct
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,11 +17,15 @@ import numpy as np
 import pytest
 import torch
 
+from exporters.crop import parse_crop
+from player.asset import Asset
 from player.errors import ConfigError, FormatError
 from player.manifest import NAME, parse_manifest
+from player.packing import pack_codes, pack_masks
 from player.transforms import parse_transforms, transforms_cameras
 from player.unpacking import read_coords
-from tests.player.conftest import cameras_bytes
+from tests.player.conftest import cameras_bytes, head_bytes
+from tests.reliability.hostile_files import vouch
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
@@ -31,6 +39,12 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = transforms_cameras(parse_transforms(cameras_bytes(), "cameras"), "cameras")
     save_model(path, Model(field, OccupancyGrid(8, 0.2, seed=0), np.eye(4), cameras, False, {}, {}))
     return path
+
+
+@pytest.fixture
+def broken(shells_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the asset, to be broken by the test."""
+    return Path(shutil.copytree(shells_folder, tmp_path / "broken"))
 
 
 def test_a_npy_header_that_never_ends() -> None:
@@ -58,6 +72,27 @@ def test_tensors_where_a_model_has_plain_values(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected the settings") as refused:
         field_config_from({1: 2, "b": torch.zeros(3, 3)}, "model.pt: field")
     assert "\n" not in str(refused.value)
+
+
+def test_an_asset_without_a_feature(broken: Path) -> None:
+    """Rays that hit something found no row to take."""
+    asset = Asset.open(broken)
+    a = asset.arrays
+    for name, data in (
+        ("feature_masks.bits", pack_masks(np.zeros_like(a.feature_masks))),
+        ("features.codes", pack_codes(a.features[:0])),
+    ):
+        (broken / name).write_bytes(data)
+    vouch(broken)
+    with pytest.raises(FormatError, match=r"feature_masks\.bits: expected at least one stored vertex"):
+        Asset.open(broken)
+
+
+def test_a_box_of_huge_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "box.json"
+    path.write_text(json.dumps({"centre": [10**400, 0, 0], "size": [1, 1, 1]}))
+    with pytest.raises(FormatError, match=r"centre: expected \[3\] finite numbers"):
+        parse_crop(str(path))
 
 
 def test_an_angle_below_every_number() -> None:
@@ -92,3 +127,19 @@ def test_values_of_a_model_that_are_none_of_ours(
     with pytest.raises(FormatError, match=message) as caught:
         load_model(path)
     assert len(str(caught.value)) < 300 and "\n" not in str(caught.value)
+
+
+def test_onnxruntime_calls_nobody(tmp_path: Path) -> None:
+    """From 1.31 on it had a thread that looked up its maker's server, and called it."""
+    (tmp_path / "head.onnx").write_bytes(head_bytes(4))
+    code = (
+        "import os, sys, time; from pathlib import Path; from player.head import Head\n"
+        f"Head(Path({str(tmp_path / 'head.onnx')!r}), 4); time.sleep(0.5)\n"
+        "print('onnxruntime' in sys.modules, len(os.listdir('/proc/self/task')))"
+    )
+    alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment | alone
+    )
+    assert done.stdout == "True 1\n", done.stdout + done.stderr

@@ -1,0 +1,168 @@
+"""The process that is given the inputs: it may crash, and what it was at is known.
+
+    python -m tests.reliability.fuzz_worker WORK SEED FIRST STEP N NAMES...
+
+Reads the inputs FIRST, FIRST + STEP, ... below N. Writes to WORK/state where it is, and what became of the
+inputs before, and a line of JSON to stdout for each failure.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporters.mesh import TriangleMesh
+from exporters.ply import ply_bytes
+from player.errors import VfrError
+from tests.player.conftest import cameras_bytes, head_bytes
+from tests.reliability.fuzz_assets import BrokenAsset, asset_targets, whole_asset
+from tests.reliability.fuzz_data import camera_targets, colmap_targets, model_target, picture_target
+from tests.reliability.fuzz_heads import head_targets
+from tests.reliability.fuzz_targets import Target, written
+
+LIMIT_SECONDS = 20.0
+ROOM = 3 << 30
+N_FIRST = 12
+"""Inputs that each reader is given before anybody watches."""
+MARK = "/vfr-fuzz-input/"
+"""What is opened, and not there, before and behind each input: a trace of the system calls shows it."""
+INDEX, SLOWEST_US, COUNTS = 0, 1, 2
+"""Places in the state: the input, microseconds of the slowest, then for each target refused and read."""
+
+
+class SlowError(BaseException):
+    """An input took longer than LIMIT_SECONDS; not an Exception, so that no reader swallows it."""
+
+
+class Watch:
+    """What is opened and started by Python while a reader works."""
+
+    def __init__(self, inside: Path) -> None:
+        self.wrong: list[str] = []
+        self.on = False
+        self._inside = str(inside)
+        sys.addaudithook(self._hear)
+
+    def _hear(self, event: str, arguments: tuple) -> None:
+        if not self.on:
+            return
+        if event == "open" and isinstance(arguments[0], str | bytes):
+            name = os.fsdecode(arguments[0])
+            if not allowed(name, self._inside):
+                self.wrong.append(f"opened {name!r}")
+        elif event in ("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "pickle.find_class",
+                       "socket.connect"):  # fmt: skip
+            self.wrong.append(f"{event} {arguments[:1]!r}")
+
+
+INSTALLED = tuple(
+    {sys.prefix, sys.base_prefix, str(Path(np.__file__).parent.parent), str(Path(__file__).parents[2])}
+)
+SYSTEM = ("/lib", "/usr/lib", "/etc/ld.so", "/etc/localtime", "/sys/", "/proc/self/cgroup", "/proc/self/maps",
+          "/proc/self/statm", "/proc/stat", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys/vm/", "/dev/urandom",
+          MARK)  # fmt: skip
+
+
+def allowed(name: str, inside: str) -> bool:
+    """Whether a reader may open a file of this name: what is installed, what the system has, the work
+    folder."""
+    name = re.sub(r"^/proc/\d+/", "/proc/self/", name)
+    return not name.startswith("/") or name.startswith((inside, *INSTALLED, *SYSTEM))
+
+
+def targets(work: Path) -> list[Target]:
+    """All of them, with their files in `work`."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    mesh = TriangleMesh(
+        corners, np.array([[0, 1, 2]], np.int32), np.eye(3, dtype=np.float32), np.full((3, 4), 255, np.uint8)
+    )
+    head = head_bytes()
+    whole = whole_asset(work / "whole", head, ply_bytes(mesh), cameras_bytes(2))
+    return [
+        *asset_targets(BrokenAsset(whole, work / "asset")),
+        *camera_targets(work),
+        *colmap_targets(work),
+        *head_targets(work, head),
+        picture_target(work),
+        model_target(work),
+    ]
+
+
+def outcome(target: Target) -> str:
+    """ "refused" by a VfrError of one line, "read", or what went wrong."""
+    signal.setitimer(signal.ITIMER_REAL, LIMIT_SECONDS)
+    try:
+        target.read()
+    except VfrError as error:
+        text = str(error)
+        return "refused" if "\n" not in text and len(text) < 3000 else f"not one short line: {text[:200]!r}"
+    except SlowError:
+        return f"over {LIMIT_SECONDS:g} s"
+    except BaseException as error:
+        return f"{type(error).__name__}: {str(error)[:200]}"
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    return "read"
+
+
+def _too_slow(*_: object) -> None:
+    raise SlowError
+
+
+def _mark(text: str) -> None:
+    try:
+        os.open(f"{MARK}{text}", os.O_RDONLY)
+    except OSError:
+        pass
+
+
+def main(work: Path, seed: int, first: int, step: int, n_inputs: int, names: list[str]) -> None:
+    """Read them all."""
+    chosen = [target for target in targets(work) if not names or target.name in names]
+    written(work / "targets.part", json.dumps([target.name for target in chosen]).encode()).replace(
+        work / "targets.json"
+    )
+    state = np.memmap(work / "state", np.int64, "r+")
+    watch = Watch(work)
+    signal.signal(signal.SIGALRM, _too_slow)
+    for target in chosen:  # what is imported or compiled when first used is so now
+        for index in range(N_FIRST):
+            target.prepare(np.random.default_rng([index]))
+            outcome(target)
+    if sys.platform == "linux":
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, resource.RLIM_INFINITY))
+    for index in range(first, n_inputs, step):
+        which = index % len(chosen)
+        target = chosen[which]
+        state[INDEX] = index
+        target.prepare(np.random.default_rng([seed, index]))
+        start = time.process_time()
+        _mark(f"{index}")
+        watch.on = True
+        what = outcome(target)
+        watch.on = False
+        _mark("end")
+        state[SLOWEST_US] = max(int(state[SLOWEST_US]), int(1e6 * (time.process_time() - start)))
+        if watch.wrong:
+            what, watch.wrong = "; ".join(watch.wrong[:3]), []
+        if what in ("refused", "read"):
+            state[COUNTS + 2 * which + (what == "read")] += 1
+        else:
+            report: dict[str, Any] = {"index": index, "target": target.name, "what": what}
+            sys.stdout.write(json.dumps(report) + "\n")
+            sys.stdout.flush()
+    state[INDEX] = n_inputs
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:6]), sys.argv[6:])
