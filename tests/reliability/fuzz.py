@@ -104,7 +104,9 @@ class Worker:
         errors: list[str] = []
         listener = threading.Thread(target=lambda: errors.extend(process.stderr or []), daemon=True)
         listener.start()
-        self.failures += [json.loads(line) for line in process.stdout if line.startswith("{")]
+        for line in process.stdout:  # one by one: they are looked at meanwhile
+            if line.startswith("{"):
+                self.failures.append(json.loads(line))
         code = process.wait()
         listener.join(5)
         if trace is not None:
