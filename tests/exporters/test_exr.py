@@ -20,6 +20,8 @@ from player.march import MIN_OPACITY
 from player.render import Frame, Renderer
 from player.transforms import read_cameras
 
+SRGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+"""Of linear sRGB, as IEC 61966-2-1 has it, to four digits."""
 LAYERS = [
     *("R", "G", "B", "A", "Z", "distance.V", "position.X", "position.Y", "position.Z"),
     *("normal.X", "normal.Y", "normal.Z", "opacity.V", "samples.V"),
@@ -184,3 +186,11 @@ def test_what_a_full_disk_and_no_openexr_say(
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(MissingExtraError, match=r"needs OpenEXR: pip install 'vfr-bake\[export\]'"):
         write_exr(tmp_path / "a.exr", channels, header)
+
+
+def test_the_primaries_are_those_of_srgb(camera: Camera) -> None:
+    """White and the three colours' x, y give the matrix from linear RGB to XYZ, which the standard has."""
+    xy = np.array(exr_header(camera)["chromaticities"]).reshape(4, 2)
+    xyz = np.stack([xy[:, 0], xy[:, 1], 1 - xy.sum(axis=1)], axis=0) / xy[:, 1]
+    scales = np.linalg.solve(xyz[:, :3], xyz[:, 3])
+    np.testing.assert_allclose(xyz[:, :3] * scales, SRGB_TO_XYZ, rtol=0, atol=6e-5)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from player.asset import Asset
 from player.errors import TrainingError
-from vfr_bake.baking import pace
+from vfr_bake.baking import estimate, pace
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.estimate import N_RAYS, expected_seconds, make_plan
+from vfr_bake.baking.estimate import MESH_SECONDS, N_RAYS, expected_seconds, make_plan
 from vfr_bake.baking.pace import keep_to_time
 from vfr_bake.baking.presets import PRESETS
 from vfr_bake.config import BakeConfig
@@ -85,6 +86,34 @@ def test_less_memory_means_fewer_rays(model: Model) -> None:
     assert rays[0] < rays[1] < rays[2] == N_RAYS
     assert plans[1].n_rays(plans[1].most_cells) < rays[1]  # the more cells, the fewer rays
     assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, (0.9, 1.2, 4.0), strict=True))
+
+
+@pytest.mark.parametrize("steps", [0, 5000])
+def test_the_expected_time_follows_from_that_of_the_models_own_rays(
+    steps: int, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock of the test's own, which moves on while the model answers. The first answer, which may wait
+    for a compiler, does not count; what follows is in proportion, beside the mesh's own time."""
+
+    def expected(*answers: float) -> float:
+        left, now = list(answers), 0.0
+
+        def answer(*_: object) -> None:
+            nonlocal now
+            now += left.pop(0)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(estimate, "time", SimpleNamespace(perf_counter=lambda: now))
+            patch.setattr(type(model.sampler), "composited_features", answer)
+            found = expected_seconds(model, config, plan)
+        assert not left
+        return found
+
+    config = BakeConfig(**(SMALL | {"refine_steps": steps}))
+    plan = make_plan(model, config)
+    slow, once = expected(0.02, 0.02), expected(0.01, 0.01)
+    assert expected(100.0, 0.01) == pytest.approx(once, rel=1e-9)
+    assert slow - MESH_SECONDS == pytest.approx(2 * (once - MESH_SECONDS), rel=1e-9) and once > MESH_SECONDS
 
 
 def test_more_work_is_expected_to_take_longer(model: Model) -> None:

@@ -92,6 +92,20 @@ def test_cells_are_where_intervals_weigh() -> None:
     assert marked(0.95) == []
 
 
+def test_cells_of_every_ray_are_marked() -> None:
+    """Rays along x, one in each row of cells, with one heavy interval each in the cell of their number."""
+    n = 12
+    rays_o = np.zeros((n, 3), np.float32)
+    rays_o[:, 1] = (np.arange(n) - 8 + 0.5) / 16
+    rays_d = np.tile(np.float32([1, 0, 0]), (n, 1))
+    t_mid = ((np.arange(n) % 4 + 0.5) / 16).astype(np.float32)
+    deltas, weights = np.full(n, 0.01, np.float32), np.full(n, 0.5, np.float32)
+    visible = np.zeros((64, 64, 64), np.uint8)
+    starts, counts = np.arange(n), np.ones(n, np.int64)
+    mark_weighty_cells(rays_o, rays_d, t_mid, deltas, weights, starts, counts, np.float32(0.1), visible)
+    assert np.argwhere(visible).tolist() == sorted([32 + i % 4, 24 + i, 32] for i in range(n))
+
+
 def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
     cells = weighty_cells(model, 64, 0.01, quiet)
     assert 0.0005 < cells.mean() < 0.2

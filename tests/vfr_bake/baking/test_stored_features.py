@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
-from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
+from vfr_bake.kernels.stored_features import BLOCK, compose, descend, descend_density, slants, weigh
 
 
-def test_density_gradient_is_that_of_the_composite() -> None:
+@pytest.mark.parametrize("n", [1, 40, BLOCK, BLOCK + 1])
+def test_density_gradient_is_that_of_the_composite(n: int) -> None:
     # Against torch, on whole codes. Adagrad that has seen very steep slopes moves by rate * gradient / 1e15.
     random = np.random.default_rng(0)
-    n, n_vertices, n_densities, k = 40, 200, 300, 6
+    n_vertices, n_densities, k = 200, 300, 6
 
     def corners(n_rows: int) -> tuple[np.ndarray, np.ndarray]:
         shares = random.random((n * k, 8)).astype(np.float32)
@@ -33,9 +35,12 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     delta = (torch.exp(float(low) + float(slope) * code) * torch.from_numpy(lengths)).reshape(n, k)
     before = torch.cumsum(delta, dim=1) - delta
     w = torch.exp(-before) * -torch.expm1(-delta)
+    composed = np.empty((n, 3), np.float32)
+    compose(starts, rows, shares, weights, values, composed)
     np.testing.assert_allclose(weights.reshape(n, k), w.detach().numpy(), atol=1e-6)
     f = (torch.from_numpy(values)[rows.astype(int)] * torch.from_numpy(shares)[..., None]).sum(dim=1).double()
     x = (w[..., None] * f.reshape(n, k, 3)).sum(dim=1)
+    np.testing.assert_allclose(composed, x.detach().numpy(), rtol=0, atol=2e-4)
     total = 1 - torch.exp(-delta.sum(dim=1))
     np.testing.assert_allclose(opacity, total.detach().numpy(), atol=1e-6)
     ((x * torch.from_numpy(gx)).sum() + (total * torch.from_numpy(ga)).sum()).backward()
@@ -51,7 +56,32 @@ def test_density_gradient_is_that_of_the_composite() -> None:
     descend_density(*of_densities, found, np.float32(1e13), 2, moved, steepness)
     moved = (density - moved) * 100
     wanted = latent.grad.numpy()
-    np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
+    # Codes from 128 on are rounded to 2^-16 where they have moved.
+    np.testing.assert_allclose(moved, wanted, rtol=0, atol=0.02 * np.abs(wanted).max() + 100 * 2**-17)
+
+
+def test_a_step_of_the_features_is_adagrad() -> None:
+    """Against a loop in float64, fetch after fetch: steps that stay inside -127..127, and that leave it."""
+    random = np.random.default_rng(3)
+    starts = np.array([0, 2, 3, 7])
+    rows = random.integers(0, 12, (7, 8)).astype(np.int32)
+    shares, weights = random.random((7, 8)).astype(np.float32), random.random(7).astype(np.float32)
+    gradient = random.normal(size=(3, 2)).astype(np.float32)
+    shares[random.random((7, 8)) < 0.2] = 0
+    start = random.uniform(-126, 126, (12, 2)).astype(np.float32)
+    for rate in (0.1, 30.0):
+        latent, steep = start.copy(), np.full(12, 0.25, np.float32)
+        descend(starts, rows, shares, weights, gradient, np.float32(rate), 2, latent, steep)
+        wanted, steepness = start.astype(np.float64), np.full(12, 0.25)
+        for ray, slope in enumerate(gradient.astype(np.float64)):
+            for j in range(starts[ray], starts[ray + 1]):
+                for row, share in zip(rows[j], weights[j] * shares[j].astype(np.float64), strict=True):
+                    steepness[row] += share**2 * np.mean(slope**2)
+                    step = rate * share / np.sqrt(steepness[row]) * slope
+                    wanted[row] = np.clip(wanted[row] - step, -127, 127)
+        np.testing.assert_allclose(latent, wanted, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(steep, steepness, rtol=1e-5)
+        assert (np.abs(latent).max() == 127) == (rate > 1)
 
 
 def test_gradients_whose_squares_underflow_move_nothing() -> None:

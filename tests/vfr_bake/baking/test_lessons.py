@@ -1,0 +1,46 @@
+"""Lessons out of rays: those that meet nothing are left out, and none at all is an error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from player.errors import TrainingError
+from tests.numerics.fog import FEATURE, fog
+from vfr_bake.baking.lessons import Taught, collect_lessons
+
+ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
+"""Where rays along x begin that meet the box, and that pass it."""
+
+
+def taught(origins: list[tuple[float, float, float]]) -> Taught:
+    n = len(origins)
+    rays_d = np.tile(np.float32([1, 0, 0]), (n, 1))
+    colours = np.arange(3 * n, dtype=np.float32).reshape(n, 3)
+    return Taught(np.float32(origins), rays_d, colours, colours, np.full(n, 0.5, np.float32))
+
+
+@pytest.mark.parametrize("n_rays", [1, 5])
+def test_rays_that_meet_nothing_teach_nothing(n_rays: int) -> None:
+    with pytest.raises(TrainingError, match="shows nothing in any training view: train longer"):
+        collect_lessons(taught([PAST] * n_rays), fog(0.1), 0)
+
+
+@pytest.mark.parametrize("n_samples", [0, 1, 4])
+@pytest.mark.parametrize("at_once", [1, 2, 100])
+def test_lessons_are_those_of_the_rays_that_meet_something(
+    n_samples: int, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In their order, however many rays are looked at together; the fog's one feature composes to its own
+    value times the opacity."""
+    monkeypatch.setattr("vfr_bake.baking.lessons.RAYS_AT_ONCE", at_once)
+    rays = taught([PAST, ALONG, PAST, PAST, ALONG, ALONG])
+    grid = fog(0.1)
+    lessons = collect_lessons(rays, grid, n_samples)
+    assert len(lessons) == 3 and np.array_equal(lessons.colours, rays.colours[[1, 4, 5]])
+    counts = np.diff(lessons.starts)
+    assert (counts == n_samples).all() if n_samples else (counts > 60).all()
+    composed = lessons.composed(grid.features.astype(np.float32))
+    np.testing.assert_allclose(composed[:, 0], FEATURE * lessons.opacity, rtol=1e-5)
+    one = collect_lessons(taught([ALONG]), grid, n_samples)
+    assert len(one) == 1 and np.array_equal(one.composed(grid.features.astype(np.float32)), composed[:1])
