@@ -98,13 +98,15 @@ def targets(work: Path) -> list[Target]:
 
 
 def outcome(target: Target) -> str:
-    """ "refused" by a VfrError of one line, "read", or what went wrong."""
+    """ "refused" by a VfrError of one line that names each place once, "read", or what went wrong."""
     signal.setitimer(signal.ITIMER_REAL, LIMIT_SECONDS)
     try:
         target.read()
     except VfrError as error:
         text = str(error)
-        return "refused" if "\n" not in text and len(text) < 3000 else f"not one short line: {text[:200]!r}"
+        if "\n" in text or len(text) >= 3000:
+            return f"not one short line: {text[:200]!r}"
+        return f"says a place twice: {text[:200]!r}" if said_twice(text) else "refused"
     except SlowError:
         return f"over {LIMIT_SECONDS:g} s"
     except BaseException as error:
@@ -112,6 +114,19 @@ def outcome(target: Target) -> str:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
     return "read"
+
+
+def said_twice(message: str) -> bool:
+    """Whether a file or a field is named twice in *where: what: expected, got*.
+
+    >>> said_twice("out/head.onnx: expected a graph, got: head.onnx: expected a message")
+    True
+    >>> said_twice("m.json: files: a: bytes: expected an integer, got 'a'")
+    False
+    """
+    names = [part.replace("\\", "/").rsplit("/", 1)[-1] for part in message.split(": ")[:-1]]
+    places = [name for name in names if re.fullmatch(r"[\w.-]*[A-Za-z][\w.-]*", name)]
+    return len(places) != len(set(places))
 
 
 def _too_slow(*_: object) -> None:
