@@ -16,9 +16,12 @@ from exporters.formats import ExportOptions
 from exporters.npz import npz_bytes, parse_npz
 from exporters.parity import check_volume_bytes
 from exporters.vdb import parse_vdb, vdb_bytes
-from exporters.volume import Volume, asset_volume
+from exporters.volume import Volume, _slope, asset_volume
 from player.asset import Asset
+from player.bricks import pack_vertices
 from player.errors import ConfigError, FormatError, ParityError, ShapeError
+from player.sparse_grid import build_grid
+from player.vertex_rows import vertex_rows
 from tests.exporters import block
 from tests.player import conftest as shells
 
@@ -55,6 +58,32 @@ def test_the_block_is_at_its_place_with_its_density(block_asset: Path, tmp_path:
     assert summary["voxels"] == len(places) == np.prod(block.HIGH - block.LOW + 1)
     # the features are integers: the head's own rounding to bytes is all that differs
     np.testing.assert_allclose(arrays["colour"] / 255, block.colours(arrays["index"]), atol=0.51 / 255)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("rise", [(1, 0, 0), (0, -2, 0), (3, 2, -1)])
+def test_colours_are_looked_at_up_the_density(size: float, rise: tuple[int, int, int]) -> None:
+    """Codes that are linear in the vertex: their gradient in model units, in a box of three edges and
+    of any size; down where they are even."""
+    vertices = np.argwhere(np.ones((9, 9, 9)))
+    coords, masks, order = pack_vertices(vertices)
+    vertices = vertices[order]
+    codes = (vertices @ np.array(rise) + 100).astype(np.uint8)
+    edges = np.array([2.0, 3.0, 5.0]) * size
+    where, features = (coords, masks), np.zeros((len(codes), 1), np.int8)
+    grid = build_grid(
+        (*where, codes), (*where, features), (8, 8), np.stack([0 * edges, edges]), 0.1 * size, (0.0, 1.0)
+    )
+    rows = vertex_rows(coords, masks, 8)
+    inner = np.argwhere(np.ones((7, 7, 7))) + 1
+    wanted = np.array(rise) / edges
+    np.testing.assert_allclose(
+        _slope(grid, rows, codes, inner),
+        np.tile(wanted / np.linalg.norm(wanted), (343, 1)),
+        rtol=0,
+        atol=1e-6,
+    )
+    assert (_slope(grid, rows, np.full_like(codes, 7), inner) == [0, 0, -1]).all()
 
 
 def test_dense_as_the_docstring_says(block_asset: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +22,8 @@ from player.camera_path import write_camera_path
 from player.cameras import orbit
 from player.errors import OutputError
 from player.images import png_bytes, read_key, webp_bytes
-from player.render import Renderer, render
+from player.play import LARGE_BYTES, _check_sizes
+from player.render import FRAME_BYTES, Renderer, render
 from player.transforms import read_cameras
 from player.video import write_video
 
@@ -54,6 +57,24 @@ def test_webp_and_png_show_the_same(background: str, shells_folder: Path, tmp_pa
         png = pixels(path)
         assert webp.shape == png.shape == (40, 48, 4 if background == "transparent" else 3)
         assert (webp == png).all()
+
+
+def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:
+    """The largest of those that are asked for, whatever their order."""
+    small = read_cameras(asset.path("cameras.json"))[0]
+    pixels = math.ceil(LARGE_BYTES / FRAME_BYTES)
+    wide, square = (
+        small.resized(pixels // 100 + 1, 100),
+        small.resized(math.isqrt(pixels) - 1, math.isqrt(pixels) - 1),
+    )
+    said: list[str] = []
+    _check_sizes([small, square], SimpleNamespace(is_video=False), said.append)
+    assert not said
+    for cameras in ([wide, small, square], [square, small, wide], [wide]):
+        said.clear()
+        _check_sizes(cameras, SimpleNamespace(is_video=False), said.append)
+        gigabytes = wide.width * 100 * FRAME_BYTES / 1e9
+        assert said == [f"a picture of {wide.width}x100 takes {gigabytes:.1f} GB of memory"]
 
 
 def test_one_picture_wants_one_view(
