@@ -3,7 +3,7 @@
     nice python -m tests.reliability.mutate --count 60 --seed 0 --results mutations.json
 
 Sites are drawn uniformly (`tests.reliability.sites`); equal seeds draw equal sites of equal code. A mutation
-is killed when a test fails or when the tests never end; the tests of the file itself come first, then those
+is killed when a test fails or never ends; the tests of the file itself come first, then those
 that import it, then whatever reaches it. Mutations that change nothing that could be told from outside are
 listed with the reason in `tests/reliability/equivalent.json`, and others are drawn in their place. What the
 results hold already is not run again.
@@ -13,6 +13,9 @@ from __future__ import annotations
 
 import argparse
 import ast
+import gc
+import importlib
+import itertools
 import json
 import os
 import shutil
@@ -21,12 +24,18 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
+import numba
+import pytest
+
+import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to wait)
 from tests.reliability.sites import Site, sites_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
+PACKAGES = ("player", "exporters", "vfr_bake", "tests")
 FOLDERS = ("player", "vfr_bake/baking", "exporters", "vfr_bake/kernels")
 """Whose sites are drawn; each meets the tests of its package, and those that concern every package."""
 TESTS = {"player": "tests/player", "vfr_bake": "tests/vfr_bake", "exporters": "tests/exporters"}
@@ -34,8 +43,14 @@ EVERYWHERE = ("tests/numerics", "tests/reliability")
 LAST = ("test_viewer", "test_other_programs", "test_reliability", "test_cluster")
 """Long tests, which start browsers and other programs, and so reach what they do not import."""
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
-LIMIT_SECONDS = 1800.0
-"""Of one mutation's tests: a loop without end is a mistake that was found."""
+BATCHES = (2, 5)
+"""So many of the files of tests are run before others are collected, which takes longer than these do."""
+IMPORTED = ("torch", "scipy.special", "onnx", "onnxruntime", "PIL.Image", "trimesh", "mpmath")
+"""What many tests import: once here, and not in the process of every mutation, which is forked."""
+BROKEN = 99
+"""Exit code of a child in which pytest itself did not run."""
+STALLED_SECONDS = 200.0
+"""A test that takes longer has no end: the mistake was found."""
 
 
 class Imports:
@@ -73,7 +88,7 @@ class Imports:
         return found
 
 
-def tests_of(imports: Imports, file: str) -> list[str]:
+def files_of_tests(imports: Imports, file: str) -> list[str]:
     """The tests that a mutation of `file` meets, the likeliest to fail first; its own examples lead."""
     distances = imports.distances(file)
     folders = (TESTS[file.split("/")[0]], *EVERYWHERE)
@@ -128,7 +143,9 @@ class Copy:
             )
             path.write_bytes(site.applied(whole))
             try:
-                outcome = self._pytest(tests_of(self.imports, site.path), compiled, Path(folder), limit)
+                outcome = self._outcome(
+                    files_of_tests(self.imports, site.path), compiled, Path(folder), limit
+                )
             finally:
                 path.write_bytes(whole)
                 os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
@@ -145,47 +162,68 @@ class Copy:
             elif path.name.split(".")[0] not in stale and path.suffix == ".nbi":
                 path.replace(target)
 
-    def _pytest(self, tests: list[str], compiled: Path, folder: Path, limit: float) -> dict[str, Any]:
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-x",
-            "-q",
-            "--no-header",
-            "--tb=line",
-            "-p",
-            "no:cacheprovider",
-        ]
-        environment = os.environ | {
-            "NUMBA_CACHE_DIR": str(compiled), "PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1",
-            "VFR_DATA": os.environ.get("VFR_DATA", str(REPOSITORY.parent / "shared" / "data")),
-        }  # fmt: skip
+    def _outcome(self, tests: list[str], compiled: Path, folder: Path, limit: float) -> dict[str, Any]:
+        """Of the likeliest tests, then of the others."""
         begin = time.monotonic()
-        arguments = [*command, "--basetemp", str(folder / "pytest"), *tests]
-        with (folder / "said.txt").open("w+") as said:
-            process = subprocess.Popen(
-                arguments,
-                cwd=self.root,
-                env=environment,
-                stdout=said,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-            try:
-                code = process.wait(limit)
-            except subprocess.TimeoutExpired:
-                code = -1
-            finally:
-                if process.poll() is None:
-                    os.killpg(process.pid, signal.SIGKILL)
-                    process.wait()
-            said.seek(0)
-            lines = said.read().splitlines()
-        failed = [line.split(" - ")[0] for line in lines if line.startswith(("FAILED", "ERROR"))]
-        reason = "no end" if code == -1 else (failed or lines[-1:] or [str(code)])[0]
+        end, by = begin + limit, None
+        for first, last in itertools.pairwise((0, *BATCHES, len(tests))):
+            some = tests[first:last]
+            if by is None and some and time.monotonic() < end:
+                by = self._pytest(some, compiled, folder, end)
         seconds = round(time.monotonic() - begin)
-        return {"killed": code != 0, "by": reason if code else None, "seconds": seconds}
+        left = by is None and time.monotonic() >= end
+        return {"killed": by is not None, "by": by, "left": left, "seconds": seconds}
+
+    def _pytest(self, tests: list[str], compiled: Path, folder: Path, end: float) -> str | None:
+        """What failed; None if nothing did before `end`."""
+        said = folder / "said.txt"
+        arguments = ["-x", "-q", "--tb=line", "-p", "no:cacheprovider", "--basetemp", str(folder / "pytest")]
+        child = os.fork()
+        if child == 0:
+            code = BROKEN
+            try:
+                self._begin_child(said, compiled)
+                code = int(pytest.main([*arguments, *tests]))
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(code)
+        moved, size, code = time.monotonic(), 0, None
+        while code is None and time.monotonic() < min(end, moved + STALLED_SECONDS):
+            time.sleep(0.2)
+            pid, status = os.waitpid(child, os.WNOHANG)
+            code = os.waitstatus_to_exitcode(status) if pid else None
+            if said.exists() and said.stat().st_size > size:
+                moved, size = time.monotonic(), said.stat().st_size
+        if code is None:
+            os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return None if time.monotonic() >= end else "no end"
+        lines = said.read_text(encoding="utf-8", errors="replace").splitlines()
+        failed = [line.split(" - ")[0] for line in lines if line.startswith(("FAILED ", "ERROR "))]
+        if code != 0 and not failed and code != -signal.SIGSEGV:
+            raise RuntimeError(f"pytest ended with {code}: " + "\n".join(lines[-20:]))
+        return (failed or ["a crash"])[0] if code else None
+
+    def _begin_child(self, said: Path, compiled: Path) -> None:
+        """Make this process one that was started in the copy: nothing of the repository is imported yet."""
+        os.setsid()
+        os.chdir(self.root)
+        output = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        os.environ.update(NUMBA_CACHE_DIR=str(compiled), PYTHONPATH=str(self.root))
+        os.environ.setdefault("VFR_DATA", str(REPOSITORY.parent / "shared" / "data"))
+        numba.config.CACHE_DIR = str(compiled)  # pyright: ignore[reportAttributeAccessIssue]
+        sys.path[:] = [
+            str(self.root),
+            *(path for path in sys.path if Path(path or ".").resolve() != REPOSITORY),
+        ]
+        for name in [name for name in sys.modules if name.split(".")[0] in PACKAGES]:
+            del sys.modules[name]
+        gc.freeze()
 
 
 def drawn_sites(seed: int) -> list[Site]:
@@ -206,6 +244,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, required=True, help="JSON, read and written")
+    parser.add_argument("--limit", type=float, default=3600.0, help="seconds for a mutation's tests")
     parser.add_argument("--again", action="store_true", help="run the survivors again")
     parser.add_argument("--list", action="store_true", help="say what would be drawn, and run nothing")
     options = parser.parse_args()
@@ -223,11 +262,13 @@ def main() -> int:
     if options.results.exists():
         known = {run["name"]: run for run in json.loads(options.results.read_text())["runs"]}
     with tempfile.TemporaryDirectory(prefix="vfr-mutate-", ignore_cleanup_errors=True) as folder:
+        for name in IMPORTED:
+            importlib.import_module(name)
         copy = Copy(Path(folder))
         for site in chosen:
             run = known.get(site.name)
             if run is None or (options.again and not run["killed"]):
-                known[site.name] = run = copy.run(site, LIMIT_SECONDS)
+                known[site.name] = run = copy.run(site, options.limit)
                 sys.stderr.write(
                     f"{'killed' if run['killed'] else 'SURVIVED'} {run['seconds']:4} s  {site.name}\n"
                 )

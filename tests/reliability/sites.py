@@ -187,4 +187,6 @@ def _text(node: ast.expr) -> str:
 
 
 def _is_string(node: ast.expr) -> bool:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return _is_string(node.left) or _is_string(node.right)
     return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
