@@ -128,6 +128,8 @@ def test_a_gpu_is_taken_if_there_is_one_and_missed_if_asked_for(monkeypatch: pyt
     assert choose_device("cpu") == torch.device("cpu")
 
 
+# On Python 3.13.0, of all versions, torch warns of a dictionary that it cannot watch, which costs time alone.
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0:RuntimeWarning")
 @pytest.mark.parametrize("unbounded_field", [False, True])
 def test_the_networks_are_one_graph_each(unbounded_field: bool, device: torch.device) -> None:
     """As they are compiled on a GPU: without a break, and with equal gradients."""
