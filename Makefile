@@ -66,7 +66,8 @@ WHEEL := $(abspath $(VENV)-wheel)
 WHEEL_PIP := $(WHEEL)/bin/python -m pip --disable-pip-version-check install --quiet -c $(CONSTRAINTS)
 WHEEL_TESTS := cd $(WHEEL)/checkout && VFR_DATA="$${VFR_DATA:-$(abspath ../shared/data)}" $(WHEEL)/bin/python -m pytest tests/player
 TOOLS_OF_TESTS := pytest hypothesis onnx scipy opencv-python-headless pycolmap
-FILES_OF_EXTRAS := compiling contracted_march head_compiled lanes march viewer
+FILES_OF_EXTRAS := test_compiling test_contracted_march test_head_compiled test_lanes test_march test_processor test_proof \
+  test_scratch test_viewer test_viewer_guard viewer_client
 test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## build, check the packages, run the player's tests on the wheel
 	rm -rf build dist $(WHEEL)
 	$(BIN)/python -m build
@@ -80,7 +81,7 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 	mkdir $(WHEEL)/checkout
 	cp -R tests conftest.py pyproject.toml $(WHEEL)/checkout
 	cd $(WHEEL)/checkout && $(WHEEL)/bin/python -c 'import player, sys; assert player.__file__.startswith(sys.prefix + "/lib")'
-	$(WHEEL_TESTS) -m 'not extra' $(FILES_OF_EXTRAS:%=--ignore=tests/player/test_%.py)
+	$(WHEEL_TESTS) -m 'not extra' $(FILES_OF_EXTRAS:%=--ignore=tests/player/%.py)
 	$(WHEEL_PIP) "$$(echo dist/*.whl)[fast,viewer,video,cluster]" playwright
 	$(WHEEL_TESTS)
 
