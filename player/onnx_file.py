@@ -199,7 +199,8 @@ def _content(piece: bytes, kind: Any, where: str) -> Any:
 
 
 def _varint(data: bytes, at: int, where: str) -> tuple[int, int]:
-    """An integer of at most 64 bits, seven in a byte, and where it ends."""
+    """An integer of at most 64 bits, seven in a byte, and where it ends. It has to be as short as it can be:
+    protobuf reads a length of at most five bytes, whatever it says."""
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(data):
@@ -208,6 +209,8 @@ def _varint(data: bytes, at: int, where: str) -> tuple[int, int]:
         value |= (byte & 127) << shift
         at += 1
         if byte < 128:
+            if shift and not byte:
+                raise FormatError(f"{where}: expected an ONNX graph, got an integer longer than it has to be")
             break
     else:
         value = 1 << 64

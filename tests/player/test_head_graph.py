@@ -213,6 +213,7 @@ def rewritten(data: bytes, path: tuple[int, ...], change: Callable[[bytes], byte
         ((7, 1), b"\x0a\x02\xff\xfe", "expected names in UTF-8"),
         ((7, 5), b"\x08" + b"\xff" * 9 + b"\x02", "an integer of more than 64 bits"),
         ((7, 1), b"\x0a\x7f", "got one cut short"),
+        ((7, 1), b"\x0a\x83" + b"\x80" * 8 + b"\x00dirs", "an integer longer than it has to be"),
         ((), b"\x3b", "got graph of wire type 3"),
     ],
 )
