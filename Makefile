@@ -85,15 +85,16 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 	$(WHEEL_PIP) "$$(echo dist/*.whl)[fast,viewer,video,cluster]" playwright
 	$(WHEEL_TESTS)
 
-fuzz: $(VENV)/.dev  ## a million broken inputs to every reader
+fuzz: $(VENV)/.dev  ## a million broken inputs to every reader, a tenth of that to the viewer
 	$(BIN)/python -m tests.reliability.fuzz --inputs 1000000
+	$(BIN)/python -m tests.reliability.fuzz_viewer --inputs 100000
 
 kill: $(VENV)/.dev  ## commands that are killed, that share an output, whose disk is full
 	$(BIN)/python -m tests.reliability.kill --runs 200
 	$(BIN)/python -m tests.reliability.every_call
 
 mutations: $(VENV)/.dev system-libraries other-programs  ## faults put into the source that the tests must notice
-	$(BIN)/python -m tests.reliability.mutate --count 60
+	$(BIN)/python -m tests.reliability.mutate --count 60 --results $(VENV)/mutations.json
 
 processors: $(VENV)/.dev  ## the compiled player as on older processors
 	$(BIN)/python -m tests.reliability.processors
