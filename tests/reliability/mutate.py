@@ -152,6 +152,18 @@ class Copy:
             self._keep(compiled, stale)
         return {"name": site.name, "line": site.line, **outcome}
 
+    def failing(self, reasons: set[str]) -> list[str]:
+        """Which of the tests that killed something fail without any change."""
+        wrong = []
+        with tempfile.TemporaryDirectory(dir=self._kept.parent, ignore_cleanup_errors=True) as folder:
+            for reason in sorted(reasons):
+                kind, _, test = reason.partition(" ")
+                if kind in ("FAILED", "ERROR"):
+                    end = time.monotonic() + STALLED_SECONDS
+                    if self._pytest([test], self._kept, Path(folder), end) is not None:
+                        wrong.append(test)
+        return wrong
+
     def _keep(self, compiled: Path, stale: set[str]) -> None:
         """What numba compiled of files that the change does not reach holds for the next one."""
         for path in compiled.rglob("*.nb?"):
@@ -283,7 +295,10 @@ def main() -> int:
                 "runs": runs,
             }
             options.results.write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
-    return 0
+        wrong = copy.failing({str(run["by"]) for run in runs if run["killed"]})
+    for test in wrong:
+        sys.stderr.write(f"fails without a mutation too, so that its kills do not count: {test}\n")
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":

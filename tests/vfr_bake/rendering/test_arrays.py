@@ -1,0 +1,86 @@
+"""The kernels of training and rendering, run as the Python that they are written in: numpy looks at every
+index, which compiled code does not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+PROGRAM = """
+import sys
+import numpy as np
+import torch
+from numba import config
+from vfr_bake.config import FieldOptions
+from vfr_bake.kernels import adam, hash_grid
+from vfr_bake.field.field import VfrField
+from vfr_bake.kernels.march import mark_visible_cells
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.samples import LIMITS
+from vfr_bake.rendering.sampling import march
+from vfr_bake.training.optimiser import FusedGridAdam, GridAdam
+
+if config.DISABLE_JIT:  # it asks for memory ahead, and has no Python
+    adam.prefetch = hash_grid.prefetch = lambda table, row: None
+torch.manual_seed(0)
+torch.set_num_threads(1)
+found = {}
+generator = torch.Generator().manual_seed(2)
+rays_o = torch.randn(5, 3, generator=generator) * 1.5
+rays_d = torch.nn.functional.normalize(torch.rand(5, 3, generator=generator) - 0.5 - rays_o, dim=-1)
+options = FieldOptions(n_levels=7, base_resolution=4, max_resolution=20, log2_table_size=10, head_width=8)
+for unbounded in (False, True):
+    field = VfrField(options.resolved(unbounded))
+    torch.nn.init.uniform_(field.grid.table, -1, 1)
+    if unbounded:
+        sampler = ProposalSampler(0.05)
+        for grid in sampler.grids:
+            torch.nn.init.uniform_(grid.table, -2, 2)
+        samples = sampler.sample_all(field, rays_o[:2].numpy(), rays_d[:2].numpy())
+    else:
+        sampler = OccupancyGrid(8, 0.1, seed=0)
+        sampler.set_occupied(np.random.default_rng(1).random((8, 8, 8)) < 0.4)
+        samples, sigmas = march(field, sampler, rays_o, rays_d, torch.full((5,), 0.5), 300, n_chunks=2)
+        found["sigmas"] = sigmas
+        visible = np.zeros((9, 9, 9, 2), np.uint8)
+        arguments = (np.float32(0.1), sampler.distance, *field.kernel_arguments(), LIMITS)
+        mark_visible_cells(rays_o.numpy(), rays_d.numpy(), *arguments, np.float32([0.01, 0.2]), visible)
+        found["visible"] = visible
+    for name in ("t_mid", "deltas", "points", "features", "counts"):
+        found[f"{unbounded} {name}"] = getattr(samples, name).detach().numpy()
+    features, opacity, depth = sampler.composited_features(field, rays_o[:2].numpy(), rays_d[:2].numpy())
+    found |= {f"{unbounded} rgb": features, f"{unbounded} opacity": opacity, f"{unbounded} depth": depth}
+    optimiser = (GridAdam if unbounded else FusedGridAdam)(field.grid.table if unbounded else field.grid)
+    field.grid(samples.points[:20]).square().sum().backward()
+    optimiser.step(0.01)
+    found[f"{unbounded} table"] = field.grid.table.detach().numpy()
+np.savez(sys.argv[1], **found)
+"""
+
+
+def run(target: Path, **environment: str) -> dict[str, np.ndarray]:
+    environment |= {"PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, "-c", PROGRAM, str(target)]
+    done = subprocess.run(
+        command, cwd=REPOSITORY, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    with np.load(target) as file:
+        return {name: file[name] for name in file.files}
+
+
+def test_kernels_stay_within_their_arrays_and_are_what_they_say(tmp_path: Path) -> None:
+    plain = run(tmp_path / "plain.npz", NUMBA_DISABLE_JIT="1")
+    compiled = run(tmp_path / "compiled.npz")
+    assert set(plain) == set(compiled) and len(plain) > 15
+    for name, values in plain.items():
+        # In float32 flat parts of a proposal magnify rounding a thousandfold in each round.
+        rtol, atol = (0.05, 5e-3) if name.startswith("True") else (1e-3, 2e-4)
+        np.testing.assert_allclose(compiled[name], values, rtol=rtol, atol=atol, err_msg=name)
+        assert values.any(), name
