@@ -115,6 +115,29 @@ def test_a_sky_at_infinity_is_met() -> None:
         assert np.isfinite(result.depth).all() and np.isfinite(result.features).all()
 
 
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("distance", [1e5, 1e7, 1e12])
+def test_the_border_of_space_belongs_to_the_last_cells(module: ModuleType, distance: float) -> None:
+    """So far away float32 rounds contracted coordinates to 2 itself, where no cell begins any more."""
+
+    def sky(x: np.ndarray) -> np.ndarray:
+        return np.full(len(x), -2.0)
+
+    def far(x: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(x, axis=-1) > 4
+
+    grid, codes = contracted_grid(sky, far), dense_codes(sky, far)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rays_o = (distance * np.repeat(axes, 6, axis=0)).astype(np.float32)
+    rays_d = np.tile(axes, (6, 1)).astype(np.float32)
+    result = module.march(grid, rays_o, rays_d, 3)
+    for index, (o, d) in enumerate(zip(rays_o, rays_d, strict=True)):
+        opacity, _, taken, _ = naive(grid, codes, o, d)
+        assert result.n_samples[index] == taken
+        assert result.opacity[index] == pytest.approx(opacity, abs=2e-6)
+    assert (result.opacity > 0.99).sum() > 20
+
+
 def test_normals_point_where_density_falls_on_both_sides_of_the_sphere() -> None:
     """A ball of radius 0.5 or 3: its normals point away from the middle; and a wall is flat, near and far."""
     for radius in (0.5, 3.0):

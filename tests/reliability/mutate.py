@@ -251,6 +251,12 @@ def drawn_sites(seed: int) -> list[Site]:
     return sorted(places.values(), key=lambda site: site.rank(seed))
 
 
+def is_compiled(site: Site) -> bool:
+    """Whether numba compiles the file anew: those take longest, and are run last."""
+    text = (REPOSITORY / site.path).read_text(encoding="utf-8")
+    return any(word in text for word in ("import njit", "player.compiling", "player.lanes", "llvmlite"))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=60)
@@ -277,7 +283,7 @@ def main() -> int:
         for name in IMPORTED:
             importlib.import_module(name)
         copy = Copy(Path(folder))
-        for site in chosen:
+        for site in sorted(chosen, key=is_compiled):
             run = known.get(site.name)
             if run is None or (options.again and not run["killed"]):
                 known[site.name] = run = copy.run(site, options.limit)
