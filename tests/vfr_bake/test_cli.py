@@ -18,6 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
+from player.asset import Asset
 from player.errors import DataError
 from vfr_bake.cli import EVAL_VIEWS, bake_main, eval_main, train_main
 from vfr_bake.config import TrainConfig
@@ -201,7 +202,9 @@ def test_bake_needs_no_data_set_and_refuses_to_replace(
     assert bake_main(arguments) == 1
     one_error(capsys, str(tmp_path / "asset"), "already exists", "--force")
     assert (tmp_path / "asset" / "manifest.json").read_bytes() == before
-    assert bake_main([*arguments, "--force"]) == 0
+    coarse = [*arguments[:2], "--resolution", "24", "--refine-steps", "0", "--force"]
+    assert bake_main(coarse) == 0
+    assert Asset.open(tmp_path / "asset").manifest.resolution == 24
 
 
 @pytest.mark.parametrize(
