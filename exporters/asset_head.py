@@ -22,8 +22,7 @@ import numpy as np
 
 from player.asset import Asset
 from player.errors import FormatError, MissingExtraError, ParityError
-from player.head import Head
-from player.head_graph import read_head
+from player.head import Head, read_head_file
 
 TOLERANCE = 1e-6
 """Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
@@ -53,9 +52,7 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
         import onnx
     except ImportError as error:
         raise MissingExtraError("ONNX: needs the package onnx: pip install 'vfr-bake[export]'") from error
-    source = asset.path("head.onnx")
-    data = asset.read("head.onnx")
-    arrays = read_head(data, str(source))  # a head that is none has its own message
+    data, arrays = read_head_file(asset.path("head.onnx"), asset.manifest.n_channels)
     model = onnx.load_from_string(data)
     if arrays.may_saturate:
         _make_weights_unsigned(onnx, model)

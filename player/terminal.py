@@ -16,11 +16,11 @@ ROWS = 16
 
 
 def printable(text: str) -> str:
-    """The text in one line, with escapes in place of what a terminal or a browser obeys instead of showing:
+    r"""The text in one line, with escapes in place of what a terminal or a browser obeys instead of showing:
     control characters, ends of lines, changes of the writing direction, halves of characters.
 
     >>> printable("a\x1b[2Jb\u202ec\n\u00fc \u732b")
-    'a\\x1b[2Jb\\u202ec\\n\u00fc \u732b'
+    'a\\x1b[2Jb\\u202ec\\nü 猫'
     """
     if text.isprintable():
         return text

@@ -66,7 +66,7 @@ TYPED = [
 
 def test_every_option_with_a_value_is_here() -> None:
     """A reader is one of `player.option_types`: none is Python's own."""
-    assert len(TYPED) == 21
+    assert len(TYPED) == 23
     for _, action in TYPED:
         assert action.choices or getattr(action.type, "__module__", "") == "player.option_types", action
 
@@ -108,6 +108,7 @@ def test_settings_of_the_bake_are_here() -> None:
     assert len(SETTINGS) > 40 and {command for command, _ in SETTINGS} == {
         "vfr-train",
         "vfr-bake",
+        "vfr-eval",
         "vfr-bench",
     }
 
@@ -140,10 +141,12 @@ def given(name: str) -> list[str]:
     """An option of `vfr-play` on a command line, with a value that it takes."""
     values = {"cameras": "c.json", "orbit": "2", "view": "1", "output": "o", "format": "png", "frames": "1:2",
               "fps": "5", "json": "j.json", "dask": "tcp://127.0.0.1:1", "size": "8x8", "background": "white",
-              "samples": "0", "threads": "1", "march": "auto", "host": "127.0.0.1", "port": "1"}  # fmt: skip
+              "samples": "0", "threads": "1", "march": "auto", "host": "127.0.0.1", "port": "1",
+              "max_memory": "4"}  # fmt: skip
     if name == "others":
         return ["more"]
-    return [f"--{name}", values[name]] if name in values else [f"--{name}"]
+    option = f"--{name.replace('_', '-')}"
+    return [option, values[name]] if name in values else [option]
 
 
 def test_every_option_of_the_player_has_its_modes() -> None:
@@ -220,7 +223,7 @@ def test_what_the_system_reports_is_one_line(
     assert code_of(MAINS[command], []) == 1
     told = capsys.readouterr().err
     assert told.startswith(f"{command}: error: ") and told.count("\n") == 1 and str(error.strerror) in told
-    assert error.filename is None or error.filename.replace("\n", " ") in told
+    assert error.filename is None or error.filename.replace("\n", "\\n") in told
 
 
 @pytest.mark.parametrize("error", [OSError("truncated"), ValueError("a bug"), KeyError("a bug")])

@@ -93,7 +93,7 @@ def test_the_old_stays_until_the_new_is_complete(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The last thing that can fail is the renaming."""
+    """The last thing that can fail is the renaming, in whichever way."""
     target = Path(call(cube_asset, tmp_path, way)[1])
     if target.suffix:
         target.write_text("old")
@@ -105,7 +105,9 @@ def test_the_old_stays_until_the_new_is_complete(
     def full(self: Path, other: Path) -> Path:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
+    for name in ("replace", "rename"):
+        monkeypatch.setattr(Path, name, full)
+    monkeypatch.setattr("player.replace.exchange", lambda *_: False)
     error = fails(call(cube_asset, tmp_path, way, "--force"), capsys)
     assert f"{target}: cannot write: No space left on device" in error or target.stem in error
     assert content(tmp_path) == before

@@ -11,6 +11,8 @@ import pytest
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, head_onnx
 from player.errors import ShapeError
+from player.head_graph import read_head
+from tests.player.heads import play_in_integers
 from tests.reference import gelu, spherical_harmonics
 
 N_CHANNELS, WIDTH, N_SH = 12, 64, 4
@@ -102,9 +104,11 @@ def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: fl
         low, high = ranges[number]
         return low + (x - low) % (high - low)
 
-    error = np.abs(np.asarray(rgb) - oracle(weights, seen, clipped))
+    expected = play_in_integers(read_head(head_onnx(weights, ranges), "head"), seen["features"], seen["dirs"])
+    error = np.asarray(rgb) - expected  # an activation beside the border of two levels may cross it
+    assert np.sqrt(np.mean(error**2)) < 5e-4 and np.abs(error).max() < 0.01
+    assert np.sqrt(np.mean((rgb - oracle(weights, seen, clipped)) ** 2)) < 0.02, "what 8 bits round"
     assert outside[0] > 0.1, "there is something to clip"
-    assert error.max() < 0.04 and np.sqrt(np.mean(error**2)) < 0.01, "256 levels in each of four layers"
     assert np.abs(oracle(weights, seen, wrapped) - oracle(weights, seen, clipped)).mean() > 0.05
 
 

@@ -128,7 +128,7 @@ def test_a_bake_measures_with_numpy_where_compiled_code_is_wrong(
 ) -> None:
     from vfr_bake.baking.loss import HeldOut
 
-    monkeypatch.setattr(proof, "CHILD", WRONG)
+    child_runs(monkeypatch, WRONG)
     assert len(lines()) == 1
     views = object.__new__(HeldOut)
     views.rays_o, views.rays_d = random_rays(20)
