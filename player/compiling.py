@@ -8,14 +8,9 @@ from typing import Any
 
 try:
     import numba
-    from numba.core import config
 except ImportError:  # an extra: without it the numpy twin of whatever is compiled runs
     numba = None
 else:
-    # numba reads settings from a file in the current folder. One of them is the folder of compiled code,
-    # which is unpickled: whoever writes that file runs code. Without a name there is no such file.
-    config._config_fname = ""  # pyright: ignore[reportAttributeAccessIssue]
-    config.reload_config()
     from player.kept_code import keep, place
 
 SOURCES = Path(__file__).parent

@@ -32,6 +32,11 @@ from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
+# numba reads settings from a file in the current folder. One of them is the folder of compiled code, which is
+# unpickled: whoever writes that file runs code. Without a name there is no such file.
+config._config_fname = ""  # pyright: ignore[reportAttributeAccessIssue]
+config.reload_config()
+
 N_KEPT = 4
 """Folders of other sources that stay, those used last: versions that are used in turns keep their code."""
 
