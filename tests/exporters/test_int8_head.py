@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 
@@ -128,6 +129,25 @@ def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None
         inside = ((found[number] >= low) & (found[number] <= high)).mean()
         assert 0.9995 < inside < 0.99996, "the rare largest ones would make every step coarser"
         assert high < found[number].max() and low > found[number].min() - 5e-4, "within the tanh form of GELU"
+
+
+def test_weights_are_within_half_a_step_of_their_codes(weights: HeadWeights) -> None:
+    """Of every output of its own: a step is 1/127 of its largest weight, which no code may fall short of."""
+    model = onnx.load_from_string(head_onnx(weights, activation_ranges(weights, **inputs(4000))))
+    constants = {entry.name: onnx.numpy_helper.to_array(entry) for entry in model.graph.initializer}
+    wide = [weights.to_sh[0], weights.directional_first[0], *(weight for weight, _ in weights.directional)]
+    met = set()
+    for node in model.graph.node:
+        codes = constants.get(node.input[0]) if node.op_type == "DequantizeLinear" else None
+        if codes is None or codes.dtype != np.int8:
+            continue
+        stored, steps = codes * constants[node.input[1]].astype(np.float64), constants[node.input[1]]
+        of_same_shape = [n for n, weight in enumerate(wide) if weight.shape == codes.shape]
+        number = min(of_same_shape, key=lambda n: np.abs(stored - wide[n]).sum())
+        met.add(number)
+        assert (np.abs(stored - wide[number]) <= 0.5001 * steps).all()
+        np.testing.assert_allclose(steps, np.abs(wide[number]).max(axis=0) / 127, rtol=1e-6)
+    assert met == set(range(len(wide)))
 
 
 def test_one_range_for_each_activation(weights: HeadWeights) -> None:
