@@ -13,9 +13,9 @@ from player.asset import Asset
 from player.bricks import pack_vertices
 from player.few_samples import Samples, equal_mass_bins, heaviest
 from player.march import MIN_OPACITY
-from player.sparse_grid import SparseGrid
+from player.sparse_grid import SparseGrid, build_grid
 from player.vertex_rows import vertex_rows
-from tests.player.conftest import RESOLUTION
+from tests.player.conftest import DENSITY_RANGE, RESOLUTION, STEP, shells
 from tests.player.oracle_march import Scene, bins, march_ray
 
 # float32: 2^-24 a rounding, some dozen samples of optical depth up to 7; measured 1e-6.
@@ -79,6 +79,30 @@ def test_march_is_the_naive_loop(
     assert result.hits.tolist() == [i for i, ray in enumerate(expected) if ray.opacity > MIN_OPACITY]
     features = np.array([expected[i].features for i in result.hits])
     np.testing.assert_allclose(result.features, features, rtol=0, atol=FEATURES)
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("k", [0, 5])
+def test_march_through_a_box_of_three_different_edges(module: ModuleType, k: int, scene: Scene) -> None:
+    """Cells that are longer along one axis than along another: every axis has a scale and a corner of its
+    own."""
+    vertices, codes, features = shells()
+    box = np.array([[-1.5, -0.7, -1.0], [1.1, 0.6, 2.5]])
+    where = pack_vertices(vertices)[:2]
+    grid = build_grid((*where, codes), (*where, features), (RESOLUTION, RESOLUTION), box, STEP, DENSITY_RANGE)
+    unit_o, unit_d = random_rays(80, seed=10)
+    edges = np.diff(box, axis=0)[0]
+    rays_o = ((unit_o + 1) / 2 * edges + box[0]).astype(np.float32)
+    rays_d = unit_d * edges
+    rays_d = (rays_d / np.linalg.norm(rays_d, axis=1, keepdims=True)).astype(np.float32)
+    result = module.march(grid, rays_o, rays_d, k)
+    other = replace(scene, aabb=box)
+    expected = [march_ray(other, o, d, k) for o, d in zip(rays_o, rays_d, strict=True)]
+    assert result.n_samples.tolist() == [ray.taken for ray in expected] and len(result.hits) > 30
+    np.testing.assert_allclose(result.opacity, [ray.opacity for ray in expected], rtol=0, atol=OPACITY)
+    np.testing.assert_allclose(result.depth, [ray.depth for ray in expected], rtol=0, atol=4 * DEPTH)
+    features = np.array([expected[i].features for i in result.hits])
+    np.testing.assert_allclose(result.features, features, rtol=0, atol=2 * FEATURES)
 
 
 def test_the_special_rays_meet_and_miss(scene: Scene) -> None:
