@@ -52,7 +52,7 @@ def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
             raise FormatError(
                 f"{where}: fov: expected degrees between 0 and 180, got {brief(frame.get('fov'))}"
             )
-        focal = height / 2 / math.tan(math.radians(fov) / 2)
+        focal = height / 2 / max(math.tan(math.radians(fov) / 2), 1e-300)  # a field of 1e-323 degrees is none
         c2w = _matrix(frame.get("camera_to_world"), where)
         camera = Camera(where, c2w, width, height, focal, focal, width / 2, height / 2)
         placed = camera if world_from_path is None else camera.transformed(world_from_path)

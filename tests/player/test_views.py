@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -125,6 +125,7 @@ VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_s
     ),
     frame=st.dictionaries(st.sampled_from(["camera_to_world", "fov"]), VALUES, max_size=2),
 )
+@example(top={}, frame={"fov": 5e-324})  # half of it is 0
 def test_garbage_is_cameras_or_a_format_error(tmp_path: Path, top: Any, frame: Any) -> None:
     path = write(tmp_path, json.dumps(path_document(**frame) | top))
     try:
