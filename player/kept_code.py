@@ -60,7 +60,9 @@ def keep(dispatcher: Any, *packages: Path) -> Any:
         packages: folders of all sources that the function is made from, its own first. A function of another
             file is not kept, because nobody would know when that has changed.
     """
-    function = dispatcher.py_func
+    function = getattr(dispatcher, "py_func", None)
+    if function is None:  # with NUMBA_DISABLE_JIT it is the function itself
+        return dispatcher
     where = place(*packages)
     if where.folder is not None and Path(function.__code__.co_filename).is_relative_to(packages[0]):
         dispatcher._cache = _KeptCode(function, where)
