@@ -51,7 +51,7 @@ def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
         name = frame.get("file_path")
         if not isinstance(name, str) or not name or any(_unwritable(c) for c in name):
             raise FormatError(f"{where}: frame {index}: file_path: expected a path, got {brief(name)}")
-        place = f"{where}: frame {index} ({name})"
+        place = f"{where}: frame {index} ({brief(name)})"
         model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
         if model not in PINHOLE_MODELS:
             expected = ", ".join(PINHOLE_MODELS)
@@ -92,7 +92,7 @@ def transforms_cameras(
     the frames that give none. Raises FormatError."""
     frames = document["frames"]
     return [
-        _frame_camera(document, frame, f"{where}: frame {index} ({frame['file_path']})", size)
+        _frame_camera(document, frame, f"{where}: frame {index} ({brief(frame['file_path'])})", size)
         for index, (frame, size) in enumerate(zip(frames, sizes or [None] * len(frames), strict=True))
     ]
 

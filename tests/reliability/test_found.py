@@ -143,3 +143,11 @@ def test_onnxruntime_calls_nobody(tmp_path: Path) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment | alone
     )
     assert done.stdout == "True 1\n", done.stdout + done.stderr
+
+
+def test_a_name_of_thousands_of_letters_is_not_repeated_in_full() -> None:
+    document = json.loads(cameras_bytes())
+    document["frames"][0] |= {"file_path": "a" * 5000, "transform_matrix": 3}
+    with pytest.raises(FormatError) as caught:
+        transforms_cameras(parse_transforms(json.dumps(document).encode(), "t"), "t")
+    assert "frame 0" in str(caught.value) and len(str(caught.value)) < 400
