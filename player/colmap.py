@@ -29,8 +29,8 @@ MODELS = {
 }
 """Number, name and parameters of the camera models that are a pinhole behind OpenCV's lens."""
 MAX_FILE_BYTES = 1 << 30
-"""Of each file of a model: ten thousand pictures of a thousand points each that several pictures share take
-half of it."""
+"""Bytes of each file of a model: ten thousand pictures of a thousand points each that several pictures share
+take half of it."""
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -14,7 +14,7 @@ else:
     from player.kept_code import keep, place
 
 SOURCES = Path(__file__).parent
-"""Of all compiled code of the player: whatever lies in this folder and below."""
+"""The sources of all compiled code of the player: whatever lies in this folder and below."""
 
 
 def available() -> bool:

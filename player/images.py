@@ -56,7 +56,7 @@ ENCODERS = {".png": png_bytes, ".webp": webp_bytes}
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """What a picture may be, whatever its name is: Pillow would start Ghostscript for another."""
 MAX_FILE_BYTES = 1 << 30
-"""Of a picture's file: 178 million pixels, the most that Pillow opens, with six bytes each."""
+"""Bytes of a picture's file: 178 million pixels, the most that Pillow opens, with six bytes each."""
 
 
 @contextmanager

@@ -47,7 +47,7 @@ class Place(NamedTuple):
     folder: Path | None
     """None where it cannot be kept."""
     digest: str
-    """Of the sources and of what compiles them."""
+    """Digest of the sources and of what compiles them."""
     refused: Path | None
     """A folder that is not used because others may write to it."""
 
@@ -100,7 +100,7 @@ def place(*packages: Path) -> Place:
 
 @lru_cache(maxsize=8)
 def sources_digest(*packages: Path) -> str | None:
-    """Of all sources below the folders `packages`, and of what compiles them; None if there are none."""
+    """Digest of all sources below the folders `packages` and of what compiles them; None without sources."""
     versions = sys.version, numba.__version__, llvmlite.__version__, np.__version__
     total, n_files = hashlib.sha256("\n".join(versions).encode()), 0
     for package in packages:

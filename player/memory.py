@@ -10,8 +10,8 @@ from pathlib import Path
 from player.errors import ConfigError
 
 SHARE = 0.5
-"""Of the machine's memory, or of a lower limit of the process, where no other number is asked for: the rest
-is for the program itself, for pictures and for other programs."""
+"""A share of the machine's memory, or of a lower limit of the process, where no other number is asked for:
+the rest is for the program itself, for pictures and for other programs."""
 UNKNOWN = 4 << 30
 """Bytes of a machine that does not tell how many it has."""
 

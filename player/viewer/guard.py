@@ -257,7 +257,7 @@ def _unknown_viser(version: str) -> MissingExtraError:
 
 
 def _logger() -> logging.Logger:
-    """Of websockets' own, without what every client can cause."""
+    """The logger of websockets' server, without the messages that every client can cause."""
     logger = logging.getLogger("websockets.server.vfr-play")
     logger.addFilter(
         lambda record: not record.getMessage().startswith(("opening handshake failed", "connection rej"))

@@ -31,10 +31,10 @@ PATH_FPS = 30
 STRIP_PIXELS = 50_000
 """The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
 MOST_PIXELS = 3840 * 2160
-"""Of a whole picture, whatever size a window says it has."""
+"""The largest whole picture, whatever size a window says it has."""
 MOST_SIDE = 8192
 MOST_VIEWS = 200
-"""Of a recorded path."""
+"""Views that a recorded path may have."""
 HANDED_OVER_SECONDS = 0.2
 """By then viser has given a file to the connection."""
 
