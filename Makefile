@@ -66,8 +66,9 @@ WHEEL := $(abspath $(VENV)-wheel)
 WHEEL_PIP := $(WHEEL)/bin/python -m pip --disable-pip-version-check install --quiet -c $(CONSTRAINTS)
 WHEEL_TESTS := cd $(WHEEL)/checkout && VFR_DATA="$${VFR_DATA:-$(abspath ../shared/data)}" $(WHEEL)/bin/python -m pytest tests/player
 TOOLS_OF_TESTS := pytest hypothesis onnx scipy opencv-python-headless pycolmap
-FILES_OF_EXTRAS := test_compiling test_contracted_march test_head_compiled test_lanes test_march test_processor test_proof \
-  test_scratch test_viewer test_viewer_guard viewer_client
+FILES_OF_EXTRAS := compiled/test_compiling compiled/test_lanes compiled/test_processor compiled/test_scratch \
+  march/test_contracted_march march/test_march head/test_head_compiled test_proof \
+  viewer/test_viewer viewer/test_viewer_guard viewer/viewer_client
 test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## build, check the packages, run the player's tests on the wheel
 	rm -rf build dist $(WHEEL)
 	$(BIN)/python -m build

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from player import Asset, Frame
-from player.cameras import orbit
-from player.images import write_png
+from player.cameras.camera import orbit
+from player.cameras.transforms import read_cameras
+from player.files.images import write_png
 from player.render import render
-from player.transforms import read_cameras
 
 
 def side_by_side(frame: Frame) -> np.ndarray:

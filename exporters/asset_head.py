@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import FormatError, MissingExtraError, ParityError
-from player.head import Head, read_head_file
+from player.head.head import Head, read_head_file
 
 TOLERANCE = 1e-6
 """Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
@@ -35,8 +35,8 @@ N_FETCHES = 5
 def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> bytes:
     """The file's content; the same asset gives the same bytes.
 
-    Checked by `onnx.checker`, run in onnxruntime, and compared with `player.head.Head` on random and extreme
-    inputs.
+    Checked by `onnx.checker`, run in onnxruntime, and compared with `player.head.head.Head` on random and
+    extreme inputs.
 
     Args:
         asset: an open asset.

@@ -26,7 +26,7 @@ from exporters.training_views import (
     depth_views,
     seen_vertices,
 )
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import DataError, MissingExtraError
 
 FLOATER_FRACTION = 1e-4

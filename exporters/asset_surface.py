@@ -1,12 +1,12 @@
 """The surface of a baked asset: marching cubes on its own sparse density, block by block.
 
 Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
-(`player.density`); v, the size of a voxel; dt, the step of the march. The default level is the density that
-is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields are
-soft at their surface, and of the levels tried this one has the player's outlines and lies on known geometry
-in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what no
-training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where they
-end.
+(`player.asset.density`); v, the size of a voxel; dt, the step of the march. The default level is the density
+that is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields
+are soft at their surface, and of the levels tried this one has the player's outlines and lies on known
+geometry in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what
+no training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where
+they end.
 
 Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
 not by the box. A corner of the mesh lies on an edge of the grid, and the edge's number is what joins it
@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError
-from player.sparse_grid import SparseGrid
 
 BLOCK = 64
 """Cells along each side of a block: 1 MB of codes."""

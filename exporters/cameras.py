@@ -1,4 +1,5 @@
-"""transforms.json of cameras in the frame of an export: instant-ngp's form, as `player.transforms` writes it.
+"""transforms.json of cameras in the frame of an export: instant-ngp's form, as `player.cameras.transforms`
+writes it.
 
 The axes of a camera (x right, y up, looks along -z) and the pixels stay; what changes with the frame is where
 the cameras are.
@@ -10,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
+from player.cameras.transforms import parse_transforms, transforms_cameras, write_cameras
 from player.errors import ParityError
-from player.transforms import parse_transforms, transforms_cameras, write_cameras
 
 
 def transforms_bytes(cameras: Sequence[Camera], matrix: np.ndarray, where: str) -> bytes:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from exporters.formats import FOLDERS, FORMATS, POINTS, ExportOptions
-from player.commands import run
-from player.option_types import gigabytes, number, part, size, whole
-from player.options import MAX_MEMORY
+from player.app.commands import run
+from player.app.option_types import gigabytes, number, part, size, whole
+from player.app.options import MAX_MEMORY
 
 _DESCRIPTION = """\
 Write a baked asset, or a part of it, for another program.

@@ -15,9 +15,9 @@ import numpy as np
 from exporters.cameras import check_cameras
 from exporters.formats import COLMAP_FILES
 from exporters.mesh import TriangleMesh
-from player.cameras import Camera
+from player.cameras.camera import Camera
+from player.cameras.rotations import quaternion, rotation_matrix
 from player.errors import ParityError
-from player.rotations import quaternion, rotation_matrix
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 TOLERANCE = 1e-9

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from exporters.mesh import TriangleMesh, take_faces
-from player.cameras import check_pose
+from player.cameras.camera import check_pose
 from player.errors import ConfigError, FormatError
-from player.json_files import brief, parse_json, read_json
+from player.files.json_files import brief, parse_json, read_json
 
 _FORM = "X,Y,Z,W,D,H[,YAW] (centre, size, degrees about Z) or a .json file"
 

@@ -18,11 +18,11 @@ from exporters.formats import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptio
 from exporters.inner_region import inner_region
 from exporters.mesh import TriangleMesh
 from exporters.mesh_export import export_mesh, mesh_paths, world_mesh
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import frame_names, read_cameras
 from player.errors import OutputError
-from player.files import check_target, new_folder, write_bytes
-from player.transforms import frame_names, read_cameras
+from player.files.files import check_target, new_folder, write_bytes
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""

@@ -6,7 +6,7 @@
 | `Z` | float | mean depth along the camera's axis, world units |
 | `distance.V` | float | mean depth along the ray: from the camera to the place, world units |
 | `position.X .Y .Z` | float | the place itself, world frame |
-| `normal.X .Y .Z` | colour | the density's, world frame, of unit length (`player.normals`) |
+| `normal.X .Y .Z` | colour | the density's, world frame, of unit length (`player.march.normals`) |
 | `opacity.V` | colour | A again, for programs that show a layer and not an alpha |
 | `samples.V` | float | density samples that the player took |
 | `features.00 ...` | colour | what the head was given: sum of weight times feature, in units of the codes |
@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from exporters.colour import linear_from_srgb
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from player.errors import MissingExtraError, OutputError, ParityError, ShapeError
-from player.march import MIN_OPACITY
+from player.march.march import MIN_OPACITY
 from player.render import Frame
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from player.asset import Asset, GridArrays
-from player.bricks import pack_vertices, unpack_vertices
+from player.asset.asset import Asset, GridArrays
+from player.asset.bricks import pack_vertices, unpack_vertices
 from player.errors import DataError
 
 REACH = 2.0

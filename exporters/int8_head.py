@@ -1,6 +1,6 @@
 """Ranges of the head's hidden activations, for multiplying in 8 bits.
 
-Letters as in `player.head_graph`: h is what the spatial MLP emits, z_i what directional layer i emits.
+Letters as in `player.head.graph`: h is what the spatial MLP emits, z_i what directional layer i emits.
 Both come out of a GELU, so they are never below -0.17.
 """
 

@@ -15,8 +15,8 @@ from exporters.asset_mesh import Report, Scene
 from exporters.formats import TEXTURE_FACES, ExportOptions
 from exporters.mesh import TriangleMesh
 from exporters.texture import Texture
-from player.asset import Asset
-from player.files import write_together
+from player.asset.asset import Asset
+from player.files.files import write_together
 
 _SECONDS = 300.0
 """Time for the layout of a texture unless asked for another."""

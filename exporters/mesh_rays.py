@@ -12,7 +12,7 @@ import numpy as np
 
 from exporters.mesh import TriangleMesh
 from exporters.open3d_package import require_open3d
-from player.cameras import Camera
+from player.cameras.camera import Camera
 
 
 class Hits(NamedTuple):

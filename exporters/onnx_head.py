@@ -1,6 +1,6 @@
 """The head of Volume Feature Rendering as one ONNX graph: composited features and a direction in, rgb out.
 
-The graph, its letters and what 8 bits round are specified in `player.head_graph`; here are the weights that
+The graph, its letters and what 8 bits round are specified in `player.head.graph`; here are the weights that
 go into it. The spherical harmonics are computed inside the graph from the one table of
 `exporters.spherical_harmonics`, so that no caller can disagree with it on order or sign. Built from numpy
 arrays, the same weights give the same bytes.
@@ -15,7 +15,7 @@ import numpy as np
 
 from exporters.spherical_harmonics import sh_monomials
 from player.errors import FormatError, MissingExtraError, ShapeError
-from player.head_graph import (
+from player.head.graph import (
     IR_VERSION,
     OPSET,
     PAIR_LIMIT,
@@ -161,7 +161,7 @@ def levels(limits: Range) -> tuple[float, int]:
 def weight_scales(weight: np.ndarray) -> np.ndarray:
     """What a code of the weights [n_in, n_out] counts, for each output: [n_out] float32.
 
-    No two neighbouring codes then exceed `player.head_graph.PAIR_LIMIT`: their sum before rounding is one
+    No two neighbouring codes then exceed `player.head.graph.PAIR_LIMIT`: their sum before rounding is one
     less at most, and each may be rounded up by a half.
     """
     return (np.maximum(pair_sums(weight).max(axis=0), 1e-12) / (PAIR_LIMIT - 1)).astype(np.float32)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from exporters.exr import exr_channels, exr_header, load_openexr, write_exr
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
 from player.errors import ConfigError
-from player.files import check_target, new_folder
+from player.files.files import check_target, new_folder
 from player.render import Renderer, check_size
 
 
@@ -29,7 +29,7 @@ def export_pictures(
         asset: an open asset.
         target: the new folder; it appears when every picture is in it.
         cameras: WORLD frame, at least one.
-        names: of the files, without suffix, one a camera (`player.transforms.frame_names`).
+        names: of the files, without suffix, one a camera (`player.cameras.transforms.frame_names`).
         half: see `exporters.exr`.
         force: replace a folder that exists.
         progress: called with the number done and the total after each picture.

@@ -14,7 +14,7 @@ import numpy as np
 
 from exporters.mesh import TriangleMesh
 from player.errors import FormatError, IntegrityError, VfrError
-from player.files import read_bytes
+from player.files.files import read_bytes
 
 MAX_BYTES = 4 << 30
 """A hundred million faces. What an asset's mesh may take is compared with its budget when it is opened."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from exporters.asset_surface import voxel_size
 from exporters.training_views import TOLERANCE, DepthView, cosines_in_view
-from player.asset import Asset
-from player.head import Head
+from player.asset.asset import Asset
+from player.head.head import Head
 from player.render import choose_march, default_threads
 
 STAND_OFF = 3.0

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
 from player.render import Renderer
-from player.transforms import read_cameras
 
 MAX_VIEWS = 100
 """Views that are played, spread over all of the training cameras."""

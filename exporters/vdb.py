@@ -25,7 +25,7 @@ import numpy as np
 
 from exporters.colour import linear_from_srgb
 from exporters.volume import Volume
-from player.bricks import pack_vertices, stored_bits
+from player.asset.bricks import pack_vertices, stored_bits
 from player.errors import ConfigError, FormatError
 
 _MAGIC, _VERSION, _LIBRARY = 0x56444220, 224, (6, 2)

@@ -16,15 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from exporters.crop import CropBox
-from player.asset import Asset
-from player.bricks import unpack_vertices
-from player.density import decode_density
+from player.asset.asset import Asset
+from player.asset.bricks import unpack_vertices
+from player.asset.density import decode_density
+from player.asset.grid import SparseGrid
+from player.asset.vertex_rows import VertexRows, vertex_rows
 from player.errors import ConfigError, ShapeError
-from player.few_samples import MIN_TOTAL, stored_features
-from player.head import Head
+from player.head.head import Head
+from player.march.fetches import MIN_TOTAL, stored_features
 from player.render import default_threads
-from player.sparse_grid import SparseGrid
-from player.vertex_rows import VertexRows, vertex_rows
 
 _ROWS = 1 << 16  # vertices at a time: some megabytes of scratch memory a thread
 

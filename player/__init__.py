@@ -2,7 +2,7 @@
 
 >>> from player import Asset
 >>> from player.render import render
->>> from player.views import read_views
+>>> from player.cameras.views import read_views
 >>> asset = Asset.open("out/")
 >>> frame = render(asset, read_views("out/cameras.json")[0])
 >>> frame.rgb.shape
@@ -17,8 +17,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from player.asset import Asset
-    from player.cameras import Camera
+    from player.asset.asset import Asset
+    from player.cameras.camera import Camera
     from player.render import Frame, Renderer
 
 try:
@@ -33,8 +33,8 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 __all__ = ["Asset", "Camera", "Frame", "Renderer", "__version__"]
 
 _PLACES = {
-    "Asset": "player.asset",
-    "Camera": "player.cameras",
+    "Asset": "player.asset.asset",
+    "Camera": "player.cameras.camera",
     "Frame": "player.render",
     "Renderer": "player.render",
 }

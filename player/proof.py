@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from player.child import python_command
-from player.compiling import SOURCES, available, first_use, not_kept
+from player.compiled.compiling import SOURCES, available, first_use, not_kept
 
 RIGHT, WRONG = "right", "wrong: "
 DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
@@ -66,8 +66,8 @@ def _known() -> str | None:
 
 def _record() -> Path | None:
     """The file of the verdict; None where nothing can be kept."""
-    from player.kept_code import place
-    from player.processor import target
+    from player.compiled.kept_code import place
+    from player.compiled.processor import target
 
     folder = place(SOURCES).folder
     key = hashlib.sha256(repr(target()).encode()).hexdigest()[:16]
@@ -109,7 +109,10 @@ def _deadly(code: int) -> str | None:
 
 def verdict() -> str:
     """RIGHT, or WRONG and what; the process ends where LLVM or the processor end it."""
-    from player import contracted_march, contracted_march_compiled, march, march_compiled, proof_head
+    from player.compiled import contracted_march as contracted_march_compiled
+    from player.compiled import march as march_compiled
+    from player.head import proof as proof_head
+    from player.march import contracted_march, march
 
     for name, compiled, plain, contracted in (
         ("the march", march_compiled, march, False),
@@ -130,9 +133,9 @@ def verdict() -> str:
 
 def _grid(contracted: bool) -> Any:
     """Sixteen vertices an axis of codes and features that vary, some of them not stored."""
-    from player.bricks import pack_vertices
-    from player.contracted_rays import MAX_SPEED
-    from player.sparse_grid import build_grid
+    from player.asset.bricks import pack_vertices
+    from player.asset.grid import build_grid
+    from player.march.contracted import MAX_SPEED
 
     vertices = np.argwhere(np.ones((16, 16, 16)))
     vertices = vertices[(vertices * (5, 3, 1)).sum(axis=1) % 29 != 0]

@@ -20,15 +20,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from player.asset import Asset
-from player.bounds import BLOCK, block_bounds
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.asset.grid import SparseGrid
+from player.cameras.camera import Camera
 from player.errors import ConfigError, MissingExtraError
-from player.head import Head
-from player.march import MarchResult
-from player.normals import composited_normals
-from player.pixels import pixels_of_blocks, rays_of_pixels, write_pixels
-from player.sparse_grid import SparseGrid
+from player.head.head import Head
+from player.march.bounds import BLOCK, block_bounds
+from player.march.march import MarchResult
+from player.march.normals import composited_normals
+from player.march.pixels import pixels_of_blocks, rays_of_pixels, write_pixels
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
@@ -77,7 +77,7 @@ class Frame:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.normals`).
+        """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.march.normals`).
 
         Found when first asked for, at the cost of a second march, unless the frame was rendered with
         `layers`. Raises ConfigError for a frame that no renderer has made.
@@ -122,7 +122,7 @@ class Renderer:
         self.march, self._module = choose_march(march, asset.manifest.contracted)
         self._write_pixels, self._directions = write_pixels, None
         if self.march == "numba":
-            from player import pixels_compiled
+            from player.compiled import pixels as pixels_compiled
 
             self._write_pixels = pixels_compiled.write_pixels
             self._directions = pixels_compiled.directions
@@ -288,10 +288,12 @@ def check_size(width: int, height: int) -> None:
 def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
     """Name and module of a march through a box, or through contracted space."""
     if name != "numpy":
-        from player import compiling, proof
+        from player import proof
+        from player.compiled import compiling
 
         if compiling.available() and not proof.refuted():
-            from player import contracted_march_compiled, march_compiled
+            from player.compiled import contracted_march as contracted_march_compiled
+            from player.compiled import march as march_compiled
 
             return "numba", contracted_march_compiled if contracted else march_compiled
         if name == "numba":
@@ -300,7 +302,7 @@ def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType
                 if compiling.available()
                 else "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
             )
-    from player import contracted_march, march
+    from player.march import contracted_march, march
 
     return "numpy", contracted_march if contracted else march
 
@@ -323,7 +325,8 @@ def import_ahead(scipy: bool = True) -> None:
                 if choose_march("auto")[0] == "numpy":
                     import onnxruntime  # noqa: F401
                 else:
-                    from player import head_compiled, pixels_compiled  # noqa: F401
+                    from player.compiled import pixels as pixels_compiled
+                    from player.head import compiled as head_compiled  # noqa: F401
 
                     camera = Camera("", np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
                     pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
@@ -366,7 +369,7 @@ def render(
         FormatError: the asset's head is not one.
         MissingExtraError: `march` is "numba", which is not installed or does not run here.
 
-    >>> from player.transforms import read_cameras
+    >>> from player.cameras.transforms import read_cameras
     >>> asset = Asset.open("out/")
     >>> camera = read_cameras("out/cameras.json")[0]
     >>> frame = render(asset, camera, background=(0.0, 0.0, 0.0))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 import numpy as np
 
 if TYPE_CHECKING:
-    from player.asset import Asset
+    from player.asset.asset import Asset
 
 ROWS = 16
 """Lines of the picture on the `--info` page."""
@@ -32,8 +32,8 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
     if not (stream.isatty() and encoding == "utf8" and os.environ.get("COLORTERM") in ("truecolor", "24bit")):
         return []
+    from player.cameras.transforms import read_cameras
     from player.render import render
-    from player.transforms import read_cameras
 
     width, height = asset.manifest.view_size
     camera = read_cameras(asset.path("cameras.json"), (width, height))[0]

@@ -65,7 +65,7 @@ def small_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from PIL import Image
 
-    from player.transforms import write_cameras
+    from player.cameras.transforms import write_cameras
     from vfr_bake.data.demo import demo_views
 
     root = tmp_path_factory.mktemp("data")

@@ -17,9 +17,9 @@ import pytest
 
 from exporters.cli import main as export_main
 from exporters.cli import make_parser as export_parser
-from player import commands
-from player.cli import main as play_main
-from player.options import MODES, USED_BY, make_parser
+from player.app import commands
+from player.app.cli import main as play_main
+from player.app.options import MODES, USED_BY, make_parser
 from vfr_bake import cli as bake_cli
 from vfr_bake import demo
 from vfr_bake import options as bake_options
@@ -37,7 +37,7 @@ ENTRIES = {
     "vfr-bake": "vfr_bake.cli:bake_main",
     "vfr-eval": "vfr_bake.cli:eval_main",
     "vfr-bench": "vfr_bake.cli:bench_main",
-    "vfr-play": "player.cli:main",
+    "vfr-play": "player.app.cli:main",
     "vfr-export": "exporters.cli:main",
 }
 
@@ -65,10 +65,10 @@ TYPED = [
 
 
 def test_every_option_with_a_value_is_here() -> None:
-    """A reader is one of `player.option_types`: none is Python's own."""
+    """A reader is one of `player.app.option_types`: none is Python's own."""
     assert len(TYPED) == 23
     for _, action in TYPED:
-        assert action.choices or getattr(action.type, "__module__", "") == "player.option_types", action
+        assert action.choices or getattr(action.type, "__module__", "") == "player.app.option_types", action
 
 
 @pytest.mark.parametrize(("command", "action"), TYPED, ids=[f"{c} {a.option_strings[0]}" for c, a in TYPED])
@@ -247,7 +247,7 @@ def _fail_with(command: str, error: BaseException, monkeypatch: pytest.MonkeyPat
     """Let what a command does first fail."""
     refuse = refuse_imports(error)
     if command == "vfr-play":
-        monkeypatch.setattr("player.cli.parse", refuse)
+        monkeypatch.setattr("player.app.cli.parse", refuse)
     elif command == "vfr-export":
         monkeypatch.setattr("exporters.cli.make_parser", refuse)
     else:
@@ -334,7 +334,7 @@ def test_head_gets_its_line(command: str, unbuffered: bool, tmp_path: Path) -> N
     module = ENTRIES[command].split(":")[0]
     chatty = f"""
 import {module} as module
-from player import commands
+from player.app import commands
 module.run = lambda name, _: commands.run(name, lambda: print("line\\n" * 100_000) or 0)
 """
     errors = tmp_path / "errors.txt"

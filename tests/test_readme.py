@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from exporters.cli import main as export
-from player.cli import main as play
+from player.app.cli import main as play
 from vfr_bake.cli import bake_main, bench_main, eval_main, train_main
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -50,7 +50,7 @@ def test_the_commands_and_the_python_run(
             for word in shlex.split(line, comments=True)
         ]
         main, smaller = COMMANDS[words[0]]
-        if words == ["vfr-play", "out/"]:  # serves until Ctrl-C: tests/player/test_viewer.py
+        if words == ["vfr-play", "out/"]:  # serves until Ctrl-C: tests/player/viewer/test_viewer.py
             continue
         assert main(words[1:] + (smaller if "--info" not in words else [])) == 0, line
         seen.add(words[0])

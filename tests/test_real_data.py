@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from exporters.cli import main as export
-from player.cli import main as play
+from player.app.cli import main as play
 from vfr_bake.cli import bake_main, eval_main, train_main
 from vfr_bake.training.metrics import over_background, psnr
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player.asset import Asset
-from player.cli import main as play
+from player.app.cli import main as play
+from player.asset.asset import Asset
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
 from vfr_bake.rendering.render import render_image

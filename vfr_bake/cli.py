@@ -15,9 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from player.commands import run
+from player.app.commands import run
 from player.errors import DataError, MissingExtraError
-from player.files import check_target, write_bytes
+from player.files.files import check_target, write_bytes
 from vfr_bake.bars import Bar, Bars
 
 if TYPE_CHECKING:
@@ -261,8 +261,8 @@ def _bake(options: Any) -> int:
 
 
 def _eval(options: Any) -> int:
-    from player.images import write_png
-    from player.transforms import frame_names
+    from player.cameras.transforms import frame_names
+    from player.files.images import write_png
     from vfr_bake.data import load_scene
     from vfr_bake.training.comparison import comparison
     from vfr_bake.training.evaluation import render_views

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
-from player.json_files import brief
+from player.files.json_files import brief
 from vfr_bake.baking.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from player.commands import run
-from player.files import check_target, write_bytes
-from player.option_types import number
+from player.app.commands import run
+from player.app.option_types import number
+from player.files.files import check_target, write_bytes
 
 TRAIN_MINUTES = 2.0
 """Leaves room for compiling, baking and playing within five minutes on two cores."""
@@ -42,9 +42,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _demo(output: Path, minutes: float, force: bool) -> int:
     from exporters.cli import main as export
-    from player.asset import Asset
-    from player.cli import main as play
-    from player.transforms import write_cameras
+    from player.app.cli import main as play
+    from player.asset.asset import Asset
+    from player.cameras.transforms import write_cameras
     from vfr_bake.cli import bake_main, train_main
     from vfr_bake.data import load_scene
 
@@ -85,8 +85,8 @@ def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path
     frames."""
     from PIL import Image
 
-    from player.images import write_png
-    from player.transforms import frame_names
+    from player.cameras.transforms import frame_names
+    from player.files.images import write_png
     from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 
     names = frame_names(scene.test.cameras)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 from typing import Any, Literal, get_args, get_origin
 
-from player.option_types import number, whole
+from player.app.option_types import number, whole
 
 _READERS = {int: ("INT", whole()), float: ("FLOAT", number("", "2.5"))}
 

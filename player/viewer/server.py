@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from player.asset import Asset
-from player.cameras import focus_point, orbit, world_up
+from player.asset.asset import Asset
+from player.cameras.camera import focus_point, orbit, world_up
+from player.cameras.transforms import read_cameras
 from player.errors import ConfigError, MissingExtraError
 from player.render import Renderer, import_ahead
 from player.terminal import printable
-from player.transforms import read_cameras
 from player.viewer.window import Window
 
 HOST = "127.0.0.1"

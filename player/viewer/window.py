@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from player.camera_path import write_camera_path
-from player.cameras import Camera
+from player.cameras.camera import Camera
+from player.cameras.keyframes import smooth_path
+from player.cameras.nerfstudio import write_camera_path
 from player.errors import VfrError
-from player.images import png_bytes
-from player.keyframes import smooth_path
+from player.files.images import png_bytes
 from player.render import Frame, Renderer
 from player.terminal import printable
 from player.viewer.layers import LAYERS, layer_picture
-from player.viewer.pace import STILL_SECONDS, Pace, fitted
+from player.viewer.resolution import STILL_SECONDS, Pace, fitted
 
 if TYPE_CHECKING:
     from player.viewer.guard import GuardedConnection

@@ -16,10 +16,10 @@ import sys
 import time
 from pathlib import Path
 
-from player.asset import Asset
-from player.cameras import orbit
+from player.asset.asset import Asset
+from player.cameras.camera import orbit
+from player.cameras.transforms import read_cameras
 from player.render import Renderer
-from player.transforms import read_cameras
 from player.viewer.server import free_port
 
 
@@ -53,7 +53,7 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
     spoken = [Subprotocol(f"viser-v{viser.__version__}")]
     port = free_port("127.0.0.1", None)
     origin = Origin(f"http://127.0.0.1:{port}")
-    program = "import sys, player.cli as c; sys.exit(c.main())"
+    program = "import sys, player.app.cli as c; sys.exit(c.main())"
     command = [sys.executable, "-c", program, str(folder), "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     held, messages = [], 0

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from player.transforms import frame_names, read_cameras
+from player.cameras.transforms import frame_names, read_cameras
 from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 
 COMMANDS = {
     "vfr-train": "import vfr_bake.cli as c; c.train_main()",
     "vfr-bake": "import vfr_bake.cli as c; c.bake_main()",
     "vfr-eval": "import vfr_bake.cli as c; c.eval_main()",
-    "vfr-play": "import player.cli as c; c.main()",
+    "vfr-play": "import player.app.cli as c; c.main()",
     "vfr-export": "import exporters.cli as c; c.main()",
 }
 

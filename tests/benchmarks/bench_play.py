@@ -30,14 +30,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from player.asset import Asset
-from player.cameras import Camera, orbit
-from player.head_graph import read_head
-from player.march import MIN_OPACITY
-from player.option_types import positive, size
-from player.play import peak_rss_mb
+from player.app.option_types import positive, size
+from player.app.play import peak_rss_mb
+from player.asset.asset import Asset
+from player.cameras.camera import Camera, orbit
+from player.cameras.transforms import read_cameras
+from player.head.graph import read_head
+from player.march.march import MIN_OPACITY
 from player.render import Frame, Renderer, default_threads
-from player.transforms import read_cameras
 from vfr_bake.bench.process import Clock
 
 SIZES = (200, 400, 566, 800, 1131)

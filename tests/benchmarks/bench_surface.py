@@ -30,10 +30,10 @@ from exporters.asset_surface import code_and_slope, voxel_size
 from exporters.formats import Method
 from exporters.mesh import TriangleMesh
 from exporters.ply import read_ply
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
 from player.render import Renderer
-from player.transforms import read_cameras
 
 SHARP = 2
 """Rays a pixel along each side, in pictures of a mesh: photographs have no jagged edges either."""

@@ -13,12 +13,12 @@ import numpy as np
 from exporters.mesh import TriangleMesh
 from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
-from player.asset import GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.cameras import Camera
-from player.density import encode_density
-from player.manifest import Manifest
-from player.transforms import write_cameras
+from player.asset.asset import GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.density import encode_density
+from player.asset.manifest import Manifest
+from player.cameras.camera import Camera
+from player.cameras.transforms import write_cameras
 from tests.exporters.meshes import box
 from tests.player.conftest import WORLD_FROM_MODEL, linear_head, look_at
 

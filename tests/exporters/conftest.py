@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from exporters.ply import ply_bytes
-from player.asset import Asset, GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.manifest import Manifest
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.manifest import Manifest
 from tests.exporters.meshes import box
 from tests.exporters.solids import ball, cube, write_solid
 from tests.player import conftest as shells

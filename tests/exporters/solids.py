@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from exporters.ply import ply_bytes
-from player.asset import Asset, GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.density import encode_density
-from player.manifest import Manifest
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.density import encode_density
+from player.asset.manifest import Manifest
 from tests.exporters.meshes import box
 from tests.player.conftest import head_bytes, look_at
 

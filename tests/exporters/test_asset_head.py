@@ -15,9 +15,9 @@ from exporters import asset_head, cli
 from exporters.asset_head import TOLERANCE, comparisons, head_bytes
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import head_onnx
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import MissingExtraError, ParityError
-from player.head import Head
+from player.head.head import Head
 from tests.exporters.test_onnx_head import inputs, random_head
 
 

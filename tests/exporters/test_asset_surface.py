@@ -18,9 +18,9 @@ from exporters.asset_surface import (
     onto_level,
     voxel_size,
 )
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import ConfigError, MissingExtraError
-from player.normals import code_gradient
+from player.march.normals import code_gradient
 from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS, CUBE_HIGH, CUBE_LOW
 from tests.exporters.solids import ball, offset_of, write_solid
 

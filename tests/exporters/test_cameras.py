@@ -14,11 +14,11 @@ from exporters.cameras import check_cameras, moved_cameras, transforms_bytes
 from exporters.colmap import colmap_files
 from exporters.frames import FRAMES, frame_matrix
 from exporters.points import sample_points
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.rotations import quaternion, rotation_matrix
+from player.cameras.transforms import read_cameras
 from player.errors import ParityError
-from player.rotations import quaternion, rotation_matrix
-from player.transforms import read_cameras
 from tests.exporters.conftest import BOX
 from tests.exporters.meshes import box
 

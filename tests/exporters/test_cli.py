@@ -13,11 +13,11 @@ import pytest
 from exporters import cli, export
 from exporters.glb import parse_glb
 from exporters.ply import ply_bytes, read_ply
-from player.asset import GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.cameras import Camera
-from player.manifest import Manifest
-from player.transforms import write_cameras
+from player.asset.asset import GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.manifest import Manifest
+from player.cameras.camera import Camera
+from player.cameras.transforms import write_cameras
 from tests.exporters.meshes import tetrahedron
 
 # The asset's mesh is in the world already; an exporter that applies this again is far off.

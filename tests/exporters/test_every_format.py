@@ -31,8 +31,8 @@ from exporters import (
 )
 from exporters.mesh import TriangleMesh
 from exporters.volume import Volume
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
 from tests.exporters.test_export import fails
 
 WAYS = {
@@ -107,7 +107,7 @@ def test_the_old_stays_until_the_new_is_complete(
 
     for name in ("replace", "rename"):
         monkeypatch.setattr(Path, name, full)
-    monkeypatch.setattr("player.replace.exchange", lambda *_: False)
+    monkeypatch.setattr("player.files.replace.exchange", lambda *_: False)
     error = fails(call(cube_asset, tmp_path, way, "--force"), capsys)
     assert f"{target}: cannot write: No space left on device" in error or target.stem in error
     assert content(tmp_path) == before

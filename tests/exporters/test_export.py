@@ -16,9 +16,9 @@ import pytest
 from exporters import cli, export
 from exporters.formats import ExportOptions, check_options
 from exporters.ply import read_ply
-from player.asset import Asset
+from player.app.option_types import part, size
+from player.asset.asset import Asset
 from player.errors import ConfigError, ParityError
-from player.option_types import part, size
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

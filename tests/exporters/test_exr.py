@@ -13,12 +13,12 @@ import pytest
 from exporters import cli
 from exporters.colour import srgb_from_linear
 from exporters.exr import check_channels, exr_channels, exr_header, write_exr
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
 from player.errors import MissingExtraError, OutputError, ParityError, ShapeError
-from player.march import MIN_OPACITY
+from player.march.march import MIN_OPACITY
 from player.render import Frame, Renderer
-from player.transforms import read_cameras
 
 SRGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 """Of linear sRGB, as IEC 61966-2-1 has it, to four digits."""

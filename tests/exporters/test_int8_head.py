@@ -12,8 +12,8 @@ import pytest
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, head_onnx
 from player.errors import ShapeError
-from player.head_graph import read_head
-from tests.player.heads import play_in_integers
+from player.head.graph import read_head
+from tests.player.head.heads import play_in_integers
 from tests.reference import gelu, spherical_harmonics
 
 N_CHANNELS, WIDTH, N_SH = 12, 64, 4

@@ -13,9 +13,9 @@ import trimesh
 
 from exporters import cli
 from exporters.ply import read_ply
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import OutputError
-from player.files import write_together
+from player.files.files import write_together
 from tests.exporters.conftest import CUBE_HIGH, CUBE_LOW
 from tests.exporters.solids import WORLD_FROM_MODEL, offset_of
 from tests.exporters.test_export import fails

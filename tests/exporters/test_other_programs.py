@@ -21,7 +21,7 @@ from exporters import cli
 from exporters.colour import linear_from_srgb, srgb_from_linear
 from exporters.ply import read_ply
 from exporters.vdb import parse_vdb
-from player.cli import main as play
+from player.app.cli import main as play
 from tests.exporters import block
 
 pytestmark = pytest.mark.needs("programs")

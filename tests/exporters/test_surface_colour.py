@@ -8,7 +8,7 @@ import pytest
 from exporters import surface_colour
 from exporters.surface_colour import surface_colours
 from exporters.training_views import depth_views
-from player.asset import Asset
+from player.asset.asset import Asset
 from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS
 from tests.exporters.solids import WORLD_FROM_MODEL
 from tests.player.conftest import head_arrays

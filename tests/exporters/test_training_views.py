@@ -10,8 +10,8 @@ import pytest
 from exporters.asset_mesh import Removed, Scene, cleaned
 from exporters.mesh import TriangleMesh, take_faces
 from exporters.training_views import DepthView, cosines_in_view, depth_views, seen_vertices
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
 from player.errors import DataError
 from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS
 from tests.exporters.meshes import sphere

@@ -17,11 +17,11 @@ from exporters.npz import npz_bytes, parse_npz
 from exporters.parity import check_volume_bytes
 from exporters.vdb import parse_vdb, vdb_bytes
 from exporters.volume import Volume, _slope, asset_volume
-from player.asset import Asset
-from player.bricks import pack_vertices
+from player.asset.asset import Asset
+from player.asset.bricks import pack_vertices
+from player.asset.grid import build_grid
+from player.asset.vertex_rows import vertex_rows
 from player.errors import ConfigError, FormatError, ParityError, ShapeError
-from player.sparse_grid import build_grid
-from player.vertex_rows import vertex_rows
 from tests.exporters import block
 from tests.player import conftest as shells
 
@@ -132,7 +132,7 @@ def test_colours_look_down_the_slope(opened: Asset) -> None:
 
 
 def _sigmoid_head(asset: Asset, rows: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    from player.head import Head
+    from player.head.head import Head
 
     features = asset.arrays.features[rows].astype(np.float32)
     return Head(asset.path("head.onnx"), 4)(features, dirs.astype(np.float32))

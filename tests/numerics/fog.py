@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.bricks import pack_vertices
-from player.sparse_grid import SparseGrid, build_grid
+from player.asset.bricks import pack_vertices
+from player.asset.grid import SparseGrid, build_grid
 
 RESOLUTION = 16
 FEATURE = 100

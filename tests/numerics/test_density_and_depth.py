@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from player import grid_compiled, march, march_compiled
-from player.few_samples import Samples, equal_mass_bins
-from player.march import MAX_TAU
+from player.compiled import grid as grid_compiled
+from player.compiled import march as march_compiled
+from player.march import march
+from player.march.fetches import Samples, equal_mass_bins
+from player.march.march import MAX_TAU
 from vfr_bake.field.density import LARGEST_LOGIT, TruncatedExp
 from vfr_bake.rendering.compositing import composite, composite_reference
 from vfr_bake.torch_kernels.compositing import composite as composite_torch

@@ -13,17 +13,19 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from player import contracted_march, contracted_march_compiled, march, march_compiled
-from player.asset import GridArrays
-from player.bricks import bricks_per_axis
-from player.contracted_rays import MAX_SPEED
+from player.asset.asset import GridArrays
+from player.asset.bricks import bricks_per_axis
+from player.asset.grid import SPARE, SparseGrid
+from player.asset.manifest import MAX_RESOLUTION, Manifest
+from player.asset.vertex_rows import VertexRows
+from player.compiled import contracted_march as contracted_march_compiled
+from player.compiled import march as march_compiled
 from player.errors import FormatError
-from player.few_samples import MIN_TOTAL, stored_features
-from player.manifest import MAX_RESOLUTION, Manifest
-from player.sparse_grid import SPARE, SparseGrid
-from player.vertex_rows import VertexRows
-from tests.player.test_contracted_march import some_rays
-from tests.player.test_march import random_rays
+from player.march import contracted_march, march
+from player.march.contracted import MAX_SPEED
+from player.march.fetches import MIN_TOTAL, stored_features
+from tests.player.march.test_contracted_march import some_rays
+from tests.player.march.test_march import random_rays
 from vfr_bake.baking.lessons import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.stored_features import compose, descend, descend_density

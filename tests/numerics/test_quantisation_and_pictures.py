@@ -11,14 +11,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from exporters.colour import linear_from_srgb, srgb_from_linear
-from player import march, march_compiled
-from player.asset import Asset
-from player.bricks import pack_vertices
-from player.density import decode_density, encode_density
-from player.packing import pack_codes, unpack_codes
+from player.asset.asset import Asset
+from player.asset.bricks import pack_vertices
+from player.asset.density import decode_density, encode_density
+from player.asset.grid import SparseGrid, build_grid
+from player.asset.packing import pack_codes, unpack_codes
+from player.cameras.transforms import read_cameras
+from player.compiled import march as march_compiled
+from player.march import march
 from player.render import Frame, Renderer, render
-from player.sparse_grid import SparseGrid, build_grid
-from player.transforms import read_cameras
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
 from vfr_bake.baking.projection import code_step, encode_features

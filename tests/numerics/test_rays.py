@@ -12,11 +12,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from player import march, march_compiled
-from player.box import enter_box
-from player.cameras import Camera
+from player.asset.manifest import Manifest
+from player.cameras.camera import Camera
+from player.compiled import march as march_compiled
 from player.errors import FormatError
-from player.manifest import Manifest
+from player.march import march
+from player.march.box import enter_box
 from tests.numerics.fog import fog
 from tests.player.conftest import look_at
 

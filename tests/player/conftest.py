@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from exporters.onnx_head import HeadWeights, head_onnx
-from player.asset import Asset, GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.density import encode_density
-from player.manifest import Manifest
-from tests.player.oracle_march import Scene
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.density import encode_density
+from player.asset.manifest import Manifest
+from tests.player.march.oracle_march import Scene
 
 RESOLUTION = 64
 DENSITY_RANGE = (-2.0, 6.0)

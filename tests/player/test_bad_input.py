@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player import cli
-from player.manifest import VERSION
+from player.app import cli
+from player.asset.manifest import VERSION
 from tests.player.conftest import head_bytes, look_at
 
 
@@ -118,7 +118,7 @@ def test_a_size_of_nothing_and_one_for_a_warehouse(
     assert cli.main([*views, "--size", "20000x20000"]) == 1
     refused(capsys, tmp_path / "o", "expected at most 67108864 pixels (8192x8192)", "12.0 GB of memory")
     # what is large but allowed is said before it starts: here it never does
-    monkeypatch.setattr("player.play.Renderer", _NoRenderer)
+    monkeypatch.setattr("player.app.play.Renderer", _NoRenderer)
     with pytest.raises(_StartError):
         cli.main([*views, "--size", "8000x8000"])
     assert capsys.readouterr().err == "vfr-play: a picture of 8000x8000 takes 1.9 GB of memory\n"
@@ -205,7 +205,8 @@ def test_heads_that_are_not_ours(
     data: bytes, message: str, command: list[str], broken_folder: Path, tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """`capfd`: onnxruntime would print past Python. What else is refused: tests/player/test_head_graph.py."""
+    """`capfd`: onnxruntime would print past Python. What else is refused:
+    tests/player/head/test_head_graph.py."""
     replace_head(broken_folder, data)
     out = tmp_path / "o"
     assert cli.main([str(broken_folder), *(str(out) if word == "O" else word for word in command)]) == 1

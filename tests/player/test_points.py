@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.colmap import read_points
+from player.cameras.colmap import read_points
 from player.errors import FormatError
 
 

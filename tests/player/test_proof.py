@@ -12,13 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from player import kept_code, march, march_compiled, proof, proof_head
-from player.asset import Asset
-from player.cli import main
+from player import proof
+from player.app.cli import main
+from player.asset.asset import Asset
+from player.cameras.transforms import read_cameras
+from player.compiled import kept_code
+from player.compiled import march as march_compiled
 from player.errors import MissingExtraError
+from player.head import proof as proof_head
+from player.march import march
 from player.render import Renderer, choose_march
-from player.transforms import read_cameras
-from tests.player.test_march import random_rays
+from tests.player.march.test_march import random_rays
 
 DIES = "import os; os.abort()"
 WRONG = "print('wrong: 2 where 6 is right')"

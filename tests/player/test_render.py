@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player import pixels, pixels_compiled
 from player import render as render_module
-from player.asset import Asset
-from player.bounds import BLOCK, block_bounds
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
+from player.compiled import pixels as pixels_compiled
 from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
-from player.head import CHUNK, Head
-from player.images import png_bytes
-from player.march import MarchResult, march
+from player.files.images import png_bytes
+from player.head.head import CHUNK, Head
+from player.march import pixels
+from player.march.bounds import BLOCK, block_bounds
+from player.march.march import MarchResult, march
 from player.render import MAX_PIXELS, Renderer, render
-from player.transforms import read_cameras
 from tests.player.conftest import head_arrays, head_bytes, look_at
-from tests.player.oracle_march import Scene, march_ray
+from tests.player.march.oracle_march import Scene, march_ray
 
 
 @pytest.fixture
@@ -143,7 +144,7 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
         render(asset, camera, n_samples=-1)
     with pytest.raises(ConfigError, match="threads: expected at least 1, got 0"):
         Renderer(asset, 0)
-    monkeypatch.setattr("player.compiling.numba", None)
+    monkeypatch.setattr("player.compiled.compiling.numba", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[fast\]'"):
         Renderer(asset, 1, "numba")
     with Renderer(asset, 1) as renderer:

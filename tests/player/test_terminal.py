@@ -9,10 +9,10 @@ import re
 import numpy as np
 import pytest
 
-from player.asset import Asset
+from player.asset.asset import Asset
+from player.cameras.transforms import read_cameras
 from player.render import render
 from player.terminal import ROWS, half_blocks, picture_lines
-from player.transforms import read_cameras
 
 
 class Terminal(io.StringIO):

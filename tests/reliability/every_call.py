@@ -28,9 +28,9 @@ from typing import Any
 import torch
 
 from exporters.cli import main as export_main
-from player.asset import Asset
-from player.cli import main as play_main
-from player.replace import clear_up
+from player.app.cli import main as play_main
+from player.asset.asset import Asset
+from player.files.replace import clear_up
 from tests.player.conftest import write_shells
 from tests.reliability import stops
 from tests.reliability.kill import BAKE, SMALL, _write_data, contents, forked

@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 
 from exporters.ply import parse_ply
-from player.asset import Asset
-from player.bricks import bricks_per_axis, pack_vertices
-from player.compiling import available
+from player.app.info import facts, page
+from player.asset.asset import Asset
+from player.asset.bricks import bricks_per_axis, pack_vertices
+from player.asset.manifest import parse_manifest
+from player.asset.packing import pack_codes, pack_masks
+from player.asset.unpacking import PLACES
+from player.compiled.compiling import available
 from player.errors import FormatError
-from player.info import facts, page
-from player.manifest import parse_manifest
-from player.packing import pack_codes, pack_masks
 from player.render import March, Renderer
-from player.unpacking import PLACES
 from tests.reliability.fuzz_targets import Target, small_view
 from tests.reliability.mutations import broken_bytes, broken_json, broken_value
 
@@ -41,8 +41,8 @@ MARCHES: tuple[March, ...] = ("numpy", "numba") if available() else ("numpy",)
 
 def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
     """A ball and a wall, as small as they can be."""
-    from player.asset import GridArrays, write_asset
-    from player.manifest import Manifest
+    from player.asset.asset import GridArrays, write_asset
+    from player.asset.manifest import Manifest
 
     axis = np.arange(RESOLUTION + 1)
     vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from exporters.crop import parse_crop
-from player.colmap import read_points
+from player.cameras.colmap import read_points
+from player.cameras.transforms import read_cameras
+from player.cameras.views import read_views
 from player.errors import FormatError
-from player.images import png_bytes, read_key, webp_bytes
-from player.transforms import read_cameras
-from player.views import read_views
+from player.files.images import png_bytes, read_key, webp_bytes
 from tests.player.conftest import cameras_bytes, look_at
 from tests.reliability.fuzz_targets import Break, Target, written
 from tests.reliability.mutations import broken_bytes, broken_json, broken_value

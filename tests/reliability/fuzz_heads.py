@@ -12,8 +12,8 @@ import numpy as np
 import onnx
 
 from exporters.onnx_head import head_onnx
-from player.compiling import available
-from player.head import Head
+from player.compiled.compiling import available
+from player.head.head import Head
 from tests.exporters.test_onnx_head import random_head
 from tests.reliability.fuzz_targets import Target, check_colours
 from tests.reliability.mutations import broken_bytes

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 
 Break = Callable[[np.random.Generator], object]
 """Writes one broken input."""

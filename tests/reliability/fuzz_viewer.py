@@ -29,7 +29,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Origin
 
 from tests.player.conftest import write_shells
-from tests.player.viewer_client import CAMERA, SPOKEN, Server, decoded, still_serves
+from tests.player.viewer.viewer_client import CAMERA, SPOKEN, Server, decoded, still_serves
 from tests.reliability.mutations import broken_bytes
 
 N_CLIENTS = 6

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from player.packing import pack_codes, pack_masks
+from player.asset.packing import pack_codes, pack_masks
 
 BUDGET = 0.3
 """Gigabytes that the commands may take for the asset."""
@@ -186,7 +186,7 @@ RECIPES: dict[str, Callable[[Path], None]] = {
 def run_all(asset: Path, output: Path) -> dict[str, Any]:
     """Exit codes and what was printed, by command, and the most memory that was taken."""
     from exporters.cli import main as export
-    from player.cli import main as play
+    from player.app.cli import main as play
 
     budget = ["--max-memory", str(BUDGET)]
     commands: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {

@@ -29,8 +29,8 @@ import torch
 
 from exporters.cli import main as export_main
 from exporters.ply import read_ply
-from player.asset import Asset
-from player.cli import main as play_main
+from player.app.cli import main as play_main
+from player.asset.asset import Asset
 from tests.player.conftest import write_shells
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.training.model_file import load_model
@@ -100,7 +100,7 @@ def _write_data(folder: Path) -> None:
 
     from PIL import Image
 
-    from player.transforms import write_cameras
+    from player.cameras.transforms import write_cameras
     from vfr_bake.data.demo import demo_views
 
     for split, views in zip(("train", "test"), demo_views(size=16, n_train=8, n_test=1), strict=True):

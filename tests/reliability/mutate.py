@@ -254,7 +254,10 @@ def drawn_sites(seed: int) -> list[Site]:
 def is_compiled(site: Site) -> bool:
     """Whether numba compiles the file anew: those take longest, and are run last."""
     text = (REPOSITORY / site.path).read_text(encoding="utf-8")
-    return any(word in text for word in ("import njit", "player.compiling", "player.lanes", "llvmlite"))
+    return any(
+        word in text
+        for word in ("import njit", "player.compiled.compiling", "player.compiled.lanes", "llvmlite")
+    )
 
 
 def main() -> int:

@@ -24,8 +24,16 @@ REPOSITORY = Path(__file__).resolve().parent.parent.parent
 NEEDS = {"x86-64-v2": ("sse4.2", "popcnt", "ssse3"), "x86-64-v3": ("avx2", "fma", "bmi2")}
 """What this machine must have to run code for a processor of that name."""
 TESTS = (
-    *("tests/player/test_lanes.py", "tests/player/test_march.py", "tests/player/test_contracted_march.py"),
-    *("tests/player/test_head_compiled.py", "tests/player/test_scratch.py", "tests/player/test_render.py"),
+    *(
+        "tests/player/compiled/test_lanes.py",
+        "tests/player/march/test_march.py",
+        "tests/player/march/test_contracted_march.py",
+    ),
+    *(
+        "tests/player/head/test_head_compiled.py",
+        "tests/player/compiled/test_scratch.py",
+        "tests/player/test_render.py",
+    ),
     *("tests/numerics", "tests/vfr_bake/field", "tests/vfr_bake/rendering"),
     "tests/vfr_bake/baking/test_stored_features.py",
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from player.files import check_target, new_folder
+from player.files.files import check_target, new_folder
 from tests.reliability.test_reliability import run, run_program
 
 if sys.platform != "linux":
@@ -18,7 +18,8 @@ if sys.platform != "linux":
 PROGRAM = """
 import sys, threading
 from pathlib import Path
-from player import files, replace
+from player.files import files
+from player.files import replace
 from tests.reliability import stops
 if {fallback}:
     replace.exchange = lambda one, other: False

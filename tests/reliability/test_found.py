@@ -18,12 +18,12 @@ import pytest
 import torch
 
 from exporters.crop import parse_crop
-from player.asset import Asset
+from player.asset.asset import Asset
+from player.asset.manifest import NAME, parse_manifest
+from player.asset.packing import pack_codes, pack_masks
+from player.asset.unpacking import read_coords
+from player.cameras.transforms import parse_transforms, transforms_cameras
 from player.errors import ConfigError, FormatError
-from player.manifest import NAME, parse_manifest
-from player.packing import pack_codes, pack_masks
-from player.transforms import parse_transforms, transforms_cameras
-from player.unpacking import read_coords
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.hostile_files import vouch
 from vfr_bake.config import FieldConfig, field_config_from
@@ -133,7 +133,7 @@ def test_onnxruntime_calls_nobody(tmp_path: Path) -> None:
     """From 1.31 on it had a thread that looked up its maker's server, and called it."""
     (tmp_path / "head.onnx").write_bytes(head_bytes(4))
     code = (
-        "import os, sys, time; from pathlib import Path; from player.head import Head\n"
+        "import os, sys, time; from pathlib import Path; from player.head.head import Head\n"
         f"Head(Path({str(tmp_path / 'head.onnx')!r}), 4); time.sleep(0.5)\n"
         "print('onnxruntime' in sys.modules, len(os.listdir('/proc/self/task')))"
     )

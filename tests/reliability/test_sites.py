@@ -69,8 +69,8 @@ def test_a_seed_draws_the_same_sites_and_another_one_others() -> None:
 
 def test_the_likeliest_tests_come_first() -> None:
     imports = Imports(REPOSITORY)
-    own, nearest, *others = files_of_tests(imports, "player/march.py")
-    assert (own, nearest) == ("player/march.py", "tests/player/test_march.py")
+    own, nearest, *others = files_of_tests(imports, "player/march/march.py")
+    assert (own, nearest) == ("player/march/march.py", "tests/player/march/test_march.py")
     assert "tests/numerics/test_rays.py" in others and not any("exporters" in name for name in others)
     assert all(Path(REPOSITORY / name).is_file() for name in others)
 

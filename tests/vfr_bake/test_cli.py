@@ -18,7 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import DataError
 from vfr_bake.cli import EVAL_VIEWS, bake_main, eval_main, train_main
 from vfr_bake.config import TrainConfig

@@ -20,13 +20,13 @@ from exporters.asset_mesh import Removed
 from exporters.mesh import TriangleMesh
 from exporters.onnx_head import head_onnx
 from exporters.ply import ply_bytes
-from player.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.manifest import Manifest
+from player.asset.packing import pack_codes
+from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, TrainingError
-from player.files import check_target
-from player.head import Head
-from player.manifest import Manifest
-from player.packing import pack_codes
-from player.transforms import write_cameras
+from player.files.files import check_target
+from player.head.head import Head
 from vfr_bake import __version__
 from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
 from vfr_bake.baking.cells import find_cells

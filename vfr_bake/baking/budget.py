@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from player.asset import GridArrays
+from player.asset.asset import GridArrays
+from player.asset.packing import pack_codes, pack_masks
 from player.errors import TrainingError
-from player.packing import pack_codes, pack_masks
 from vfr_bake.config import BakeConfig
 
 SMALL_FILES = 200_000

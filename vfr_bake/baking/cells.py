@@ -21,7 +21,7 @@ class StoredCells(NamedTuple):
     visible: np.ndarray
     """[n, n, n] bool: cells of the features' grid, or blocks of them."""
     step: float
-    """Of the march: model units, of an unbounded scene dphi of `player.contracted_rays`."""
+    """Of the march: model units, of an unbounded scene dphi of `player.march.contracted`."""
     left_out: str | None
     """What is not stored, in words."""
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from player.contracted_rays import MAX_SPEED
 from player.errors import TrainingError
+from player.march.contracted import MAX_SPEED
 from vfr_bake.baking.views import BETWEEN, MARGIN, views_between, widened
 from vfr_bake.baking.visibility import VIEWS_OF_A_CELL, Progress, close_gaps, pixel_footprints
 from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
@@ -37,7 +37,7 @@ CELL_SHARE = 0.008
 
 
 def lattice_step(resolution: int) -> float:
-    """dphi of `player.contracted_rays` for densities on a grid of `resolution` cells.
+    """dphi of `player.march.contracted` for densities on a grid of `resolution` cells.
 
     >>> round(lattice_step(512), 5)
     0.00699

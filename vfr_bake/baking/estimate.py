@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from player.errors import ConfigError
 from vfr_bake.baking.contracted import BLOCK, CELL_SHARE, rays_of_contracted_views
 from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS

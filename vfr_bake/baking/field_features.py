@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.few_samples import MIN_TOTAL
-from player.march import MarchResult
-from player.sparse_grid import SparseGrid
+from player.asset.grid import SparseGrid
+from player.march.fetches import MIN_TOTAL
+from player.march.march import MarchResult
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.baking.lessons import corners, player_fetches
 from vfr_bake.training.model_file import Model

@@ -1,6 +1,6 @@
 """The exported head in torch, to be tuned: in float32, or as it is played in 8 bits.
 
-Letters as in `player.head_graph`. What 8 bits round, activations to 256 levels of a fixed range and weights
+Letters as in `player.head.graph`. What 8 bits round, activations to 256 levels of a fixed range and weights
 as `exporters.onnx_head.weight_scales` says, is rounded in the same places, and learns as if it were not
 (straight through).
 """
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from exporters.onnx_head import HeadWeights, Layer, Range, levels
-from player.head_graph import PAIR_LIMIT
+from player.head.graph import PAIR_LIMIT
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.asset import GridArrays
-from player.bricks import pack_vertices
-from player.density import encode_density
-from player.sparse_grid import SparseGrid, build_grid
-from player.vertex_rows import VertexRows, vertex_rows
+from player.asset.asset import GridArrays
+from player.asset.bricks import pack_vertices
+from player.asset.density import encode_density
+from player.asset.grid import SparseGrid, build_grid
+from player.asset.vertex_rows import VertexRows, vertex_rows
 from vfr_bake.baking.projection import encode_features
 from vfr_bake.baking.visibility import corners_of, subdivided
 from vfr_bake.training.model_file import Model
@@ -40,7 +40,7 @@ class Vertices:
 
     coords: np.ndarray
     masks: np.ndarray
-    """Of their bricks, as `player.bricks` has them."""
+    """Of their bricks, as `player.asset.bricks` has them."""
     index: np.ndarray
     """[n, 3] int16."""
     resolution: int

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras import Camera
+from player.asset.grid import SparseGrid
+from player.asset.vertex_rows import VertexRows
+from player.cameras.camera import Camera
 from player.errors import TrainingError
-from player.few_samples import MIN_TOTAL, Samples, equal_mass_bins, heaviest
-from player.march import MIN_OPACITY
-from player.marches import sampled_rays
-from player.sparse_grid import SparseGrid
-from player.vertex_rows import VertexRows
+from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
+from player.march.march import MIN_OPACITY
+from player.march.marches import sampled_rays
 from vfr_bake.kernels.stored_features import compose, corner_rows
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
@@ -179,7 +179,7 @@ def player_fetches(
     grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """Where the player fetches features on the rays that hit, and how much each fetch weighs, as
-    `player.march` composes them.
+    `player.march.march` composes them.
 
     Returns hits [n_hits], their opacity [n_hits], and (fetches of each hit [n_hits], places [n_fetches, 3]
     float32 in cells of the densities' grid, weights [n_fetches], lengths [n_fetches]).

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from player.asset.grid import SparseGrid
 from player.errors import TrainingError
-from player.march import MIN_OPACITY, MarchResult
+from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
-from player.sparse_grid import SparseGrid
 from vfr_bake.baking.views import views_between
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model

@@ -10,9 +10,9 @@ from exporters.asset_surface import extract_asset_surface
 from exporters.inner_region import inner_region
 from exporters.mesh import TriangleMesh
 from exporters.simplify import simplify_mesh
-from player.asset import Asset
+from player.asset.asset import Asset
+from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError
-from player.sparse_grid import SparseGrid
 
 PIXELS = 22_500
 """Of a view that is played for the mesh, at most: its faces are as large as several pixels of those."""

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from player.asset import Asset, GridArrays
-from player.cameras import Camera
+from player.asset.asset import Asset, GridArrays
+from player.asset.manifest import Manifest
+from player.cameras.camera import Camera
 from player.errors import TrainingError
-from player.manifest import Manifest
 from player.render import Renderer
 from vfr_bake.baking.presets import BakeChoice
 from vfr_bake.baking.unwritten import unwritten_asset

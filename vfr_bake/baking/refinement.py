@@ -18,8 +18,8 @@ from numba import get_num_threads
 from torch import Tensor
 
 from exporters.onnx_head import HeadWeights, Range
-from player.march import MAX_TAU
-from player.sparse_grid import SparseGrid
+from player.asset.grid import SparseGrid
+from player.march.march import MAX_TAU
 from vfr_bake.baking.folded_head import FoldedHead
 from vfr_bake.baking.lessons import Lessons, compose_into
 from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from player.asset import Asset
-from player.images import png_bytes
+from player.asset.asset import Asset
+from player.files.images import png_bytes
 from player.render import Renderer
 from vfr_bake.baking.views import views_between
 from vfr_bake.rendering.render import render_image

@@ -12,7 +12,7 @@ import numpy as np
 
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, Range
-from player.sparse_grid import SparseGrid
+from player.asset.grid import SparseGrid
 from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.head_weights import small_head

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from player.asset import Asset, GridArrays
-from player.manifest import FileEntry, Manifest
+from player.asset.asset import Asset, GridArrays
+from player.asset.manifest import FileEntry, Manifest
 
 
 def unwritten_asset(folder: Path, manifest: Manifest, arrays: GridArrays, files: dict[str, bytes]) -> Asset:

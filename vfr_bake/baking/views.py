@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from player.cameras import Camera, focus_point
-from player.keyframes import smooth_path
+from player.cameras.camera import Camera, focus_point
+from player.cameras.keyframes import smooth_path
 from vfr_bake.training.model_file import Model
 
 LARGEST_TURN = np.deg2rad(15.0)

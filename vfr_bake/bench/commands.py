@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from vfr_bake.baking.presets import PRESETS
 from vfr_bake.config import BakeConfig
 

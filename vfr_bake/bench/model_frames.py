@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from player.play import peak_rss_mb
-from player.transforms import read_cameras
+from player.app.play import peak_rss_mb
+from player.cameras.transforms import read_cameras
 from vfr_bake.bench.process import Answer, serve
 
 

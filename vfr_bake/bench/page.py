@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from player.images import png_bytes
+from player.files.images import png_bytes
 from vfr_bake.baking.report import STYLE
 from vfr_bake.bench.plot import Mark, plot
 from vfr_bake.bench.result import Setting, Trade

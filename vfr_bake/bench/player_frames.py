@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from player.asset import Asset
-from player.march import MIN_OPACITY
-from player.play import peak_rss_mb
+from player.app.play import peak_rss_mb
+from player.asset.asset import Asset
+from player.cameras.transforms import read_cameras
+from player.march.march import MIN_OPACITY
 from player.render import Renderer
-from player.transforms import read_cameras
 from vfr_bake.bench.process import Answer, Clock, serve
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from player.app.option_types import size
 from player.errors import ConfigError
-from player.option_types import size
 
 Size = tuple[int, int]
 """Width and height in pixels."""

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from player.asset import Asset
-from player.cameras import Camera
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
 from player.render import bounded_threads
-from player.transforms import write_cameras
 from vfr_bake.bench.commands import bake_command, eval_command, play_command
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import Setting, Trade, conclude

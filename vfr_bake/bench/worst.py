@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.asset import Asset
-from player.cameras import Camera
-from player.marches import sampled_rays
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.march.marches import sampled_rays
 
 N_WORST = 10
 APART = 8

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from player.cameras import Camera, focus_point
+from player.cameras.camera import Camera, focus_point
 
 N_CELLS = 64
 MARGIN_CELLS = 1.5

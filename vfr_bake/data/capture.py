@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from player.errors import ShapeError
 
 HOLD_OUT_EVERY = 8

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from player.cameras import Camera
-from player.colmap import colmap_folder, read_cameras, read_images, read_points
+from player.cameras.camera import Camera
+from player.cameras.colmap import colmap_folder, read_cameras, read_images, read_points
 from player.errors import DataError, FormatError
 from vfr_bake.data.capture import Capture, counter, held_out
 from vfr_bake.data.pictures import read_pictures

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo_shading import shade
 from vfr_bake.data.demo_solids import (

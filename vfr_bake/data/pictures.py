@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from player.errors import DataError, FormatError, MissingExtraError
-from player.files import open_file, read_bytes
-from player.images import MAX_FILE_BYTES, open_picture
+from player.files.files import open_file, read_bytes
+from player.files.images import MAX_FILE_BYTES, open_picture
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.threads import in_threads
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from player.colmap import MAX_FILE_BYTES
+from player.cameras.colmap import MAX_FILE_BYTES
 from player.errors import DataError, FormatError
-from player.files import new_folder, read_bytes
-from player.images import open_picture
+from player.files.files import new_folder, read_bytes
+from player.files.images import open_picture
 from vfr_bake.data import video
 from vfr_bake.data.features import Features, find_features, pairs_to_match
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras import Camera, focus_point
+from player.cameras.camera import Camera, focus_point
 from player.errors import DataError
 from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box

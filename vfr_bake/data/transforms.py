@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError
-from player.transforms import load_transforms, transforms_cameras, transforms_number
 from vfr_bake.data.capture import Capture, counter, held_out
 from vfr_bake.data.pictures import SUFFIXES, picture_size, read_pictures
 

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from player.errors import DataError, MissingExtraError
-from player.files import new_folder
+from player.files.files import new_folder
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 N_FRAMES = 80

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from player.prefetch import prefetch
+from player.compiled.prefetch import prefetch
 from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from player.prefetch import prefetch
+from player.compiled.prefetch import prefetch
 from vfr_bake.kernels import njit
 
 PRIME_Y = np.uint32(2654435761)

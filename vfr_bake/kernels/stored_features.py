@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from player.prefetch import prefetch
+from player.compiled.prefetch import prefetch
 from vfr_bake.kernels import njit
 
 BLOCK = 64
@@ -178,7 +178,7 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
 @njit(parallel=True, cache=True)
 def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, shares):
     """The stored corners around `points` [n, 3] float32 of a grid (cells): `rows` [n, 8] and trilinear
-    `shares` [n, 8], 0 where a corner is not stored. As `player.few_samples` states.
+    `shares` [n, 8], 0 where a corner is not stored. As `player.march.fetches` states.
 
     With a `least` above 0, shares are of what is stored: divided by their sum, and all 0 where that is
     below it.

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.samples import Samples

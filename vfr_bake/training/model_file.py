@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
+from player.cameras.transforms import parse_transforms, transforms_cameras, write_cameras
 from player.errors import ConfigError, FormatError, VersionError
-from player.json_files import brief
-from player.transforms import parse_transforms, transforms_cameras, write_cameras
+from player.files.json_files import brief
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout

@@ -18,9 +18,9 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 
 from player.errors import FormatError
-from player.files import file_size, open_file, write_bytes
-from player.json_files import brief
-from player.memory import allowed_bytes, check_memory
+from player.files.files import file_size, open_file, write_bytes
+from player.files.json_files import brief
+from player.files.memory import allowed_bytes, check_memory
 
 COPIES = 3
 """Of a file's tensors in memory, at most: what is read, what it is restored into, and what is checked."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import CENTRE, SCALE, demo_cameras
 from vfr_bake.data.scene import Scene, build_scene

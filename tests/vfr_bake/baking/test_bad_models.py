@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import ConfigError, TrainingError
 from player.render import render
 from vfr_bake.baking.bake import bake

@@ -16,13 +16,13 @@ import torch
 
 from exporters.onnx_head import head_onnx
 from exporters.ply import read_ply
-from player.asset import Asset
-from player.bricks import pack_vertices
-from player.cameras import orbit
+from player.asset.asset import Asset
+from player.asset.bricks import pack_vertices
+from player.asset.vertex_rows import vertex_rows
+from player.cameras.camera import orbit
 from player.errors import ConfigError, OutputError, TrainingError
-from player.march import march
+from player.march.march import march
 from player.render import render
-from player.vertex_rows import vertex_rows
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.budget import SMALL_FILES
 from vfr_bake.baking.folded_head import FoldedHead

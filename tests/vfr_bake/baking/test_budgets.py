@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from player.errors import TrainingError
 from vfr_bake.baking import estimate, pace
 from vfr_bake.baking.bake import bake

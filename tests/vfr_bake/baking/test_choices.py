@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene
 from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake

@@ -11,13 +11,13 @@ import torch
 
 from exporters.export import export_asset
 from exporters.ply import read_ply
-from player import contracted_march_compiled
-from player.asset import Asset
-from player.cameras import Camera
-from player.contracted_rays import enter_space
-from player.contraction import contract
+from player.asset.asset import Asset
+from player.asset.vertex_rows import vertex_rows
+from player.cameras.camera import Camera
+from player.compiled import contracted_march as contracted_march_compiled
+from player.march.contracted import enter_space
+from player.march.contraction import contract
 from player.render import render
-from player.vertex_rows import vertex_rows
 from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.contracted import lattice_step, weighty_cells
@@ -118,7 +118,7 @@ def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
 
 def depth_at_the_mean_angle(model: Model, asset: Asset, camera: Camera) -> np.ndarray:
     """[n] the model's depth as the player states it: t where the angle is the mean over the weights
-    (`player.contracted_rays`). In a fog it is nearer than the mean t."""
+    (`player.march.contracted`). In a fog it is nearer than the mean t."""
     rays_o, rays_d = camera.rays()
     rays = enter_space(asset.grid, rays_o, rays_d)
     samples = model.sampler.sample_all(model.field, rays_o, rays_d)

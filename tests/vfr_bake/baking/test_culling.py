@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from player.asset import Asset
+from player.asset.asset import Asset
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.culling import FLOORS, cull, whole
 from vfr_bake.baking.loss import HeldOut, expected_loss

@@ -20,7 +20,7 @@ from torch.nn.functional import gelu
 from exporters.asset_head import comparisons, head_bytes
 from exporters.int8_head import activation_ranges
 from exporters.onnx_head import HeadWeights, Range, head_onnx, weight_scales
-from player.asset import Asset
+from player.asset.asset import Asset
 from tests.exporters import block
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.config import FieldConfig

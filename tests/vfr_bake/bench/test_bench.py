@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player.asset import Asset, GridArrays, write_asset
-from player.bricks import pack_vertices
-from player.cameras import Camera
-from player.manifest import CONTRACTED_AABB, Manifest
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.manifest import CONTRACTED_AABB, Manifest
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras, write_cameras
 from player.render import render
-from player.transforms import read_cameras, write_cameras
 from tests.player.conftest import head_bytes
-from tests.player.contracted_scene import RANGE, RESOLUTION, STEP, vertices_and_codes
+from tests.player.march.contracted_scene import RANGE, RESOLUTION, STEP, vertices_and_codes
 from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.cameras import Camera
-from player.transforms import read_cameras
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
 from vfr_bake.data.bounds import _dilated, scene_box
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.pictures import read_picture

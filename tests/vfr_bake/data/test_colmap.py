@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from player.cameras import Camera
-from player.colmap import OPENGL_FROM_OPENCV, read_cameras, read_images, read_points
+from player.cameras.camera import Camera
+from player.cameras.colmap import OPENGL_FROM_OPENCV, read_cameras, read_images, read_points
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_folder, load_scene
 from vfr_bake.data.demo import demo_cameras

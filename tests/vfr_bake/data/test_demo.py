@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from vfr_bake.data import demo as module
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import (

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from player.cameras.views import read_views
 from player.errors import DataError, FormatError
-from player.views import read_views
 from vfr_bake.data import load_scene
 from vfr_bake.data.pictures import read_picture
 

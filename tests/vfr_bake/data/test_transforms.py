@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
 from player.errors import DataError, FormatError, MissingExtraError
-from player.transforms import read_cameras
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.pictures import read_picture, undistort

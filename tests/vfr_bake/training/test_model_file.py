@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from player.cameras import Camera
+from player.cameras.camera import Camera
 from player.errors import FormatError, VersionError
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField

@@ -1,0 +1,1 @@
+"""vfr-play: its command line, and how frames are rendered into files."""

@@ -1,0 +1,145 @@
+"""`vfr-play --info` and `--check`: what is in an asset, in words and as numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.asset.asset import Asset
+from player.asset.manifest import Manifest
+from player.cameras.transforms import read_cameras
+from player.head.head import read_head_file
+from player.march.contracted import MAX_SPEED
+from player.terminal import printable
+
+MANIFEST_KEYS = (
+    "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
+    "near", "step", "n_samples", "density_range", "n_channels", "background", "colour_space", "view_size",
+    "provenance",
+)  # fmt: skip
+
+CONTENT = {
+    "features.codes": "what the head is given",
+    "density.codes": "where there is something",
+    "brick_masks.bits": "which densities are stored",
+    "brick_coords.npy": "where their bricks are",
+    "feature_masks.bits": "which features are stored",
+    "feature_coords.npy": "where their bricks are",
+    "head.onnx": "features to colour",
+    "mesh.ply": "the surface, for other programs",
+    "cameras.json": "the training cameras",
+}
+
+
+def facts(asset: Asset) -> dict[str, Any]:
+    """Everything that `--info` knows, as JSON has it."""
+    m = asset.manifest
+    _, head = read_head_file(asset.path("head.onnx"), m.n_channels)
+    return {
+        "bytes": {name: entry.bytes for name, entry in sorted(m.files.items())},
+        "bytes_total": sum(entry.bytes for entry in m.files.values()),
+        "n_bricks": len(asset.arrays.brick_coords),
+        "n_vertices": len(asset.arrays.density),
+        "n_feature_vertices": len(asset.arrays.features),
+        "head_parameters": head.n_parameters,
+        "n_cameras": len(read_cameras(asset.path("cameras.json"), (m.view_size[0], m.view_size[1]))),
+        "world_box": _world_box(asset),
+        "world_units_per_model_unit": asset.scale,
+        **{key: getattr(m, key) for key in MANIFEST_KEYS},
+    }
+
+
+def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
+    """The lines of a page for people, without control characters, whatever the manifest holds."""
+    low, high = known["world_box"]
+    scale = known["world_units_per_model_unit"]
+    total = known["bytes_total"]
+    size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
+    share = known["n_vertices"] / (m.resolution + 1) ** 3
+    lines = [
+        f"{folder}: {_megabytes(total)}, {known['n_cameras']} training views of "
+        f"{m.view_size[0]}x{m.view_size[1]}",
+        f"vfr-asset {m.version[0]}.{m.version[1]}, written by {m.generator}",
+        *_section("files", [
+            (name, f"{_megabytes(n):>9}  {_bar(n / max(total, 1))}  {CONTENT.get(name, '')}")
+            for name, n in sorted(known["bytes"].items(), key=lambda item: -item[1])
+        ]),
+        *_section("scene", [
+            ("inner region" if m.contracted else "world box",
+             f"{size} units, from {_numbers(low)} to {_numbers(high)}"),
+            *([("around it", "the rest of space, contracted"),
+               ("shown", f"{m.near * scale:.3g} units before a camera and beyond")] if m.contracted else []),
+            ("world units", f"{scale:.5g} in a model unit"),
+            ("colours", f"{m.colour_space}, over {_numbers(m.background)}"),
+        ]),
+        *_section("how it is rendered", [
+            ("grid", f"{m.resolution} cells per axis, {known['n_vertices']:,} vertices stored "
+             f"({share:.2%}) in {known['n_bricks']:,} bricks of 8 x 8 x 8"),
+            ("features", f"{m.feature_resolution} cells per axis, {known['n_feature_vertices']:,} vertices "
+             f"of {m.n_channels} channels of 8 bits, fetched "
+             f"{f'at {m.n_samples} places a ray' if m.n_samples else 'at every sample'}"),
+            ("step", _step(m, scale)),
+            ("head", f"{known['head_parameters']:,} parameters, once a pixel"),
+        ]),
+    ]  # fmt: skip
+    lines += _section("provenance", list(_flat(m.provenance)))
+    name = str(folder)
+    lines += _section("to look at it", [
+        ("in a browser", f"vfr-play {name}"),
+        ("pictures", f"vfr-play {name} --orbit 60 --output frames/"),
+    ])  # fmt: skip
+    return [printable(line) for line in lines]
+
+
+def _section(title: str, rows: list[tuple[str, str]]) -> list[str]:
+    if not rows:
+        return []
+    width = max(len(key) for key, _ in rows)
+    return ["", title, *(f"  {key:<{width}}  {value}" for key, value in rows)]
+
+
+def _flat(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """One row a number: objects inside objects get their names joined by dots."""
+    for key, value in sorted(values.items()):
+        name = f"{above}{key}"
+        if isinstance(value, dict) and value:
+            yield from _flat(value, f"{name}.")
+        else:
+            text = f"{value:,.5g}" if isinstance(value, float) else json.dumps(value)
+            yield name, text if len(text) < 90 else f"{text[:87]}..."
+
+
+def _numbers(values: Any, form: Callable[[float], str] = "{:.4g}".format) -> str:
+    return ", ".join(form(value) for value in values)
+
+
+def _megabytes(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 1e5 else f"{n_bytes / 1e3:.1f} kB"
+
+
+def _bar(share: float) -> str:
+    return ("#" * round(20 * share)).ljust(20, ".")
+
+
+def _edge(m: Manifest) -> float:
+    return max(high - low for low, high in zip(*m.aabb, strict=True))
+
+
+def _step(m: Manifest, scale: float) -> str:
+    cells = m.step * m.resolution / _edge(m)
+    if m.contracted:
+        return f"an angle of {m.step:.5g}, {cells * MAX_SPEED:.2g} of a cell at most"
+    return f"{m.step * scale:.5g} world units, {cells:.2g} of a cell"
+
+
+def _world_box(asset: Asset) -> list[list[float]]:
+    """Least and greatest world coordinates of the box's corners; in contracted space of the cube around what
+    is not contracted."""
+    box = np.array(asset.manifest.aabb) / (2 if asset.manifest.contracted else 1)
+    corners = np.array([[box[i, 0], box[j, 1], box[k, 2], 1] for i, j, k in np.ndindex(2, 2, 2)])
+    world = (corners @ asset.world_from_model.T)[:, :3]
+    return [world.min(axis=0).tolist(), world.max(axis=0).tolist()]

@@ -1,0 +1,184 @@
+"""The command line of `vfr-play`: its options, and which of them goes with what it is to do."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from player.app.option_types import background, gigabytes, number, part, positive, size, whole
+
+PICTURES = (".png", ".webp")
+VIDEO = ".mp4"
+
+MAX_MEMORY = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
+
+MOST_VIEWS = 100_000
+"""Pictures of an orbit: an hour of a video at 30 frames a second has 108,000."""
+
+EXAMPLES = """examples:
+  vfr-play out/                                                        look at it in a browser
+  vfr-play fidelity/ balanced/ fast/                                   and switch between bakes of a scene
+  vfr-play out/ --info
+  vfr-play out/ --check
+  vfr-play out/ --view 3 --output view.png
+  vfr-play out/ --orbit 60 --output frames/ --size 800x800 --background black
+  vfr-play out/ --orbit 120 --output turn.mp4 --fps 30
+  vfr-play out/ --cameras transforms_test.json --output frames/ --frames 10:20
+  vfr-play out/ --cameras camera_path.json --output turn.mp4 --resume
+
+exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 unread output
+"""
+
+MODES = {
+    "viewer": "the viewer, which opens without views and --output",
+    "files": "pictures and videos, with --output and --cameras, --orbit or --view",
+    "info": "--info",
+    "check": "--check",
+}
+"""What `vfr-play` does, in words."""
+
+_FILES = ("files",)
+_RENDERS = ("viewer", "files")
+USED_BY = {
+    "others": ("viewer",),
+    "cameras": _FILES,
+    "orbit": _FILES,
+    "view": _FILES,
+    "info": ("info",),
+    "check": ("check",),
+    "output": _FILES,
+    "format": _FILES,
+    "frames": _FILES,
+    "fps": _FILES,
+    "resume": _FILES,
+    "force": _FILES,
+    "json": ("files", "info", "check"),
+    "dask": _FILES,
+    "size": _FILES,
+    "background": _RENDERS,
+    "samples": _RENDERS,
+    "threads": _RENDERS,
+    "march": _RENDERS,
+    "max_memory": tuple(MODES),
+    "host": ("viewer",),
+    "port": ("viewer",),
+}
+"""Where an option does something, for every one of them."""
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """The options; leaves by SystemExit as argparse does."""
+    parser = make_parser()
+    arguments = parser.parse_args(argv)
+    _check_together(parser, arguments)
+    if arguments.frames is None:
+        arguments.frames = slice(None)
+    if arguments.march is None:
+        arguments.march = "auto"
+    return arguments
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """What is not given is None, False or an empty list."""
+    parser = argparse.ArgumentParser(
+        prog="vfr-play",
+        description="Look at a baked asset in a browser, or render it to files, on the CPU.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("asset", type=Path, help="folder of the asset")
+    add("others", type=Path, nargs="*", metavar="asset", help="more of them, to switch to in the viewer")
+    views = parser.add_argument_group("views").add_mutually_exclusive_group()
+    views.add_argument(
+        "--cameras",
+        type=Path,
+        metavar="FILE",
+        help="those of a transforms.json, a nerfstudio camera_path.json or a COLMAP folder",
+    )
+    views.add_argument(
+        "--orbit", type=whole(1, MOST_VIEWS, 60), metavar="N", help="a turn around the scene in N pictures"
+    )
+    views.add_argument(
+        "--view", type=whole(example=3), metavar="N", help="training view N, from 0; -1 is the last one"
+    )
+    views.add_argument("--info", action="store_true", help="no view: say what is in the asset")
+    views.add_argument("--check", action="store_true", help="no view: compare every file with its checksum")
+    _add_files(parser.add_argument_group("files"))
+    add = parser.add_argument_group("pictures").add_argument
+    add("--size", type=size, metavar="WxH", help="their size (the camera file's, else as trained)")
+    add(
+        "--background",
+        type=background,
+        metavar="COLOUR",
+        help="white, black, transparent or R,G,B in 0..255",
+    )
+    add("--samples", type=whole(0), metavar="K", help="fetches a ray (the asset's own); 0: at every sample")
+    add("--threads", type=positive, metavar="N", help="threads (one for each core)")
+    add("--march", choices=("auto", "numpy", "numba"), help="implementation (numba if there)")
+    add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
+    add = parser.add_argument_group("viewer").add_argument
+    add("--host", metavar="ADDRESS", help="address to serve at (127.0.0.1: this machine alone)")
+    add("--port", type=whole(1, 65535, 8080), metavar="N", help="port (8080, or the next that is free)")
+    return parser
+
+
+def _add_files(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--output", type=Path, metavar="PATH", help="folder, or one picture (.png, .webp), or a video (.mp4)")
+    add("--format", choices=("png", "webp"), help="of the pictures in a folder (png)")
+    add("--frames", type=part, metavar="A:B", help="a slice of the views, as in Python")
+    add(
+        "--fps",
+        type=number("frames a second", "30", 0, 1000),
+        metavar="N",
+        help="frames a second of a video (the camera path's, else 30)",
+    )
+    add("--resume", action="store_true", help="go on where an interrupted run with these options stopped")
+    add("--force", action="store_true", help="replace what is there")
+    add("--json", metavar="FILE", help="write figures as JSON; - is standard output")
+    add("--dask", metavar="ADDRESS", help="render on the Dask cluster whose scheduler is at tcp://HOST:PORT")
+
+
+def given(arguments: argparse.Namespace) -> list[str]:
+    """The names of the options that are on the command line, in the order of USED_BY."""
+    values = vars(arguments)
+    return [name for name in USED_BY if values[name] not in (None, []) and values[name] is not False]
+
+
+def _mode(arguments: argparse.Namespace) -> str:
+    if arguments.info or arguments.check:
+        return "info" if arguments.info else "check"
+    views = (arguments.cameras, arguments.orbit, arguments.view, arguments.output)
+    return "viewer" if all(value is None for value in views) else "files"
+
+
+def _check_together(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
+    mode = _mode(a)
+    lost = [name for name in given(a) if mode not in USED_BY[name]]
+    if lost and lost[0] == "others":
+        parser.error(f"{a.others[0]}: one asset at a time, but in the viewer")
+    if lost:
+        parser.error(
+            f"--{lost[0]}: does nothing for {MODES[mode].split(',')[0]}; it is for "
+            + ", or for ".join(MODES[used] for used in USED_BY[lost[0]])
+        )
+    if mode == "files":
+        _check_files(parser, a)
+
+
+def _check_files(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
+    output: Path | None = a.output
+    if output is None:
+        parser.error("--output: add where the pictures go: --output DIR, FILE.png, FILE.webp or FILE.mp4")
+    if a.cameras is None and a.orbit is None and a.view is None:
+        parser.error("--output: add the views: --cameras FILE, --orbit N or --view N")
+    if a.resume and a.force:
+        parser.error("--resume: not allowed with --force, which renders everything anew")
+    suffix = output.suffix.lower()
+    if a.format is not None and suffix in (*PICTURES, VIDEO):
+        parser.error(f"--format: {output.name} says which format it is")
+    if a.fps is not None and suffix != VIDEO:
+        parser.error(f"--fps: expected a video, got --output {output}")
+    if a.background == "transparent" and suffix == VIDEO:
+        parser.error("--background: a video has no transparency")

@@ -1,0 +1,385 @@
+"""The format `vfr-asset`, version 3.1: this docstring is its specification, the module parses and writes
+the manifest.
+
+An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved. What is
+packed is so as `player.asset.packing` describes; .npy files have version 1.0 and the header that numpy
+writes.
+
+| file | content |
+|---|---|
+| `manifest.json` | what is described below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
+| `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
+| `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed |
+| `density.codes` | uint8 [n_vertices], codes, packed |
+| `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
+| `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored, packed |
+| `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed |
+| `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
+| `mesh.ply` | the surface with vertex colours, world frame |
+| `cameras.json` | the training cameras as transforms.json with sizes, world frame |
+| `report.json`, `report.html` | what the bake measured; for people, no player reads them; may be absent |
+
+GRID. The box `aabb`, in the model frame, has `resolution` R cells and R + 1 vertices along each axis;
+vertex i is at `lo + i (hi - lo) / R`. Vertices are stored in bricks of 8 x 8 x 8 as `player.asset.bricks`
+describes. A cell is live when its eight corners are stored; outside live cells the density is 0. Features
+have a grid of their own over the same box, of `feature_resolution` cells: where a surface is has to be known
+more finely than what colour it has.
+
+CONTRACTED. Where `contracted` is true the box is [-2, 2]^3 of contracted coordinates
+(`player.march.contraction`), which are those of the model frame inside its unit ball and hold the rest of
+space around it. Rays begin `near` model units from the camera: the model has been taught nothing that is
+nearer to one.
+
+DENSITY. `log sigma = lo + (hi - lo) code / 255` with `density_range`; the code is interpolated, sigma is
+per model unit.
+
+FEATURES. The features of a ray are the sum of weight times trilinear code; scales are folded into the head.
+`dirs` are unit directions in the model frame.
+
+MARCH. `player.march.march`, with the step `step`; `player.march.contracted_march` where `contracted` is true.
+`n_samples` fetches as `player.march.fetches` chooses them.
+
+COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
+
+| key | type | meaning |
+|---|---|---|
+| `format` | "vfr-asset" | |
+| `version` | [major, minor] | [3, 1]; unknown keys of a newer minor are ignored |
+| `generator` | text | the program that wrote the asset |
+| `resolution` | integer, 1..2048 | cells per axis of the density |
+| `feature_resolution` | integer, 1..2048 | cells per axis of the features |
+| `aabb` | 2 x 3 numbers | box, model frame |
+| `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
+| `contracted` | true or false | |
+| `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted; 0 in 3.0, which lacks it |
+| `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
+| `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
+| `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
+| `n_channels` | integer, 1..1024 | |
+| `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
+| `colour_space` | "srgb" | |
+| `view_size` | 2 integers | width and height of the training pictures |
+| `files` | object | name: {`bytes`: integer, `sha256`: 64 hexadecimal digits}, every file but the manifest |
+| `provenance` | object | settings and measured figures, free form |
+
+Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
+History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports; 2.1,
+contracted; 3.0, features have a grid of their own; 3.1, near.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from player.errors import FormatError, VersionError
+
+FORMAT = "vfr-asset"
+VERSION = (3, 1)
+NAME = "manifest.json"
+FILES = (
+    "brick_coords.npy",
+    "brick_masks.bits",
+    "density.codes",
+    "feature_coords.npy",
+    "feature_masks.bits",
+    "features.codes",
+    "head.onnx",
+    "mesh.ply",
+    "cameras.json",
+)
+MAX_BYTES = 16 << 20
+MAX_VALUES = 1 << 20
+MAX_RESOLUTION = 2048
+MAX_STEPS = 65536
+CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+
+Vector = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FileEntry:
+    """Size and checksum of one file."""
+
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """The manifest; its fields are the keys above. Built by the bake or by `parse_manifest`, checked either
+    way.
+
+    >>> manifest = Manifest(generator="doctest", resolution=8, feature_resolution=4, step=0.2,
+    ...     density_range=(-5, 5), n_channels=4, view_size=(4, 3))
+    >>> parse_manifest(manifest_bytes(manifest), "manifest.json", complete=False) == manifest
+    True
+    """
+
+    generator: str
+    resolution: int
+    feature_resolution: int
+    step: float
+    density_range: Vector
+    n_channels: int
+    view_size: tuple[int, ...]
+    aabb: tuple[Vector, ...] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    world_from_model: tuple[Vector, ...] = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
+    contracted: bool = False
+    near: float = 0.0
+    n_samples: int = 5
+    background: Vector = (1.0, 1.0, 1.0)
+    colour_space: str = "srgb"
+    files: dict[str, FileEntry] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    version: tuple[int, ...] = VERSION
+
+    def __post_init__(self) -> None:
+        for key, parse in _PARSERS.items():
+            object.__setattr__(self, key, parse(f"manifest: {key}", getattr(self, key)))
+        _check_together(self)
+
+
+def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
+    """Bytes of `manifest.json` to a Manifest.
+
+    Args:
+        data: the file's bytes.
+        where: what to call the file in messages.
+        complete: whether every file of the format must be listed.
+
+    Raises:
+        VersionError: written for another major version.
+        FormatError: anything else that the specification does not allow.
+    """
+    if len(data) > MAX_BYTES:
+        raise FormatError(f"{where}: size: expected at most {MAX_BYTES} bytes, got {len(data)}")
+    n_values = 1 + sum(map(data.count, (b",", b"[", b"{")))
+    if n_values > MAX_VALUES:
+        raise FormatError(f"{where}: expected at most {MAX_VALUES} values, got about {n_values}")
+    try:
+        document = json.loads(
+            data.decode(), parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_each_once
+        )
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{where}: expected JSON, got something else: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
+    version = _parse_version(f"{where}: version", document.get("version"))
+    if version < (3, 1):
+        document.setdefault("near", 0.0)
+    known = {f.name for f in fields(Manifest)}
+    missing = sorted(known - set(document))
+    if missing:
+        raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
+    unknown = sorted(set(document) - known - {"format"})
+    if unknown and version <= VERSION:
+        raise FormatError(
+            f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
+        )
+    values = {}
+    for key in known:
+        values[key] = _PARSERS[key](f"{where}: {key}", document[key])
+    absent = [name for name in FILES if name not in values["files"]]
+    if complete and absent:
+        raise FormatError(f"{where}: files: expected {absent[0]}, got {sorted(values['files'])}")
+    return Manifest(**values)
+
+
+def manifest_bytes(manifest: Manifest) -> bytes:
+    """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
+    document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
+    document["format"] = FORMAT
+    document["files"] = {
+        name: {"bytes": entry.bytes, "sha256": entry.sha256} for name, entry in manifest.files.items()
+    }
+    try:
+        return (json.dumps(document, sort_keys=True, indent=1, allow_nan=False) + "\n").encode()
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"manifest: provenance: expected finite JSON values: {error}") from error
+
+
+def _refuse(text: str) -> float:
+    raise ValueError(f"{text} is not a number of JSON")
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key that is there twice")
+    return found
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _refuse(text)
+
+
+def _show(value: object) -> str:
+    text = repr(value)
+    return text if len(text) < 80 else text[:77] + "..."
+
+
+def _parse_version(where: str, value: object) -> tuple[int, ...]:
+    version = _integers(2, 0, 1 << 20)(where, value)
+    if version[0] != VERSION[0]:
+        raise VersionError(
+            f"{where}: expected {VERSION[0]}.x, got {version[0]}.{version[1]}: "
+            f"{'install a newer vfr-bake' if version > VERSION else 'bake the asset again'}"
+        )
+    return version
+
+
+def _text(where: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise FormatError(f"{where}: expected text, got {_show(value)}")
+    return value
+
+
+def _boolean(where: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise FormatError(f"{where}: expected true or false, got {_show(value)}")
+    return value
+
+
+def _one_of(*allowed: str) -> Callable[[str, object], str]:
+    def parse(where: str, value: object) -> str:
+        if value not in allowed:
+            raise FormatError(f"{where}: expected one of {list(allowed)}, got {_show(value)}")
+        return str(value)
+
+    return parse
+
+
+def _integer(low: int, high: int) -> Callable[[str, object], int]:
+    def parse(where: str, value: object) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise FormatError(f"{where}: expected an integer in {low}..{high}, got {_show(value)}")
+        return int(value)
+
+    return parse
+
+
+def _integers(count: int, low: int, high: int) -> Callable[[str, object], tuple[int, ...]]:
+    def parse(where: str, value: object) -> tuple[int, ...]:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise FormatError(f"{where}: expected {count} integers, got {_show(value)}")
+        return tuple(_integer(low, high)(where, item) for item in value)
+
+    return parse
+
+
+def _number(low: float, high: float) -> Callable[[str, object], float]:
+    def parse(where: str, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise FormatError(f"{where}: expected a number in {low:g}..{high:g}, got {_show(value)}")
+        return float(value)
+
+    return parse
+
+
+def _numbers(count: int, low: float = -1e9, high: float = 1e9) -> Callable[[str, object], Vector]:
+    def parse(where: str, value: object) -> Vector:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise FormatError(f"{where}: expected {count} numbers, got {_show(value)}")
+        return tuple(_number(low, high)(where, item) for item in value)
+
+    return parse
+
+
+def _matrix(rows: int, columns: int) -> Callable[[str, object], tuple[Vector, ...]]:
+    def parse(where: str, value: object) -> tuple[Vector, ...]:
+        if not isinstance(value, list | tuple) or len(value) != rows:
+            raise FormatError(f"{where}: expected {rows} rows of {columns} numbers, got {_show(value)}")
+        return tuple(_numbers(columns)(where, row) for row in value)
+
+    return parse
+
+
+def _similarity(where: str, value: object) -> tuple[Vector, ...]:
+    matrix = _matrix(4, 4)(where, value)
+    columns = [[matrix[i][j] for i in range(3)] for j in range(3)]
+    gram = [[sum(a * b for a, b in zip(u, v, strict=True)) for v in columns] for u in columns]
+    (a, d, g), (b, e, h), (c, f, i) = columns
+    scale = gram[0][0]
+    is_similarity = (
+        scale > 0
+        and all(
+            abs(gram[p][q] - (scale if p == q else 0)) <= 1e-4 * scale for p in range(3) for q in range(3)
+        )
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+        and matrix[3] == (0, 0, 0, 1)
+    )
+    if not is_similarity:
+        raise FormatError(f"{where}: expected a rotation, one scale and a translation, got {_show(value)}")
+    return matrix
+
+
+def _files(where: str, value: object) -> dict[str, FileEntry]:
+    if not isinstance(value, dict):
+        raise FormatError(f"{where}: expected an object, got {_show(value)}")
+    entries = {}
+    for name, entry in value.items():
+        if (
+            not isinstance(name, str)
+            or not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,199}", name)
+            or name == NAME
+        ):
+            raise FormatError(f"{where}: expected plain file names, got {_show(name)}")
+        if isinstance(entry, FileEntry):
+            entry = {"bytes": entry.bytes, "sha256": entry.sha256}
+        if not isinstance(entry, dict) or not {"bytes", "sha256"} <= set(entry):
+            raise FormatError(f"{where}: {name}: expected bytes and sha256, got {_show(entry)}")
+        size = _integer(0, 1 << 50)(f"{where}: {name}: bytes", entry["bytes"])
+        digest = _text(f"{where}: {name}: sha256", entry["sha256"])
+        if not re.fullmatch(r"[0-9a-f]{64}", digest):
+            raise FormatError(f"{where}: {name}: sha256: expected 64 hexadecimal digits, got {_show(digest)}")
+        entries[name] = FileEntry(size, digest)
+    return entries
+
+
+def _object(where: str, value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise FormatError(f"{where}: expected an object, got {_show(value)}")
+    return value
+
+
+def _check_together(manifest: Manifest) -> None:
+    low, high = manifest.aabb
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise FormatError(f"manifest: aabb: expected lower corner below upper, got {manifest.aabb}")
+    if not manifest.density_range[0] < manifest.density_range[1]:
+        raise FormatError(f"manifest: density_range: expected low < high, got {manifest.density_range}")
+    if manifest.contracted and manifest.aabb != CONTRACTED_AABB:
+        raise FormatError(f"manifest: aabb: expected {CONTRACTED_AABB} where contracted, got {manifest.aabb}")
+    if manifest.near and not manifest.contracted:
+        raise FormatError(f"manifest: near: expected 0 unless contracted, got {manifest.near}")
+    if math.dist(low, high) > MAX_STEPS * manifest.step:
+        raise FormatError(
+            f"manifest: step: expected at most {MAX_STEPS} steps along the diagonal, got {manifest.step}"
+        )
+
+
+_PARSERS: dict[str, Callable[[str, Any], Any]] = {
+    "version": _parse_version,
+    "generator": _text,
+    "resolution": _integer(1, MAX_RESOLUTION),
+    "feature_resolution": _integer(1, MAX_RESOLUTION),
+    "aabb": _matrix(2, 3),
+    "world_from_model": _similarity,
+    "step": _number(1e-9, 1e9),
+    "contracted": _boolean,
+    "near": _number(0, 1e6),
+    "n_samples": _integer(0, 1024),
+    "density_range": _numbers(2, -80, 80),
+    "n_channels": _integer(1, 1024),
+    "background": _numbers(3, 0, 1),
+    "colour_space": _one_of("srgb"),
+    "view_size": _integers(2, 1, 1 << 20),
+    "files": _files,
+    "provenance": _object,
+}

@@ -1,0 +1,235 @@
+"""The arrays of an asset out of its files, within a budget of memory.
+
+Every step is as large as what came before it says, and is compared with the budget before it is taken: the
+manifest has the sizes of the files; so many bytes of coordinates are so many bricks; each has a mask of 64
+bytes; and the bits of the masks are the codes that are unpacked and the rows of the grid that is built. No
+more than that is ever unpacked, whatever a file holds.
+"""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from player.asset.bricks import bricks_per_axis, unpack_vertices, with_corners
+from player.asset.manifest import FileEntry, Manifest
+from player.asset.packing import unpack_codes, unpack_masks
+from player.errors import FormatError, IntegrityError
+from player.files.files import file_size, read_bytes
+from player.files.memory import check_memory
+
+DTYPES = {
+    "brick_coords": "<u2",
+    "brick_masks": "<u8",
+    "density": "|u1",
+    "feature_coords": "<u2",
+    "feature_masks": "<u8",
+    "features": "|i1",
+}
+PLACES = {
+    "brick_coords": "brick_coords.npy",
+    "brick_masks": "brick_masks.bits",
+    "density": "density.codes",
+    "feature_coords": "feature_coords.npy",
+    "feature_masks": "feature_masks.bits",
+    "features": "features.codes",
+}
+"""The file of each array."""
+
+Names = tuple[str, str, str]
+DENSITIES: Names = ("brick_coords", "brick_masks", "density")
+FEATURES: Names = ("feature_coords", "feature_masks", "features")
+
+MAX_HEAD_BYTES = 64 << 20
+"""Ten times the largest head that can be baked: 1,024 channels into layers that are 256 wide take 6 MB."""
+MAX_CAMERA_BYTES = 64 << 20
+
+_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00(..)"
+    rb"\{'descr': '<u2', 'fortran_order': False, 'shape': \(([0-9]{1,9}), 3\), \} *\n",
+    re.DOTALL,
+)
+_LONGEST_HEADER = 10 + 65535
+
+
+class Counts(NamedTuple):
+    """How much there is in one of the two grids, as far as it is known yet."""
+
+    n_per_axis: int
+    """Bricks along an axis."""
+    n_bricks: int
+    n_codes: int = 0
+    """Bytes of codes."""
+    n_rows: int = 0
+    """Stored vertices."""
+    n_held: int = 0
+    """Bricks that hold a cell with a stored corner."""
+
+
+def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
+    """Most memory that is taken while `n_packed` bytes of files become arrays and those a grid.
+
+    Bytes a brick, a row, a cell of a table are those of the arrays in `player.asset.asset`,
+    `player.asset.grid` and `player.asset.vertex_rows`, and of their temporaries;
+    tests/player/asset/test_unpacking.py compares the sum with what numpy asks for.
+    """
+    d, f = densities, features
+    kept = sum(70 * grid.n_bricks + grid.n_codes for grid in (d, f))
+    unpacking = n_packed + sum(256 * grid.n_bricks + 2 * grid.n_codes for grid in (d, f))
+    tables = sum(17 * (grid.n_per_axis + 1) ** 3 for grid in (d, f))
+    densities_built = 2400 * d.n_bricks
+    features_built = 800 * d.n_bricks + 2560 * f.n_bricks + 8 * f.n_rows + 5200 * f.n_held
+    return kept + max(unpacking, tables + max(densities_built, features_built))
+
+
+def check_files(folder: Path, manifest: Manifest, allowed: int) -> None:
+    """Look at every file of an asset before any is opened: sizes against the manifest, against what they can
+    hold, and against the memory that is allowed.
+
+    Raises FormatError: not a file, outside the folder, larger than any of its kind; IntegrityError: of
+    another size; ConfigError: more than is allowed.
+    """
+    for name, entry in manifest.files.items():
+        check_size(folder, name, entry)
+    check_total(folder, manifest, allowed)
+    most = {"head.onnx": MAX_HEAD_BYTES, "cameras.json": MAX_CAMERA_BYTES}
+    for names, n_per_axis in _per_axis(manifest):
+        most[PLACES[names[0]]] = 6 * n_per_axis**3 + _LONGEST_HEADER
+    for name, n_bytes in most.items():
+        if manifest.files[name].bytes > n_bytes:
+            raise FormatError(
+                f"{folder / name}: size: expected at most {n_bytes} bytes, got {manifest.files[name].bytes}"
+            )
+    least = [Counts(n, _n_bricks(manifest, names)) for names, n in _per_axis(manifest)]
+    check_memory(needed_bytes(0, *least), allowed, str(folder))
+
+
+def check_total(folder: Path, manifest: Manifest, allowed: int) -> None:
+    """Raise ConfigError if the files of an asset are larger than what is allowed, all together."""
+    check_memory(sum(entry.bytes for entry in manifest.files.values()), allowed, str(folder))
+
+
+def check_size(folder: Path, name: str, entry: FileEntry) -> None:
+    """Raise FormatError unless the file is a regular one inside the folder; IntegrityError for another size
+    than the manifest has."""
+    size = file_size(folder / name, f"a file of {entry.bytes} bytes", folder)
+    if size != entry.bytes:
+        raise IntegrityError(f"{folder / name}: size: expected {entry.bytes} bytes, got {size}")
+
+
+def _per_axis(manifest: Manifest) -> list[tuple[Names, int]]:
+    return [
+        (DENSITIES, bricks_per_axis(manifest.resolution)),
+        (FEATURES, bricks_per_axis(manifest.feature_resolution)),
+    ]
+
+
+def _n_bricks(manifest: Manifest, names: Names) -> int:
+    """As many as there are at least, by the size of their coordinates."""
+    return max(manifest.files[PLACES[names[0]]].bytes - _LONGEST_HEADER, 0) // 6
+
+
+def _most_packed(n_bytes: int) -> int:
+    """Size of a zlib stream of so many bytes, at most: a thousandth on top of what it cannot pack, and more
+    for a few bytes."""
+    return n_bytes + n_bytes // 100 + 1000
+
+
+def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> list[np.ndarray]:
+    """The six arrays of an asset whose files `check_files` has looked at, in the order of `DTYPES`.
+
+    Raises FormatError, IntegrityError: they break the format; ConfigError: they take more than is allowed.
+    """
+
+    def read(name: str, most: int) -> bytes:
+        return read_bytes(folder / PLACES[name], "an array", most, folder)
+
+    def masks(names: Names, coords: np.ndarray, n_per_axis: int) -> tuple[np.ndarray, Counts]:
+        found = unpack_masks(
+            read(names[1], _most_packed(64 * len(coords))), len(coords), str(folder / PLACES[names[1]])
+        )
+        of_features = names is FEATURES
+        resolution = manifest.feature_resolution if of_features else manifest.resolution
+        check_bricks(coords, found, names, resolution, f"{folder}/")
+        n_rows = n_vertices(found)
+        n_held = len(with_corners(coords, found, n_per_axis)) if of_features else 0
+        n_codes = n_rows * (manifest.n_channels if of_features else 1)
+        return found, Counts(n_per_axis, len(coords), n_codes, n_rows, n_held)
+
+    def codes(names: Names, counts: Counts) -> np.ndarray:
+        shape = (counts.n_rows, manifest.n_channels) if names is FEATURES else (counts.n_rows,)
+        data = read(names[2], _most_packed(counts.n_codes))
+        return unpack_codes(data, shape, DTYPES[names[2]], str(folder / PLACES[names[2]]))
+
+    (_, n_dense), (_, n_coarse) = _per_axis(manifest)
+    coords, coarse = (
+        read_coords(read(names[0], manifest.files[PLACES[names[0]]].bytes), str(folder / PLACES[names[0]]))
+        for names in (DENSITIES, FEATURES)
+    )
+    n_packed = sum(manifest.files[name].bytes for name in PLACES.values())
+    least = needed_bytes(n_packed, Counts(n_dense, len(coords)), Counts(n_coarse, len(coarse)))
+    check_memory(least, allowed, str(folder))
+    with ThreadPoolExecutor(1) as other:  # both at a time: what unpacks leaves the interpreter to others
+        later = other.submit(masks, FEATURES, coarse, n_coarse)
+        found, dense_counts = masks(DENSITIES, coords, n_dense)
+        coarse_found, coarse_counts = later.result()
+        check_memory(needed_bytes(n_packed, dense_counts, coarse_counts), allowed, str(folder))
+        features = other.submit(codes, FEATURES, coarse_counts)
+        density = codes(DENSITIES, dense_counts)
+        return [coords, found, density, coarse, coarse_found, features.result()]
+
+
+def read_coords(data: bytes, where: str) -> np.ndarray:
+    """Coordinates of bricks [n, 3] uint16 out of a .npy file's bytes. Raises FormatError.
+
+    Its header is read as numpy writes it, and not by numpy, which takes it for a line of Python.
+
+    >>> import io
+    >>> file = io.BytesIO()
+    >>> np.save(file, np.array([[1, 2, 3]], np.uint16))
+    >>> read_coords(file.getvalue(), "coords.npy").tolist()
+    [[1, 2, 3]]
+    """
+    match = _HEADER.match(data)
+    if match is None or match.end() != 10 + int.from_bytes(match[1], "little"):
+        got = data[:10] if len(data) < 10 else data[10:90]
+        raise FormatError(f"{where}: expected a numpy array of uint16 [n, 3] in C order, got {bytes(got)!r}")
+    n_bricks, explained = int(match[2]), match.end() + 6 * int(match[2])
+    if explained != len(data):
+        raise FormatError(f"{where}: expected {explained} bytes as its header says, got {len(data)}")
+    return np.frombuffer(data, "<u2", 3 * n_bricks, match.end()).reshape(-1, 3)
+
+
+def n_vertices(masks: np.ndarray) -> int:
+    """Stored vertices of bricks with these masks [n, 8] uint64."""
+    return int(np.bitwise_count(masks).sum(dtype=np.int64))
+
+
+def check_bricks(coords: np.ndarray, masks: np.ndarray, names: Names, resolution: int, where: str) -> None:
+    """Raise FormatError unless the bricks are sorted, each once, and hold no vertex beyond the grid."""
+    coords = np.asarray(coords, np.int64)
+    keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
+    if (np.diff(keys) <= 0).any():
+        raise FormatError(f"{where}{PLACES[names[0]]}: expected bricks sorted by x, y, z, each once")
+    n = bricks_per_axis(resolution)
+    if (coords >= n).any():
+        raise FormatError(f"{where}{PLACES[names[0]]}: expected coordinates below {n}, got {coords.max()}")
+    if names is FEATURES and not masks.any():  # every sample that counts is given a feature
+        raise FormatError(f"{where}{PLACES[names[1]]}: expected at least one stored vertex, got none")
+    last = resolution - 8 * (n - 1)  # the grid's last vertex in a brick at its edge
+    beyond = np.zeros((3, 8), np.uint64)  # bits of vertices behind it, along x, y, z
+    bits = np.arange(512)
+    for axis, place in enumerate((bits >> 6, (bits >> 3) & 7, bits & 7)):
+        beyond[axis] = np.packbits(place > last, bitorder="little").view("<u8")
+    for axis in range(3):
+        edge = np.flatnonzero(coords[:, axis] == n - 1)
+        wrong = edge[(masks[edge] & beyond[axis]).any(axis=1)]
+        if len(wrong):
+            got = unpack_vertices(coords[wrong[:1]], masks[wrong[:1]])[:, axis].max()
+            raise FormatError(
+                f"{where}{PLACES[names[1]]}: expected vertices up to {resolution}, got one at {got}"
+            )

@@ -1,0 +1,1 @@
+"""Cameras, the files that hold them, and paths that join them."""

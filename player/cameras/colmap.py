@@ -1,0 +1,257 @@
+"""COLMAP models: the lenses, the pictures' poses and the points of `cameras.bin`, `images.bin`,
+`points3D.bin`.
+
+The format is COLMAP's (scene/reconstruction_io.cc); it is read here because pycolmap's reader takes files
+that were cut short for whole ones or never comes back from them. COLMAP's cameras look along +z with y down
+(OpenCV); the pixel centre is at +0.5 as here. Of the text form, `cameras.txt` and `images.txt` are read.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from player.cameras.camera import Camera
+from player.cameras.rotations import rotation_matrix
+from player.errors import DataError, FormatError
+from player.files.files import read_bytes
+
+MODELS = {
+    0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
+    1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
+    2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
+    3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
+    4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+}
+"""Number, name and parameters of the camera models that are a pinhole behind OpenCV's lens."""
+MAX_FILE_BYTES = 1 << 30
+"""Bytes of each file of a model: ten thousand pictures of a thousand points each that several pictures share
+take half of it."""
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of one camera, and the lens in front of it."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: dict[str, float]
+
+
+@dataclass(frozen=True)
+class RegisteredImage:
+    """One picture that COLMAP has placed."""
+
+    name: str
+    camera_id: int
+    c2w: np.ndarray
+    """[4, 4], OpenGL axes."""
+
+
+def colmap_folder(folder: Path) -> Path | None:
+    """The folder of the COLMAP model that belongs to the pictures in `folder`, if there is one."""
+    for name in FOLDERS:
+        if (folder / name / "images.bin").exists():
+            return folder / name
+    return None
+
+
+def read_views(model: Path) -> list[Camera]:
+    """The registered pictures of a COLMAP model as pinhole cameras, in the order of their names.
+
+    `model`: the folder of `cameras.bin` and `images.bin`, or of `cameras.txt` and `images.txt`. What lenses
+    do beyond a pinhole is left away, as in pictures that were undistorted. Raises FormatError, DataError (a
+    camera model that is no pinhole).
+    """
+    suffix = "bin" if (model / "images.bin").exists() else "txt"
+    if suffix == "bin":
+        lenses, images = read_cameras(model / "cameras.bin"), read_images(model / "images.bin")
+    else:
+        lenses, images = _text_cameras(model / "cameras.txt"), _text_images(model / "images.txt")
+    if not images:
+        raise FormatError(f"{model}: images.{suffix}: expected at least one picture, got none")
+    views = []
+    for image in sorted(images, key=lambda image: image.name):
+        if image.camera_id not in lenses:
+            raise FormatError(f"{model}: {image.name}: camera {image.camera_id} is not in cameras.{suffix}")
+        lens = lenses[image.camera_id]
+        size = (lens.width, lens.height)
+        views.append(Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy))
+    return views
+
+
+def read_cameras(path: Path) -> dict[int, Lens]:
+    """The lenses of `cameras.bin` by camera number. Raises FormatError, DataError (an unknown model)."""
+    file = _Reader(path)
+    lenses = {}
+    for _ in range(file.count(24)):
+        camera_id, model, width, height = file.take("<iiQQ")
+        if model not in MODELS:
+            raise _unknown_model(f"{path}: camera {camera_id}", f"number {model}")
+        values = file.take(f"<{len(MODELS[model][1])}d")
+        lenses[camera_id] = _lens(model, width, height, values, f"{path}: camera {camera_id}")
+    file.end()
+    return lenses
+
+
+def _unknown_model(where: str, got: str) -> DataError:
+    known = ", ".join(name for name, _ in MODELS.values())
+    return DataError(
+        f"{where}: model: expected {known}, got {got}: "
+        "undistort the pictures with COLMAP's image_undistorter first"
+    )
+
+
+def _lens(model: int, width: float, height: float, parameters: Sequence[float], where: str) -> Lens:
+    values = dict(zip(MODELS[model][1], parameters, strict=True))
+    fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
+    if not (np.isfinite(list(values.values())).all() and fx > 0 and fy > 0):
+        raise FormatError(f"{where}: expected finite numbers and a positive focal length, got {values}")
+    if not (0 < width < 2**20 and 0 < height < 2**20):
+        raise FormatError(f"{where}: size: expected 1 to 2^20, got {width:.0f}x{height:.0f}")
+    distortion = {key: value for key, value in values.items() if key[0] in "kp"}
+    return Lens(int(width), int(height), fx, fy, values["cx"], values["cy"], distortion)
+
+
+def read_images(path: Path) -> list[RegisteredImage]:
+    """The pictures of `images.bin`. Raises FormatError."""
+    file = _Reader(path)
+    images = []
+    for _ in range(file.count(73)):
+        _, *pose, camera_id = file.take("<i7di")
+        name = file.text()
+        file.skip(24 * file.count(24))
+        images.append(RegisteredImage(name, camera_id, _c2w(np.array(pose), f"{path}: {name}")))
+    file.end()
+    return images
+
+
+def read_points(path: Path) -> np.ndarray:
+    """The points [n_points, 3] of `points3D.bin`, world frame. Raises FormatError."""
+    file = _Reader(path)
+    points = []
+    for _ in range(file.count(51)):
+        points.append(file.take("<Q3d")[1:])
+        file.skip(11)
+        file.skip(8 * file.count(8))
+    file.end()
+    found = np.array(points).reshape(-1, 3)
+    return found[np.isfinite(found).all(axis=1)]
+
+
+def _c2w(pose: np.ndarray, where: str) -> np.ndarray:
+    """Camera to world [4, 4], OpenGL axes, from COLMAP's world to camera (w, x, y, z of a quaternion,
+    translation)."""
+    length = np.linalg.norm(pose[:4])
+    if not np.isfinite(pose).all() or length < 1e-9:
+        raise FormatError(f"{where}: pose: expected a rotation and a translation, got {pose.tolist()}")
+    rotation = rotation_matrix(pose[:4] / length)
+    c2w = np.eye(4)
+    c2w[:3, :3] = rotation.T
+    c2w[:3, 3] = -rotation.T @ pose[4:]
+    return c2w @ OPENGL_FROM_OPENCV
+
+
+def _text_cameras(path: Path) -> dict[int, Lens]:
+    numbers = {name: number for number, (name, _) in MODELS.items()}
+    lenses = {}
+    for number, line in _lines(path):
+        words = line.split()
+        where = f"{path}: line {number}"
+        if len(words) > 1 and words[1] not in numbers:
+            raise _unknown_model(f"{path}: camera {words[0]}", words[1])
+        model = numbers[words[1]] if len(words) > 1 else 0
+        if len(words) != 4 + len(MODELS[model][1]):
+            raise FormatError(f"{where}: expected number, model, size and parameters, got {line[:80]!r}")
+        width, height, *values = _floats(words[2:], where)
+        lenses[int(*_floats(words[:1], where))] = _lens(model, width, height, values, where)
+    return lenses
+
+
+def _text_images(path: Path) -> list[RegisteredImage]:
+    """Each picture has two lines, the second of which holds its points and may be empty."""
+    images, skip = [], 0
+    for number, line in _lines(path, empty=True):
+        if number == skip or not line:
+            continue
+        words = line.split(maxsplit=9)
+        where = f"{path}: line {number}"
+        if len(words) != 10:
+            raise FormatError(f"{where}: expected number, pose, camera and name, got {line[:80]!r}")
+        pose = np.array(_floats(words[1:8], where))
+        camera_id = int(*_floats(words[8:9], where))
+        images.append(RegisteredImage(words[9], camera_id, _c2w(pose, f"{path}: {words[9]}")))
+        skip = number + 1
+    return images
+
+
+def _lines(path: Path, empty: bool = False) -> list[tuple[int, str]]:
+    """Lines that are no comments, with their numbers."""
+    try:
+        text = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: cannot read: {error}") from error
+    lines = ((number, line.strip()) for number, line in enumerate(text.split("\n"), start=1))
+    return [(number, line) for number, line in lines if not line.startswith("#") and (line or empty)]
+
+
+def _floats(words: list[str], where: str) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [float("nan")]
+    if not np.isfinite(values).all():
+        raise FormatError(f"{where}: expected finite numbers, got {' '.join(words)[:80]!r}")
+    return values
+
+
+class _Reader:
+    """A little-endian binary file, with every read checked against what is left."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._data = read_bytes(path, "a COLMAP model in binary form", MAX_FILE_BYTES)
+        self._at = 0
+
+    def take(self, form: str) -> tuple:
+        start = self._at
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self._data, start)
+
+    def skip(self, n_bytes: int) -> None:
+        if n_bytes > len(self._data) - self._at:
+            raise FormatError(f"{self._path}: cut short at byte {len(self._data)}")
+        self._at += n_bytes
+
+    def count(self, least_bytes: int) -> int:
+        """A number of things of at least so many bytes each, which must still fit."""
+        (n,) = self.take("<Q")
+        if n * least_bytes > len(self._data) - self._at:
+            raise FormatError(f"{self._path}: cut short: {n} entries do not fit into {len(self._data)} bytes")
+        return n
+
+    def text(self) -> str:
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise FormatError(f"{self._path}: cut short in a name")
+        raw, self._at = self._data[self._at : end], end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError:
+            raise FormatError(f"{self._path}: name: expected UTF-8, got {raw[:40]!r}") from None
+
+    def end(self) -> None:
+        if self._at != len(self._data):
+            raise FormatError(
+                f"{self._path}: expected the end at byte {self._at}, got {len(self._data)} bytes"
+            )

@@ -1,0 +1,65 @@
+"""A smooth camera path through a few views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from player.cameras.camera import Camera
+from player.cameras.rotations import quaternion, rotation_matrix
+
+
+def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
+    """Cameras on a path through `views`: `n_between` steps from each view to the next, the last one included.
+
+    Places lie on a Catmull-Rom spline, rotations turn evenly from view to view (slerp), the focal length
+    changes by equal factors. Size and name are those of the first view; the vertical field of view is each
+    view's own, whatever its size.
+
+    >>> views = [Camera(str(x), np.eye(4), 4, 4, f, f, 2.0, 2.0) for x, f in enumerate((5.0, 20.0))]
+    >>> [round(camera.fx, 6) for camera in smooth_path(views, 2)]
+    [5.0, 10.0, 20.0]
+    """
+    places = np.stack([view.c2w[:3, 3] for view in views])
+    turns = _continuous([quaternion(view.c2w[:3, :3]) for view in views])
+    focal = [view.fy / view.height * views[0].height for view in views]
+    path = []
+    for index in range(len(views) - 1):
+        around = places[np.clip(np.arange(index - 1, index + 3), 0, len(views) - 1)]
+        for step in range(n_between):
+            share = step / n_between
+            c2w = np.eye(4)
+            c2w[:3, :3] = rotation_matrix(_slerp(turns[index], turns[index + 1], share))
+            c2w[:3, 3] = _spline(around, share)
+            path.append(_zoomed(views[0], c2w, focal[index] ** (1 - share) * focal[index + 1] ** share))
+    return [*path, _zoomed(views[0], views[-1].c2w, focal[-1])]
+
+
+def _zoomed(camera: Camera, c2w: np.ndarray, fy: float) -> Camera:
+    return replace(camera, c2w=c2w, fx=camera.fx * fy / camera.fy, fy=fy)
+
+
+def _spline(points: np.ndarray, share: float) -> np.ndarray:
+    """The Catmull-Rom point between the second and the third of four."""
+    a, b, c, d = points
+    linear, square, cube = c - a, 2 * a - 5 * b + 4 * c - d, 3 * b - 3 * c + d - a
+    return b + share / 2 * (linear + share * (square + share * cube))
+
+
+def _continuous(turns: list[np.ndarray]) -> list[np.ndarray]:
+    """The same rotations with signs that take the short way from each to the next."""
+    for index in range(1, len(turns)):
+        if turns[index] @ turns[index - 1] < 0:
+            turns[index] = -turns[index]
+    return turns
+
+
+def _slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    angle = np.arccos(np.clip(a @ b, -1, 1))
+    if angle < 1e-6:
+        mixed = (1 - share) * a + share * b
+    else:
+        mixed = (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+    return mixed / np.linalg.norm(mixed)

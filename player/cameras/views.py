@@ -1,0 +1,63 @@
+"""The views to render, out of any file that has cameras: transforms.json, nerfstudio's camera_path.json,
+COLMAP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from player.cameras import colmap
+from player.cameras.camera import Camera
+from player.cameras.nerfstudio import is_camera_path, path_cameras, path_frame_rate
+from player.cameras.transforms import parse_transforms, transforms_cameras
+from player.errors import FormatError
+from player.files.json_files import parse_json, read_json
+
+EXPECTED = "a transforms.json, a camera_path.json or the folder of a COLMAP model"
+
+
+def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Camera]:
+    """The cameras of a file, in its order; those of COLMAP in the order of their names.
+
+    Args:
+        path: a transforms.json, a nerfstudio camera_path.json, or a COLMAP model: its folder, the folder
+            above, or one of its files.
+        size: (width, height) in pixels for cameras that the file gives no size.
+
+    Raises:
+        FormatError: file, frame, expected, got.
+        DataError: a COLMAP camera that is no pinhole.
+
+    >>> [camera.name for camera in read_views("out/cameras.json")][:2]
+    ['./test/r_0', './test/r_1']
+    """
+    path = Path(path)
+    model = _colmap_model(path)
+    if model is not None:
+        return colmap.read_views(model)
+    data = read_json(path, EXPECTED)
+    document = parse_json(data, str(path))
+    if is_camera_path(document):
+        return path_cameras(document, path)
+    document = parse_transforms(data, str(path))
+    return transforms_cameras(document, path, [size] * len(document["frames"]))
+
+
+def frame_rate(path: str | Path) -> float | None:
+    """Frames a second that a camera_path.json asks for; None for any other file. Raises FormatError."""
+    path = Path(path)
+    if _colmap_model(path) is not None:
+        return None
+    document = parse_json(read_json(path, EXPECTED), str(path))
+    return path_frame_rate(document, path) if is_camera_path(document) else None
+
+
+def _colmap_model(path: Path) -> Path | None:
+    """The folder with `images.bin` or `images.txt` that `path` means; None for a file of another kind."""
+    if path.name in ("images.bin", "images.txt", "cameras.bin", "cameras.txt"):
+        return path.parent
+    if not path.is_dir():
+        return None
+    for folder in (path, *(path / name for name in colmap.FOLDERS)):
+        if (folder / "images.bin").exists() or (folder / "images.txt").exists():
+            return folder
+    raise FormatError(f"{path}: expected {EXPECTED}, got a folder without images.bin or images.txt")

@@ -1,0 +1,231 @@
+"""Reading regular files alone, within a size that is stated; and writing so that the final name holds
+either the old content or the complete new one."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from player.errors import FormatError, OutputError
+from player.files.replace import PART, clear_up, held, put_folder, put_together, remove, sync, sync_all
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+"""A pipe that nobody writes to is opened at once, and then refused, instead of waited for."""
+
+
+def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> BinaryIO:
+    """Open a regular file of at most `most` bytes for reading; every file of a user is opened here.
+
+    Args:
+        path: the file; it may be a link.
+        what: what is expected there, for the message.
+        most: bytes.
+        inside: a folder that the file must lie in, once links are followed.
+
+    Raises:
+        FormatError: there is no such file, it is a folder, a pipe, a device or a socket, it is too large, it
+            lies outside the folder, or it cannot be read.
+
+    >>> open_file(Path("surely/not/there.json"), "cameras", 1000)
+    Traceback (most recent call last):
+    player.errors.FormatError: surely/not/there.json: no such file: expected cameras
+    """
+    with _told(path, what):
+        place = path if inside is None else _inside(path, inside)
+        _check_regular(path, what, place.stat())  # before it is opened, which a device may notice
+        handle = os.open(place, _FLAGS)
+        try:
+            size = _check_regular(path, what, os.fstat(handle))  # another file may be there by now
+            if size > most:
+                raise FormatError(f"{path}: size: expected at most {most} bytes for {what}, got {size}")
+            return os.fdopen(handle, "rb")
+        except BaseException:
+            os.close(handle)
+            raise
+
+
+def read_bytes(path: Path, what: str, most: int, inside: Path | None = None) -> bytes:
+    """The content of a file that `open_file` opens, with its arguments. Raises FormatError."""
+    with open_file(path, what, most, inside) as file, _told(path, what):
+        return file.read(os.fstat(file.fileno()).st_size)
+
+
+def file_size(path: Path, what: str, inside: Path | None = None) -> int:
+    """Bytes of a regular file, which is not opened; arguments as `open_file`. Raises FormatError."""
+    with _told(path, what):
+        place = path if inside is None else _inside(path, inside)
+        return _check_regular(path, what, place.stat())
+
+
+@contextmanager
+def _told(path: Path, what: str) -> Iterator[None]:
+    """Failures of the system as one FormatError."""
+    try:
+        yield
+    except FormatError:
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        raise FormatError(f"{path}: no such file: expected {what}") from None
+    except (OSError, ValueError, RuntimeError) as error:  # a null in the name, links that lead to themselves
+        raise FormatError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _check_regular(path: Path, what: str, found: os.stat_result) -> int:
+    """The size of what was found, if it is a regular file."""
+    if not stat.S_ISREG(found.st_mode):
+        got = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+        raise FormatError(f"{path}: cannot read: expected a file, {what}, got {got}")
+    return found.st_size
+
+
+def _inside(path: Path, folder: Path) -> Path:
+    """The place of `path` once links are followed, which must be in `folder`."""
+    place = path.resolve(strict=True)
+    if not place.is_relative_to(folder.resolve()):
+        raise FormatError(f"{path}: expected a file inside {folder}, got a link to {place}")
+    return place
+
+
+def check_target(path: Path, force: bool = False) -> None:
+    """Refuse a target that exists, unless `force`, or that cannot be written because it or its folder is
+    read-only; called before long work, so that nobody waits for a refusal.
+
+    What a process that was killed has left in its folder is finished or removed first
+    (`player.files.replace`).
+
+    >>> check_target(Path("surely/not/there.png"))
+    """
+    try:
+        clear_up(path.parent)
+        if path.exists() and not force:
+            raise OutputError(f"{path}: already exists: add --force to replace it")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise OutputError(f"{path}: cannot write: it is read-only")
+        above = next(parent for parent in path.absolute().parents if parent.exists())
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+    if not above.is_dir():
+        raise OutputError(f"{path}: cannot write: {above} is a file, not a folder")
+    if not os.access(above, os.W_OK):
+        raise OutputError(f"{path}: cannot write: the folder {above} is read-only")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` beside `path` and rename it into place.
+
+    Raises OutputError: full disk, read-only folder, ...
+    """
+    write_together({path: data})
+
+
+def write_together(files: dict[Path, bytes]) -> None:
+    """Write files that belong together beside their places; when all are complete, move them there.
+
+    They are in one folder, and up to their first dots their names are the same: `a.obj`, `a.lod1.obj`.
+
+    A process that is killed while it moves them leaves some of the old and some of the new: the next one that
+    writes in this folder, or looks whether it may (`check_target`), moves the rest.
+
+    Raises OutputError: full disk, read-only folder, ...
+    """
+    first = next(iter(files))
+    if len({(path.parent, path.name.split(".")[0]) for path in files}) > 1:
+        raise ValueError(f"{[str(path) for path in files]}: expected names that begin alike, in one folder")
+    with _writing(first):
+        if len(files) == 1:
+            _write_one(first, files[first])
+            return
+        for path in files:
+            if path.is_dir():
+                raise OutputError(f"{path}: cannot write: it is a folder")
+        with _temporary_folder(first) as folder:
+            for path, data in files.items():
+                (folder / path.name).write_bytes(data)
+            sync_all(folder)
+            put_together(folder, first.name)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """The folder of `path` is there and held, and what the system refuses is an OutputError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with held(path.parent):
+            yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+
+
+def _write_one(path: Path, data: bytes) -> None:
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PART, dir=path.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A file of the same name in a temporary folder beside `path`, for a library that writes files itself; it
+    becomes `path` when the block ends well.
+
+    Raises OutputError: full disk, read-only folder, ...
+    """
+    with _writing(path), _temporary_folder(path) as folder:
+        yield folder / path.name
+        sync(folder / path.name)
+        (folder / path.name).replace(path)
+
+
+@contextmanager
+def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
+    """A temporary folder beside `path` that becomes `path` when the block ends well, and vanishes when it
+    does not.
+
+    With `force` a folder that exists is replaced when the new one is complete, in one step where the system
+    can (`player.files.replace`). Raises OutputError: `path` exists, full disk, read-only folder, ...
+    """
+    check_target(path, force)
+    with _writing(path), _temporary_folder(path) as temporary:
+        yield temporary
+        sync_all(temporary)
+        put_folder(temporary, path)
+
+
+@contextmanager
+def _temporary_folder(path: Path) -> Iterator[Path]:
+    """A folder beside `path`; what then has its name is removed in the end."""
+    folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.parent))
+    try:
+        folder.chmod(0o777 & ~_umask())
+        yield folder
+    finally:
+        remove(folder)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,213 @@
+"""A tile of a dense layer in registers: what `player.head.compiled` is made of.
+
+A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold; in float32,
+and in 8 bits where the processor multiplies bytes. Compiled code alone imports this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from player.compiled.lanes import FLOAT, INT, LANES, LONG, Lanes, address, load, splat, store, vector
+from player.compiled.processor import multiplies_bytes
+
+ROWS = 12 if LANES == 16 else 6
+"""32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
+WIDTH = 2 * LANES
+"""Outputs of a tile."""
+
+QUAD = 4
+"""Products of bytes that the processor adds up at once."""
+MOST_BYTES = 256
+"""Inputs of a layer in 8 bits, at most: bytes from a pixel to the next. A number that the compiler knows
+saves it a register for each row."""
+MULTIPLIES_BYTES = multiplies_bytes(QUAD * LANES)
+"""Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
+_DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
+"""Its operands are words of QUAD bytes, as until LLVM 21; later ones take that for what they write."""
+
+
+def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
+        in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
+        first = builder.select(in_memory, here, there)
+        start_at, start_pitch = _pair(builder, arguments[4])
+        sums = _Sums(builder, FLOAT)
+        for row in range(ROWS):
+            at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
+            for half in range(2):
+                sums.set(row, half, load(builder, first, builder.add(at, LONG(half * LANES))))
+        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
+        sums.write(here, _pair(builder, arguments[5]), lambda x, _: x)
+        return context.get_dummy_value()
+
+    two, three = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
+    return types.void(memory, weights, two, two, three, two, types.int64), generate
+
+
+dense_tile: Any = intrinsic(_dense)
+"""dense_tile(memory, weights, x, w, start, out, depth): ROWS by WIDTH outputs of one layer.
+
+`memory` and `weights` are flat float32. x, w, out: (index of the first number, numbers from row to row), w in
+`weights`, the others in `memory`. start: the same, and whether it is in `memory` rather than in `weights`;
+what the sums begin with, a bias with 0 from row to row. depth: inputs of the layer.
+"""
+
+
+def _dense_codes(_: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, depth: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
+        rows = [
+            [load(builder, there, builder.add(at, LONG(half * LANES))) for half in range(2)]
+            for at in _pair(builder, arguments[4])
+        ]
+        starts, scales = rows
+        sums = _Sums(builder, FLOAT)
+        for row in range(ROWS):
+            for half in range(2):
+                sums.set(row, half, starts[half])
+        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
+        sums.write(here, _pair(builder, arguments[5]), lambda x, half: x * scales[half])
+        return context.get_dummy_value()
+
+    two = types.UniTuple(types.int64, 2)
+    return types.void(memory, weights, two, two, two, two, types.int64), generate
+
+
+dense_codes_tile: Any = intrinsic(_dense_codes)
+"""dense_codes_tile(memory, weights, x, w, places, out, depth): the same of 8-bit codes that are floats.
+
+Sums below 2^24 are then exact, as `dense_bytes_tile` has them. places: (first of what the sums begin with,
+first of what they are multiplied by), both in `weights`, the same for every row.
+"""
+
+
+def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, Any], depth: Any) -> None:
+    """Add to `sums` the products of `depth` inputs of each row and their weights; x and w are (array, (index
+    of the first number, numbers from row to row))."""
+    x_rows = _rows(builder, x[0], *_pair(builder, x[1]))
+    w_at, w_pitch = _pair(builder, w[1])
+    with cgutils.for_range(builder, depth) as loop:
+        at = builder.add(w_at, builder.mul(w_pitch, loop.index))
+        columns = [load(builder, w[0], builder.add(at, LONG(half * LANES))) for half in range(2)]
+        for row in range(ROWS):
+            value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
+            for half in range(2):
+                sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
+
+
+def _dense_bytes(
+    _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any
+) -> Any:
+    packed, starts, scales = weights
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
+            return context.get_dummy_value()
+        bytes_here, here = (
+            address(context, builder, signature.args[index], arguments[index]) for index in (0, 1)
+        )
+        parts = [builder.extract_value(arguments[2], index) for index in range(3)]
+        packed_there, starts_there, scales_there = (
+            address(context, builder, kind, part)
+            for kind, part in zip((packed, starts, scales), parts, strict=True)
+        )
+        out = _pair(builder, arguments[6])
+        start_at, scale_at = _pair(builder, arguments[5])
+        sums = _Sums(builder, INT)
+        for half in range(2):
+            start = load(builder, starts_there, builder.add(start_at, LONG(half * LANES)), INT)
+            for row in range(ROWS):
+                sums.set(row, half, start)
+        quads = ir.PointerType(INT)
+        x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
+        x_rows = [builder.bitcast(row, quads) for row in x_rows]
+        words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
+        lanes = vector(INT)
+        dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
+        with cgutils.for_range(builder, arguments[7]) as loop:
+            at = builder.mul(loop.index, LONG(WIDTH))
+            columns = [load(builder, words, builder.add(at, LONG(half * LANES)), INT) for half in range(2)]
+            for row in range(ROWS):
+                quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
+                for half in range(2):
+                    total = builder.call(dot, [sums.get(row, half).value, quad.value, columns[half].value])
+                    sums.set(row, half, Lanes(builder, total))
+        halves = [load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)]
+        sums.write(here, out, lambda x, half: x.to_float() * halves[half])
+        return context.get_dummy_value()
+
+    long, two = types.int64, types.UniTuple(types.int64, 2)
+    return types.void(codes, memory, weights, long, long, two, two, long), generate
+
+
+dense_bytes_tile: Any = intrinsic(_dense_bytes)
+"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): the same of 8-bit codes, where
+MULTIPLIES_BYTES.
+
+`codes` are flat uint8, `memory` flat float32. `weights`: int8 codes, QUAD inputs of one output beside each
+other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 steps of the sums.
+x: the first code of the first pixel, MOST_BYTES before the next one's; w: the first of the tile's codes;
+places: (first start, first step); out: in `memory`.
+"""
+
+
+def _multiply(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = address(context, builder, signature.args[0], arguments[0])
+        one, other = (load(builder, array, at) for at in arguments[2:])
+        store(array, arguments[1], one * other)
+        return context.get_dummy_value()
+
+    return types.void(memory, types.int64, types.int64, types.int64), generate
+
+
+multiply_lanes: Any = intrinsic(_multiply)
+"""multiply_lanes(memory, out, a, b): LANES numbers at `out` become the products of those at `a` and `b`.
+
+The compiler does not do so by itself: it cannot know that the three do not overlap.
+"""
+
+
+class _Sums:
+    """ROWS by two vectors that a loop adds to."""
+
+    def __init__(self, builder: Any, element: Any) -> None:
+        self._builder = builder
+        self._places = [
+            [cgutils.alloca_once(builder, vector(element)) for _ in range(2)] for _ in range(ROWS)
+        ]
+
+    def get(self, row: int, half: int) -> Lanes:
+        return Lanes(self._builder, self._builder.load(self._places[row][half]))
+
+    def set(self, row: int, half: int, value: Lanes) -> None:
+        self._builder.store(value.value, self._places[row][half])
+
+    def write(self, array: Any, out: tuple[Any, Any], function: Callable[[Lanes, int], Lanes]) -> None:
+        """To `array`, a row at a time, what `function` makes of a sum and which half it is."""
+        at, pitch = out
+        for row in range(ROWS):
+            start = self._builder.add(at, self._builder.mul(pitch, LONG(row)))
+            for half in range(2):
+                place = self._builder.add(start, LONG(half * LANES))
+                store(array, place, function(self.get(row, half), half))
+
+
+def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
+    return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
+
+
+def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:
+    """Where each of ROWS rows begins."""
+    return [builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)]

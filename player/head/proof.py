@@ -1,0 +1,84 @@
+"""The proof of what heads are made of: tiles of layers, in float32 and in 8 bits, and what follows a layer.
+`player.proof` asks for it; compiled code alone imports this."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from player.compiled.compiling import compiled
+from player.head.activations import gelu_lanes, quantize_lanes, sigmoid_lanes
+from player.head.dense_tiles import (
+    LANES,
+    MOST_BYTES,
+    MULTIPLIES_BYTES,
+    QUAD,
+    ROWS,
+    WIDTH,
+    dense_bytes_tile,
+    dense_tile,
+)
+
+F32 = np.float32
+DEPTH = 24
+"""Inputs of the layer."""
+
+
+def wrong() -> str | None:
+    """What is wrong, if anything is."""
+    numbers = np.random.default_rng(0)
+    x = numbers.uniform(-1, 1, (ROWS, DEPTH)).astype(F32)
+    w = numbers.uniform(-1, 1, (DEPTH, WIDTH)).astype(F32)
+    memory = np.zeros(x.size + ROWS * WIDTH, F32)
+    memory[: x.size] = x.reshape(-1)
+    _floats(memory, np.append(w, np.zeros(WIDTH, F32)), DEPTH)
+    if not np.allclose(memory[x.size :].reshape(ROWS, WIDTH), x.astype(np.float64) @ w, rtol=0, atol=1e-5):
+        return "a layer gives other sums than numpy"
+    y = np.linspace(-6, 6, 4 * LANES, dtype=F32)
+    gelu, sigmoid, codes = y.copy(), y.copy(), np.zeros(y.size, np.uint8)
+    _follow(gelu, sigmoid, codes, y, F32(20))
+    expected = y * np.array([0.5 * math.erfc(-value / math.sqrt(2)) for value in y])
+    if not np.allclose(gelu, expected, rtol=0, atol=1e-5):
+        return "gelu is another than numpy's"
+    if not np.allclose(sigmoid, 1 / (1 + np.exp(-y.astype(np.float64))), rtol=0, atol=1e-5):
+        return "the sigmoid is another than numpy's"
+    if (codes != np.clip(np.rint(y * F32(20)) + 100, 0, 255)).any():
+        return "codes are others than numpy's"
+    return _wrong_bytes(numbers) if MULTIPLIES_BYTES else None
+
+
+def _wrong_bytes(numbers: np.random.Generator) -> str | None:
+    codes = np.zeros((ROWS, MOST_BYTES), np.uint8)
+    codes[:, :DEPTH] = numbers.integers(0, 256, (ROWS, DEPTH))
+    w = numbers.integers(-127, 128, (DEPTH, WIDTH)).astype(np.int8)
+    codes[0], w[:, 0] = 255, 127
+    packed = np.ascontiguousarray(w.reshape(DEPTH // QUAD, QUAD, WIDTH).transpose(0, 2, 1)).reshape(-1)
+    starts = numbers.integers(-1000, 1000, WIDTH).astype(np.int32)
+    memory = np.zeros(ROWS * WIDTH, F32)
+    _bytes(codes.reshape(-1), memory, packed, starts, np.full(WIDTH, 0.5, F32), DEPTH // QUAD)
+    expected = (codes[:, :DEPTH].astype(np.int64) @ w + starts) * 0.5
+    return (
+        None
+        if (memory.reshape(ROWS, WIDTH) == expected).all()
+        else "products of bytes are others than numpy's"
+    )
+
+
+@compiled
+def _floats(memory, weights, depth):
+    out = len(memory) - ROWS * WIDTH
+    dense_tile(memory, weights, (0, depth), (0, WIDTH), (depth * WIDTH, 0, 0), (out, WIDTH), depth)
+
+
+@compiled
+def _follow(gelu, sigmoid, codes, x, per_step):
+    for i in range(0, len(x), LANES):
+        gelu_lanes(gelu, i)
+        sigmoid_lanes(sigmoid, i)
+        quantize_lanes(codes, x, i, i, 100, per_step)
+
+
+@compiled
+def _bytes(codes, memory, packed, starts, scales, n_quads):
+    dense_bytes_tile(codes, memory, (packed, starts, scales), 0, 0, (0, 0), (0, WIDTH), n_quads)

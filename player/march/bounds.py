@@ -1,0 +1,79 @@
+"""Which part of the picture, and which stretch of the way, can meet a live cell at all.
+
+The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick with a live cell is projected; a block
+keeps the least and the greatest distance of the bricks whose projection touches it. Rays of a block without
+bricks are never made, the others start at the near bound. The bounds are conservative, so that pictures do
+not depend on them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from player.asset.bricks import BRICK as VERTICES
+from player.asset.grid import SparseGrid
+from player.cameras.camera import Camera
+
+BLOCK = 8
+"""Pixels along each edge of a block: smaller blocks fit the outline better and cost more to project."""
+
+MARGIN_PX = 0.01
+"""Pixels by which projections are grown: far more than the rounding of float64."""
+
+
+def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of t for each block of the picture.
+
+    Args:
+        grid: the sparse grid.
+        camera: in the model frame.
+
+    Returns:
+        near: [rows, columns] float32, model units; inf where no brick projects.
+        far: [rows, columns] float32, -inf there.
+    """
+    shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
+    near, far = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+    edge = VERTICES / grid.cells_per_unit.astype(np.float64)
+    w2c = np.linalg.inv(camera.c2w)
+    steps = (w2c[:3, :3] * edge).T  # [3, 3]: what one brick along x, y, z is in the camera's frame
+    first = grid.slot_coords @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
+    radius = float(np.linalg.norm(edge)) / 2
+    distance = np.linalg.norm(first + steps.sum(axis=0) / 2, axis=1)
+    starts, ends = np.maximum(distance - radius * 1.001, 0), distance + radius * 1.001
+    corners = np.array(list(np.ndindex(2, 2, 2))) @ steps
+    depths = -(first[:, 2] + corners[:, 2, None])  # [8, n]
+    ahead, behind = (depths > 1e-6 * radius).all(axis=0), (depths < 0).all(axis=0)
+    around = np.flatnonzero(~ahead & ~behind)
+    if len(around):  # the camera is in or beside such a brick: it may be anywhere in the picture
+        near[:], far[:] = starts[around].min(), ends[around].max()
+    shown = np.flatnonzero(ahead)
+    x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None]) / depths[:, shown]
+    y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None]) / depths[:, shown]
+    left, right = _range(x, shape[1])
+    top, bottom = _range(y, shape[0])
+    _spread((left, right, top, bottom), starts[shown], ends[shown], near, far)
+    return near, far
+
+
+def _range(x: np.ndarray, n_blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """First block and one past the last whose pixel centres can lie between the least and greatest of x [8,
+    n]."""
+    low = np.floor((x.min(axis=0) - 0.5 - MARGIN_PX) / BLOCK)
+    high = np.floor((x.max(axis=0) - 0.5 + MARGIN_PX) / BLOCK) + 1
+    return np.clip(low, 0, n_blocks).astype(np.int64), np.clip(high, 0, n_blocks).astype(np.int64)
+
+
+def _spread(
+    box: tuple[np.ndarray, ...], starts: np.ndarray, ends: np.ndarray, near: np.ndarray, far: np.ndarray
+) -> None:
+    """Take every brick into the blocks of its box (left, right, top, bottom)."""
+    left, right, top, bottom = box
+    wide = np.maximum(right - left, 0)
+    counts = wide * np.maximum(bottom - top, 0)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    place = np.arange(counts.sum()) - (np.cumsum(counts) - counts)[owner]
+    rows, columns = np.divmod(place, np.maximum(wide, 1)[owner])
+    index = (top[owner] + rows) * near.shape[1] + left[owner] + columns
+    np.minimum.at(near.reshape(-1), index, starts.astype(np.float32)[owner])
+    np.maximum.at(far.reshape(-1), index, ends.astype(np.float32)[owner])

@@ -1,0 +1,135 @@
+"""Rays through contracted space: a lattice on them that depends on the ray alone and reaches infinity.
+
+Letters: (o, d) a ray in the model frame, d of unit length; p its point nearest to the origin, at t = t_p; b =
+|p|; w = max(1, b). A place on the ray is an angle: t = t_p + w tan(phi), from phi_0 at t = near to almost
+pi/2. The point is (p cos(phi) + w d sin(phi)) / cos(phi), which `player.march.contraction` takes as it is:
+nothing is divided by a cosine that is nearly 0. s = phi - phi_0, so that the samples are at s_n = (n + 1/2)
+dphi.
+
+In contracted space a ray is never faster than MAX_SPEED for a step of phi: inside the unit ball dt/dphi = w +
+(t - t_p)^2 / w <= 2; far out it approaches sqrt(4 b^2 + w^2) / w <= sqrt(5). So pi / dphi samples reach from
+anywhere to infinity, and m cells around a sample that are empty are m / (cells for MAX_SPEED dphi) samples
+long.
+
+The sample at phi has the way from phi - dphi/2 to phi + dphi/2, in model units w sin(dphi) / (cos(phi -
+dphi/2) cos(phi + dphi/2)); both cosines are at least MIN_COS, which is where the lattice ends.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+from player.march.contraction import contraction_scale, pull_back
+
+MAX_SPEED = np.float32(5**0.5)
+"""Contracted units for a unit of phi, at most."""
+MIN_COS = np.float32(1e-3)
+"""Rays end where cos(phi) is this: a thousand model units behind the point nearest to the origin."""
+SPARE = 8
+"""Lattice samples behind the last: the numpy march looks at so many at a time."""
+
+
+class ContractedRays(NamedTuple):
+    """n rays, as the lattice wants them."""
+
+    nearest: np.ndarray
+    """[3, n] float32: p."""
+    along: np.ndarray
+    """[3, n] float32: w d."""
+    t_nearest: np.ndarray
+    """[n] float32: t_p."""
+    width: np.ndarray
+    """[n] float32: w."""
+    cos: np.ndarray
+    sin: np.ndarray
+    """[n] float32, both of phi_0."""
+    length: np.ndarray
+    """[n] float32: s where the ray ends."""
+    cells: np.float32
+    """Cells in a contracted unit."""
+    step: np.float32
+    """dphi."""
+
+    def turned(self, ray: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """cos and sin [n_places] of phi at the places `s` [n_places] on the rays `ray` [n_places]."""
+        return self.lattice_turned(ray, np.cos(s), np.sin(s))
+
+    def lattice_turned(
+        self, ray: np.ndarray, cos_s: np.ndarray, sin_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same from cos and sin of s."""
+        cos, sin = self.cos[ray], self.sin[ray]
+        return cos * cos_s - sin * sin_s, sin * cos_s + cos * sin_s
+
+    def directions(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """v [3, n_places]: the places are v / cos, model frame."""
+        return cos * self.nearest[:, ray] + sin * self.along[:, ray]
+
+    def on_grid(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, n_places] (cells) of places."""
+        v = self.directions(ray, cos, sin)
+        scale = contraction_scale(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cos) * self.cells
+        return v * scale + self.cells * np.float32(2)
+
+    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, n_places] at the places `s` on the rays `ray`."""
+        return self.on_grid(ray, *self.turned(ray, s))
+
+    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """t [n_places], model units."""
+        cos, sin = self.turned(ray, s)
+        return self.t_nearest[ray] + self.width[ray] * sin / np.maximum(cos, MIN_COS)
+
+    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Gradients [3, n_places] with respect to contracted coordinates, as such with respect to the
+        model's."""
+        cos, sin = self.turned(ray, s)
+        return pull_back(gradients, self.directions(ray, cos, sin), cos)
+
+    def ways(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """Model units [n_places] that samples at places stand for."""
+        half = self.step * np.float32(0.5)
+        a, b = cos * np.cos(half), sin * np.sin(half)
+        return self.width[ray] * np.sin(self.step) / (np.maximum(a + b, MIN_COS) * np.maximum(a - b, MIN_COS))
+
+    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Model units [n_places] that the samples at the places `s` on the rays `ray` stand for."""
+        return self.ways(ray, *self.turned(ray, s))
+
+
+def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> ContractedRays:
+    """Rays [n, 3] (model frame, unit directions) from where they begin, `grid.near` from their origins, to
+    where they end."""
+    o, d = rays_o.astype(np.float64), rays_d.astype(np.float64)
+    t_nearest = -np.sum(o * d, axis=-1)
+    nearest = o + t_nearest[:, None] * d
+    width = np.maximum(1.0, np.linalg.norm(nearest, axis=-1))
+    start = np.arctan2(grid.near - t_nearest, width)
+    return ContractedRays(
+        nearest=np.ascontiguousarray(nearest.T, np.float32),
+        along=np.ascontiguousarray((width[:, None] * d).T, np.float32),
+        t_nearest=t_nearest.astype(np.float32),
+        width=width.astype(np.float32),
+        cos=np.cos(start).astype(np.float32),
+        sin=np.sin(start).astype(np.float32),
+        length=(np.arccos(float(MIN_COS)) - start).astype(np.float32),
+        cells=grid.cells_per_unit[0],
+        step=grid.step,
+    )
+
+
+@lru_cache(maxsize=4)
+def lattice(step: float) -> np.ndarray:
+    """[3, n] float32: s_n and its cos and sin, for all samples that a ray can have and SPARE more.
+
+    >>> lattice(1.0)[0, :4].tolist()
+    [0.5, 1.5, 2.5, 3.5]
+    """
+    s = (np.arange(int(np.pi / step) + 1 + SPARE) + 0.5).astype(np.float32) * np.float32(step)
+    found = np.stack([s, np.cos(s.astype(np.float64)), np.sin(s.astype(np.float64))]).astype(np.float32)
+    found.flags.writeable = False  # it is shared
+    return found

@@ -1,0 +1,222 @@
+"""Where along a ray to fetch features: k places instead of one at every sample.
+
+Letters: a ray has m samples at s_i with weights w_i and opacity A. Its weights are cut into k bins of equal
+mass; a sample may be split between bins. A bin is fetched at the centroid of its mass, with the weight A /
+k, so that the weights still add up to A and opacity does not depend on k. A ray with m <= k samples uses
+the samples themselves, exactly.
+
+Features are trilinear over the corners that are stored, divided by their share of the interpolation
+weights. A bin that straddles a gap may have its centroid where nothing is stored: if that share is below
+MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of equals), which lies in a live cell.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+
+MIN_TOTAL = np.float32(1e-3)
+"""Least share of stored corners with which a place counts as stored."""
+
+BLOCK = 4096
+"""Fetches at a time: what they gather stays in the second-level cache."""
+
+
+class Places(Protocol):
+    """Rays in grid coordinates: `player.march.box.Entries`, `player.march.contracted.ContractedRays`."""
+
+    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, n_places] at the places `s` [n_places] on the rays `ray` [n_places]."""
+        ...
+
+    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """t [n_places] of these places, model units."""
+        ...
+
+    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Model units [n_places] that samples at these places stand for."""
+        ...
+
+    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Gradients [3, n_places] at these places with respect to the grid's axes (model units), as such with
+        respect to the model frame's."""
+        ...
+
+
+class Samples(NamedTuple):
+    """Samples with weight, grouped by ray, in the order of the march."""
+
+    ray: np.ndarray
+    """[n_samples] int64."""
+    s: np.ndarray
+    """[n_samples] float32, distance from the entry into the box, model units; in contracted space an
+    angle."""
+    weights: np.ndarray
+    """[n_samples] float32."""
+
+
+class Bins(NamedTuple):
+    """The k bins of n rays that have more than k samples each; bin j of ray r is row r * k + j."""
+
+    ray: np.ndarray
+    """[n * k] int64."""
+    s: np.ndarray
+    """[n * k] float32, centroid of the bin's mass."""
+    first: np.ndarray
+    """[n * k] int64, the first sample with mass in the bin."""
+    last: np.ndarray
+    """[n * k] int64, the last one."""
+    start: np.ndarray
+    """[n * k] float64, mass of the ray before the bin, 0..1."""
+    mass: np.ndarray
+    """[n_samples] float64, mass of the ray up to and with each sample, 0..1."""
+    k: int
+    """Bins a ray; each has the mass 1 / k."""
+
+
+def fetch_features(
+    grid: SparseGrid, entries: Places, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
+) -> np.ndarray:
+    """Sum of weight times feature over the fetches of each ray in `hits`: [n_hits, n_channels] float32.
+
+    Args:
+        grid: the sparse grid.
+        entries: all rays where they enter the box.
+        samples: all samples with weight.
+        opacity: [n] float32 of all rays.
+        hits: [n_hits] rays to fetch for, ascending.
+        k: fetches a ray; 0 fetches at every sample.
+    """
+    rows = np.full(len(opacity), -1, np.int64)
+    rows[hits] = np.arange(len(hits))
+    out = np.zeros((len(hits), grid.n_channels), np.float32)
+    counts = np.bincount(samples.ray, minlength=len(opacity))
+    wanted = rows[samples.ray] >= 0
+    merged = wanted & (counts[samples.ray] > k) if k else np.zeros(len(wanted), bool)
+    own = Samples(*(column[wanted & ~merged] for column in samples))
+    _add(grid, entries, own, rows, out)
+    if merged.any():
+        samples = Samples(*(column[merged] for column in samples))
+        bins = equal_mass_bins(samples, k)
+        weights = opacity[bins.ray] / np.float32(k)
+        gaps = _add(grid, entries, Samples(bins.ray, bins.s, weights), rows, out)
+        if len(gaps):
+            s = samples.s[heaviest(bins, gaps)]
+            _add(grid, entries, Samples(bins.ray[gaps], s, weights[gaps]), rows, out)
+    return out
+
+
+def equal_mass_bins(samples: Samples, k: int) -> Bins:
+    """Cut the weights of each ray into k bins of equal mass; every ray has more than k samples.
+
+    Cumulative mass is scaled to 1 a ray, so that `rank + mass` rises over all rays and one search finds
+    every cut.
+
+    >>> samples = Samples(np.zeros(3, int), np.float32([1, 2, 4]), np.float32([0.25, 0.25, 0.25]))
+    >>> equal_mass_bins(samples, 2).s.round(3).tolist()
+    [1.3329999446868896, 3.3329999446868896]
+    """
+    starts = np.flatnonzero(np.diff(samples.ray, prepend=-1))
+    ends = np.append(starts[1:], len(samples.ray)) - 1
+    rank = np.repeat(np.arange(len(starts)), ends - starts + 1)
+    weights = samples.weights.astype(np.float64)
+    share = weights / np.add.reduceat(weights, starts)[rank]
+    unit = samples.s[ends].astype(np.float64)  # the last sample's s, so that moments are at most 1 too
+    mass = _cumulative(share, starts, rank)
+    mass /= mass[ends][rank]
+    moment = _cumulative(share * (samples.s / unit[rank]), starts, rank)
+    cuts = np.arange(1, k) / k
+    found = np.searchsorted(rank + mass, np.arange(len(starts))[:, None] + cuts)
+    found = np.clip(found, starts[:, None], ends[:, None])
+    at_cut = moment[found] - (mass[found] - cuts) * (samples.s[found] / unit[:, None])
+    edges = np.concatenate([np.zeros((len(starts), 1)), at_cut, moment[ends][:, None]], axis=1)
+    centroids = np.diff(edges, axis=1) * k * unit[:, None]
+    return Bins(
+        ray=np.repeat(samples.ray[starts], k),
+        s=centroids.reshape(-1).astype(np.float32),
+        first=np.concatenate([starts[:, None], found], axis=1).reshape(-1),
+        last=np.concatenate([found, ends[:, None]], axis=1).reshape(-1),
+        start=np.tile(np.arange(k) / k, len(starts)),
+        mass=mass,
+        k=k,
+    )
+
+
+def _cumulative(values: np.ndarray, starts: np.ndarray, rank: np.ndarray) -> np.ndarray:
+    """Sums of values 0..1 along each ray, the sample itself included.
+
+    In integers of 2^-50, whose sums are exact even where they wrap around: a ray's sums must not depend on
+    the rays before it.
+    """
+    whole = np.rint(values * 2.0**50).astype(np.int64)
+    running = np.cumsum(whole)
+    return (running - (running[starts] - whole[starts])[rank]) * 2.0**-50
+
+
+def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
+    """[n] the sample with most of its mass in each of the bins `which` [n]; the first of equals.
+
+    >>> samples = Samples(np.zeros(3, int), np.float32([1, 2, 4]), np.float32([0.3, 0.4, 0.3]))
+    >>> heaviest(equal_mass_bins(samples, 2), np.array([0, 1])).tolist()
+    [0, 2]
+    """
+    first, begin = bins.first[which], bins.start[which]
+    counts = bins.last[which] - first + 1
+    starts = np.cumsum(counts) - counts
+    owner = np.repeat(np.arange(len(which)), counts)
+    index = np.arange(counts.sum()) - starts[owner] + first[owner]
+    before = np.where(index == first[owner], begin[owner], bins.mass[index - 1])
+    inside = np.minimum(bins.mass[index], begin[owner] + 1 / bins.k) - before
+    most = np.maximum.reduceat(inside, starts)[owner]
+    candidates = np.flatnonzero(inside >= most)
+    _, place = np.unique(owner[candidates], return_index=True)
+    return index[candidates[place]]
+
+
+def _add(
+    grid: SparseGrid, entries: Places, fetches: Samples, rows: np.ndarray, out: np.ndarray
+) -> np.ndarray:
+    """Add each fetch to the row of its ray; returns the indices of those where too little is stored."""
+    gaps = []
+    firsts = np.flatnonzero(np.diff(fetches.ray, prepend=-1))
+    cuts = np.searchsorted(
+        firsts, np.arange(0, len(fetches.ray), BLOCK)
+    )  # no ray is cut: sums keep their order
+    edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
+    for start, stop in itertools.pairwise(edges):
+        ray, s, weights = (column[start:stop] for column in fetches)
+        values, total = stored_features(grid, entries.at(ray, s))
+        poor = total < MIN_TOTAL
+        scale = np.where(poor, np.float32(0), weights / np.where(poor, np.float32(1), total))
+        values *= scale[:, None]
+        groups = np.flatnonzero(np.diff(ray, prepend=-1))
+        out[rows[ray[groups]]] += np.add.reduceat(values, groups, axis=0)
+        gaps.append(start + np.flatnonzero(poor))
+    return np.concatenate(gaps) if gaps else np.zeros(0, np.int64)
+
+
+def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stored corners' weighted sum of codes [n, n_channels] at g [3, n] float32, cells of the density's grid,
+    and their weights' sum [n]."""
+    vertices = grid.rows
+    g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
+    low = np.minimum(g.astype(np.int32), vertices.resolution - 1)
+    fraction = g - low.astype(np.float32)
+    n = vertices.n_per_axis
+    held = vertices.bricks.take(((low[0] >> 3) * n + (low[1] >> 3)) * n + (low[2] >> 3))
+    lx, ly, lz = (low & 7).astype(np.int64)
+    at = np.maximum(held, 0) * np.int64(729) + lx * 81 + ly * 9 + lz
+    share = [(np.float32(1) - side, side) for side in fraction]
+    values = np.zeros((g.shape[1], grid.n_channels), np.float32)
+    total = np.zeros(g.shape[1], np.float32)
+    for x, y, z in np.ndindex(2, 2, 2):
+        row = vertices.rows.take(at + (x * 81 + y * 9 + z))
+        stored = (held >= 0) & (row >= 0)
+        weight = share[0][x] * share[1][y] * share[2][z] * stored
+        values += weight[:, None] * grid.features.take(np.where(stored, row, 0), axis=0)
+        total += weight
+    return values, total

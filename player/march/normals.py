@@ -1,0 +1,63 @@
+"""The normal that a pixel sees: the density gradient, composited like a feature.
+
+Letters: samples x_i with weights w_i as in `player.march.march`; sigma, the density. A pixel's normal is `N =
+normalise(- sum w_i grad log sigma(x_i))`: it points where density falls. The logarithm of the density is
+linear in the interpolated code (`player.asset.density`), so that the gradient is that of the trilinear code
+in the sample's cell; in contracted space it is pulled back to the model frame. It is summed before it is
+normalised: where the code is flat, inside a solid, there is no direction, and none is added.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+from player.march.marches import sampled_rays
+
+
+def composited_normals(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Normals of rays, in the model frame. The samples are collected again, by the numpy march.
+
+    Args:
+        grid: the sparse grid.
+        rays_o: [n, 3] float32 origins, model frame.
+        rays_d: [n, 3] float32 unit directions, model frame.
+        bounds: optional [n] float32 `near` and `far`, as for `player.march.march.march`.
+
+    Returns:
+        normals: [n, 3] float32, of unit length; 0 where no sample has weight or the gradients cancel.
+    """
+    places, samples, _ = sampled_rays(grid, rays_o, rays_d, bounds)
+    slopes = code_gradient(grid, places.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
+    slopes = places.pulled_back(slopes, samples.ray, samples.s)
+    weights = samples.weights.astype(np.float64)
+    normals = np.stack([-np.bincount(samples.ray, weights * slope, len(rays_o)) for slope in slopes], axis=-1)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(length > 1e-9, normals / np.where(length > 1e-9, length, 1), 0).astype(np.float32)
+
+
+def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
+    """Gradient [3, n] float32 of the interpolated density code, codes a cell, at points of live cells.
+
+    `g` [3, n] float32: grid coordinates (cells), each in a live cell, as samples of the march are.
+    """
+    cell = np.clip(g.astype(np.int32), 0, grid.resolution - 1)
+    fraction = (g - cell).astype(np.float32)
+    n = np.int32(grid.n_per_axis)
+    brick = cell >> 3
+    slot = grid.table.take((brick[0] * n + brick[1]) * n + brick[2]).astype(np.int64)
+    local = cell & 7
+    at = np.maximum(slot, 0) * 729 + local[0] * 81 + local[1] * 9 + local[2]
+    share = [(1 - fraction[axis], fraction[axis]) for axis in range(3)]
+    slopes = np.zeros((3, g.shape[1]), np.float32)
+    for x, y, z in np.ndindex(2, 2, 2):
+        code = grid.density.take(at + (x * 81 + y * 9 + z)).astype(np.float32)
+        slopes[0] += (2 * x - 1) * code * share[1][y] * share[2][z]
+        slopes[1] += (2 * y - 1) * code * share[0][x] * share[2][z]
+        slopes[2] += (2 * z - 1) * code * share[0][x] * share[1][y]
+    return slopes

@@ -1,0 +1,304 @@
+"""`vfr-play` as a contract: what other programs call."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from player.app import cli
+from player.compiled import compiling
+from player.files import files
+from player.render import Renderer
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+def views(shells_folder: Path) -> list[str]:
+    return [str(shells_folder), "--cameras", str(shells_folder / "cameras.json")]
+
+
+def test_one_picture_a_frame_and_figures(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, figures = tmp_path / "frames", tmp_path / "figures.json"
+    options = ["--output", str(out), "--threads", "2", "--json", str(figures)]
+    assert cli.main([*views(shells_folder), *options]) == 0
+    assert sorted(p.name for p in out.iterdir()) == [f"r_{i}.png" for i in range(5)]
+    with Image.open(out / "r_0.png") as picture:
+        assert picture.size == (48, 40) and picture.mode == "RGB"
+    got = json.loads(figures.read_text())
+    assert set(got) == {
+        "ms_median", "ms_p95", "frames", "width", "height", "threads", "march", "peak_rss_mb", "samples",
+    }  # fmt: skip
+    assert (got["frames"], got["width"], got["height"], got["threads"], got["samples"]) == (5, 48, 40, 2, 5)
+    assert got["march"] == ("numba" if compiling.available() else "numpy")
+    assert 0 < got["ms_median"] <= got["ms_p95"]
+    assert got["peak_rss_mb"] is None or got["peak_rss_mb"] > 10
+    printed = capsys.readouterr()
+    assert printed.err == "" and printed.out.count("\n") == 1 and str(out) in printed.out
+
+
+def test_json_on_stdout_and_slices(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for text, names in (
+        ("1:3", ["r_1", "r_2"]),
+        ("::2", ["r_0", "r_2", "r_4"]),
+        ("-1:", ["r_4"]),
+        ("2", ["r_2"]),
+    ):
+        out = tmp_path / text.replace(":", "_")
+        options = [
+            "--output",
+            str(out),
+            "--frames=" + text,
+            "--march",
+            "numpy",
+            "--json",
+            "-",
+            "--samples",
+            "0",
+        ]
+        assert cli.main([*views(shells_folder), *options]) == 0
+        got = json.loads(capsys.readouterr().out)
+        assert sorted(p.stem for p in out.iterdir()) == names and got["frames"] == len(names)
+        assert got["march"] == "numpy" and got["samples"] == 0
+
+
+@pytest.mark.parametrize(
+    ("background", "mode", "corner"),
+    [("white", "RGB", (255,) * 3), ("black", "RGB", (0,) * 3), ("10,200,30", "RGB", (10, 200, 30)),
+     ("transparent", "RGBA", (0,) * 4)],
+)  # fmt: skip
+def test_backgrounds(
+    background: str, mode: str, corner: tuple[int, ...], shells_folder: Path, tmp_path: Path
+) -> None:
+    options = [
+        "--output",
+        str(tmp_path / "o"),
+        "--frames",
+        "0:1",
+        "--background",
+        background,
+        "--size",
+        "32x24",
+    ]
+    assert cli.main([*views(shells_folder), *options]) == 0
+    with Image.open(tmp_path / "o" / "r_0.png") as picture:
+        assert (picture.mode, picture.size) == (mode, (32, 24))
+        pixels = np.asarray(picture)
+    assert tuple(pixels[0, 0].tolist()) == corner and tuple(pixels[12, 16].tolist()) != corner
+
+
+def test_orbit(shells_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "turn"
+    assert cli.main([str(shells_folder), "--orbit", "3", "--output", str(out), "--size", "24x16"]) == 0
+    pictures = sorted(out.iterdir())
+    assert len(pictures) == 3
+    for path in pictures:
+        with Image.open(path) as picture:
+            assert picture.size == (24, 16) and np.asarray(picture)[8, 12].min() < 255
+
+
+def test_output_that_is_not_empty(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    out.mkdir()
+    options = ["--output", str(out), "--frames", "0:1"]
+    assert cli.main([*views(shells_folder), *options]) == 0, "an empty folder will do"
+    (out / "mine.txt").write_text("mine")
+    (out / "r_0.png").write_text("old")
+    assert cli.main([*views(shells_folder), *options]) == 1
+    error = capsys.readouterr().err
+    assert (
+        error == f"vfr-play: error: {out}: not empty: add --force to write into it, replacing frames of "
+        "equal name, or --resume to go on with a run that was interrupted\n"
+    )
+    assert (out / "r_0.png").read_text() == "old"
+    assert cli.main([*views(shells_folder), *options, "--force"]) == 0
+    assert (out / "mine.txt").read_text() == "mine" and (out / "r_0.png").read_bytes()[:4] == b"\x89PNG"
+    assert cli.main([*views(shells_folder), "--output", str(out / "mine.txt"), "--force"]) == 1
+    assert "expected a folder for the pictures, got a file" in capsys.readouterr().err
+
+
+def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([str(shells_folder), "--info"]) == 0
+    page = capsys.readouterr().out
+    for text in ("vfr-asset 3.1", "64 cells per axis", "4 channels", "at 5 places a ray", "161 parameters",
+                 "5 training views of 48x40", "psnr", "4 x 4 x 4 units, from -1, 0, 1 to 3, 4, 5",
+                 "head.onnx"):  # fmt: skip
+        assert text in page, text
+    assert cli.main([str(shells_folder), "--info", "--json", "-"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["bytes_total"] == sum(facts["bytes"].values()) and facts["n_channels"] == 4
+    assert facts["world_units_per_model_unit"] == 2 and facts["provenance"] == {"psnr": 30.5}
+
+
+def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([str(broken_folder), "--check"]) == 0
+    assert len(re.findall(r"^ok ", capsys.readouterr().out, re.M)) == 9
+    data = bytearray((broken_folder / "mesh.ply").read_bytes())
+    data[0] ^= 1
+    (broken_folder / "mesh.ply").write_bytes(bytes(data))
+    (broken_folder / "density.codes").unlink()
+    assert cli.main([str(broken_folder), "--check"]) == 1
+    printed = capsys.readouterr()
+    assert len(re.findall(r"^ok ", printed.out, re.M)) == 7
+    assert re.search(r"^FAILED  mesh\.ply .*sha256", printed.out, re.M)
+    assert re.search(r"^FAILED  density\.codes .*no such file", printed.out, re.M)
+    assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 9 files failed\n"
+    assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
+    assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--orbit", "3"], "--output: add where the pictures go"),
+        (
+            ["--force"],
+            "--force: does nothing for the viewer; it is for pictures and videos, with --output and",
+        ),
+        (["--frames", "3"], "--frames: does nothing for the viewer; it is for pictures and videos"),
+        (["--info", "--output", "o"], "--output: does nothing for --info; it is for pictures and videos"),
+        (["--check", "--samples", "0"], "--samples: does nothing for --check; it is for the viewer"),
+        (
+            ["--orbit", "3", "--output", "o", "--port", "1"],
+            "--port: does nothing for pictures and videos; it is for",
+        ),
+        (["--port", "65536"], "expected a whole number, 1 to 65535, such as 8080, got '65536'"),
+        (["--orbit", "3", "--output", "o", "--resume", "--force"], "--resume: not allowed with --force"),
+        (["--orbit", "3", "--output", "o.mp4", "--format", "png"], "--format: o.mp4 says"),
+        (["--orbit", "3", "--output", "o", "--fps", "3"], "--fps: expected a video"),
+        (
+            ["--orbit", "3", "--output", "o.mp4", "--fps", "0"],
+            "a number over 0 up to 1000, such as 30, got '0'",
+        ),
+        (["--orbit", "3", "--output", "o.mp4", "--background", "transparent"], "a video has no transparency"),
+        (["--orbit", "3", "--output", "o", "--size", "0x0"], "from 1x1 on, such as 800x600, got '0x0'"),
+        (["--view", "x", "--output", "o"], "expected a whole number, such as 3, got 'x'"),
+        (["--output", "o"], "--output: add the views"),
+        (["--orbit", "0", "--output", "o"], "--orbit"),
+        (["--orbit", "3", "--info"], "not allowed with"),
+        (["--info", "--size", "800"], "--size"),
+        (["--info", "--background", "1,2"], "--background"),
+        (["--info", "--background", "1,2,256"], "--background"),
+        (["--info", "--frames", "::0"], "--frames"),
+        (["--info", "--samples", "-1"], "--samples"),
+        (["--info", "--nonsense"], "unrecognized"),
+    ],
+)
+def test_usage(
+    options: list[str], message: str, shells_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([str(shells_folder), *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cameras", "nowhere.json"], "nowhere.json"),
+        (["--orbit", "1", "--size", "20000x20000"], "got 20000x20000, which would take 12.0 GB of memory"),
+        (["--view", "5"], "--view: expected 0 to 4, got 5"),
+        (["--orbit", "1", "--frames", "5:9"], "--frames: expected at least one of the 1 views"),
+    ],
+)
+def test_errors_are_one_line(
+    options: list[str], message: str, shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([str(shells_folder), *options, "--output", str(tmp_path / "o")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("vfr-play: error: ") and error.count("\n") == 1 and message in error
+    assert not (tmp_path / "o").exists()
+
+
+def test_not_an_asset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for option in (["--info"], ["--check"], ["--orbit", "1", "--output", str(tmp_path / "o")]):
+        assert cli.main([str(tmp_path / "nowhere"), *option]) == 1
+        assert "nowhere: expected the folder of an asset, got nothing" in capsys.readouterr().err
+
+
+def test_full_disk(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o")]) == 1
+    assert "r_0.png: cannot write: No space left on device" in capsys.readouterr().err
+    assert list((tmp_path / "o").iterdir()) == []
+
+
+def test_ctrl_c_keeps_finished_frames(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original, calls = Renderer.render, []
+
+    def stop(self: Renderer, *args: object, **kwargs: object) -> object:
+        calls.append(1)
+        if len(calls) == 4:  # one to warm up, two frames
+            raise KeyboardInterrupt
+        return original(self, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Renderer, "render", stop)
+    assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o")]) == 130
+    assert sorted(p.name for p in (tmp_path / "o").iterdir()) == ["r_0.png", "r_1.png"]
+    assert f"kept in {tmp_path / 'o'}; --resume goes on" in capsys.readouterr().err
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("first", [False, True])
+def test_progress_on_a_terminal(
+    first: bool, shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    child = [sys.executable, "-I", "-c", "print('right')"]
+    monkeypatch.setattr("player.proof._record", lambda: tmp_path / "proof.txt")
+    monkeypatch.setattr("player.proof.python_command", lambda _: child)
+    monkeypatch.setattr("player.proof.first_use", lambda: first)
+    assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o"), "--frames", ":2"]) == 0
+    shown = terminal.getvalue()
+    assert "frame 2/2" in shown and ("compiling for this processor" in shown) == first
+
+
+def run(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_plays_where_torch_numba_and_the_rest_are_blocked(shells_folder: Path, tmp_path: Path) -> None:
+    blocked = ("torch", "numba", "scipy", "cv2", "onnx", "skimage", "tqdm", "vfr_bake", "exporters")
+    code = f"import sys; sys.modules.update(dict.fromkeys({blocked!r}))\n"
+    code += "from player.app.cli import main; sys.exit(main())"
+    out = tmp_path / "o"
+    done = run(code, *views(shells_folder), "--output", str(out), "--frames", "0:1", "--json", "-")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["march"] == "numpy" and (out / "r_0.png").is_file()
+
+
+def test_help_and_import_are_light() -> None:
+    code = "import sys, player; from player.app.cli import main; main(['--help']); print(player.Camera)\n"
+    done = run(code + "print(sorted({'onnxruntime', 'numba', 'PIL', 'torch'} & set(sys.modules)))")
+    assert done.returncode == 0 and done.stdout.splitlines()[-1] == "[]"
+    done = run("import sys; from player.app.cli import main; main(['--help']); print('numpy' in sys.modules)")
+    assert done.stdout.splitlines()[-1] == "False" and "--orbit" in done.stdout

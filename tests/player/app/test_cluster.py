@@ -1,0 +1,136 @@
+"""Frames on a Dask cluster of two workers, one of which is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from player.app import cli
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+N_FRAMES = 24
+SECONDS = 300.0
+"""Patience with a busy machine."""
+
+
+def start(module: str, *arguments: str) -> subprocess.Popen[bytes]:
+    # No restarts by a nanny: what is killed stays so.
+    return subprocess.Popen(
+        [sys.executable, "-m", f"distributed.cli.{module}", *arguments],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+class Cluster:
+    """A scheduler on this machine and its workers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "scheduler.json"
+        self.scheduler = start(
+            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show",
+            "--scheduler-file", str(self._file),
+        )  # fmt: skip
+        self.workers: list[subprocess.Popen[bytes]] = []
+        end = time.monotonic() + SECONDS
+        while not self._file.is_file():
+            assert self.scheduler.poll() is None and time.monotonic() < end
+            time.sleep(0.1)
+        self.address: str = json.loads(self._file.read_text())["address"]
+
+    def add_worker(self) -> None:
+        self.workers.append(
+            start("dask_worker", self.address, "--no-nanny", "--nthreads", "1", "--no-dashboard")
+        )
+
+    def close(self) -> None:
+        for process in [*self.workers, self.scheduler]:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    cluster = Cluster(tmp_path)
+    yield cluster
+    cluster.close()
+
+
+def play(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "player", *arguments],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.extra
+def test_every_frame_arrives_once_though_a_worker_dies(
+    cluster: Cluster, shells_folder: Path, tmp_path: Path
+) -> None:
+    cluster.add_worker()
+    cluster.add_worker()
+    views = [str(shells_folder), "--orbit", str(N_FRAMES), "--size", "320x320", "--threads", "1"]
+    out, here = tmp_path / "there", tmp_path / "here"
+    process = play(*views, "--output", str(out), "--dask", cluster.address, "--json", "-")
+    end = time.monotonic() + SECONDS
+    while not (out.is_dir() and len(list(out.glob("*.png"))) >= 3):
+        assert process.poll() is None and time.monotonic() < end, process.communicate()
+        time.sleep(0.01)
+    cluster.workers[0].kill()
+    finished = len(list(out.glob("*.png")))
+    printed, errors = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0, errors
+    assert finished < N_FRAMES, "it died midway"
+    assert json.loads(printed)["frames"] == N_FRAMES
+    assert cli.main([*views, "--output", str(here)]) == 0
+    assert len(list(here.iterdir())) == N_FRAMES == len(list(out.iterdir()))
+    for path in here.iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.extra
+def test_what_is_said_when_it_cannot_be(
+    cluster: Cluster,
+    shells_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    views = [str(shells_folder), "--orbit", "2", "--size", "8x8", "--output", str(tmp_path / "o")]
+    process = play(*views, "--dask", "tcp://127.0.0.1:1")
+    _, errors = process.communicate(timeout=SECONDS)
+    assert process.returncode == 1
+    assert errors.startswith("vfr-play: error: --dask: tcp://127.0.0.1:1: expected a scheduler to answer")
+    # the path leads to another asset on the worker
+    cluster.add_worker()
+    code = (
+        "import sys; from pathlib import Path; import player.app.cluster as c; digest = c._digest\n"
+        "c._digest = lambda folder: 'another'\n"
+        "from player.app.cli import main; sys.exit(main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *views, "--dask", cluster.address],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("vfr-play: error: ") and "on a worker: expected the asset of the client" in last
+
+
+def test_without_the_extra(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    options = ["--orbit", "2", "--output", str(tmp_path / "o"), "--dask", "tcp://127.0.0.1:1"]
+    assert cli.main([str(shells_folder), *options]) == 1
+    assert "pip install 'vfr-bake[cluster]'" in capsys.readouterr().err

@@ -1,0 +1,251 @@
+"""Files: pictures, videos, what is resumed, and what Ctrl-C leaves."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from player.app import cli
+from player.app.play import LARGE_BYTES, _check_sizes
+from player.app.video import write_video
+from player.asset.asset import Asset
+from player.cameras.camera import orbit
+from player.cameras.nerfstudio import write_camera_path
+from player.cameras.transforms import read_cameras
+from player.errors import OutputError
+from player.files.images import png_bytes, read_key, webp_bytes
+from player.render import FRAME_BYTES, Renderer, render
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+def trained(folder: Path) -> list[str]:
+    return [str(folder), "--cameras", str(folder / "cameras.json")]
+
+
+def test_a_training_view_exactly(asset: Asset, shells_folder: Path, tmp_path: Path) -> None:
+    cameras = read_cameras(asset.path("cameras.json"))
+    for number, name in ((3, "view.png"), (-1, "last.webp")):
+        assert cli.main([str(shells_folder), "--view", str(number), "--output", str(tmp_path / name)]) == 0
+        assert (pixels(tmp_path / name) == render(asset, cameras[number]).to_uint8()).all()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["last.webp", "view.png"]
+
+
+@pytest.mark.parametrize("background", ["white", "transparent"])
+def test_webp_and_png_show_the_same(background: str, shells_folder: Path, tmp_path: Path) -> None:
+    for form in ("png", "webp"):
+        options = ["--output", str(tmp_path / form), "--format", form, "--background", background]
+        assert cli.main([*trained(shells_folder), *options]) == 0
+    for path in sorted((tmp_path / "png").iterdir()):
+        webp = pixels(tmp_path / "webp" / f"{path.stem}.webp")
+        png = pixels(path)
+        assert webp.shape == png.shape == (40, 48, 4 if background == "transparent" else 3)
+        assert (webp == png).all()
+
+
+def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:
+    """The largest of those that are asked for, whatever their order."""
+    small = read_cameras(asset.path("cameras.json"))[0]
+    pixels = math.ceil(LARGE_BYTES / FRAME_BYTES)
+    wide, square = (
+        small.resized(pixels // 100 + 1, 100),
+        small.resized(math.isqrt(pixels) - 1, math.isqrt(pixels) - 1),
+    )
+    said: list[str] = []
+    _check_sizes([small, square], SimpleNamespace(is_video=False), said.append)
+    assert not said
+    for cameras in ([wide, small, square], [square, small, wide], [wide]):
+        said.clear()
+        _check_sizes(cameras, SimpleNamespace(is_video=False), said.append)
+        gigabytes = wide.width * 100 * FRAME_BYTES / 1e9
+        assert said == [f"a picture of {wide.width}x100 takes {gigabytes:.1f} GB of memory"]
+
+
+def test_one_picture_wants_one_view(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "a.png"
+    assert cli.main([*trained(shells_folder), "--output", str(target)]) == 1
+    assert "expected one view for one picture, got 5" in capsys.readouterr().err
+    assert cli.main([*trained(shells_folder), "--output", str(target), "--frames", "2"]) == 0
+    assert cli.main([*trained(shells_folder), "--output", str(target), "--frames", "2"]) == 1
+    assert f"{target}: already exists: add --force to replace it" in capsys.readouterr().err
+    assert cli.main([*trained(shells_folder), "--output", str(target), "--frames", "2", "--force"]) == 0
+
+
+def test_keys_survive_in_both_formats(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (3, 4, 4), np.uint8)
+    for name, encode in (("a.png", png_bytes), ("a.webp", webp_bytes)):
+        path = tmp_path / name
+        path.write_bytes(encode(image, "0123abc"))
+        assert read_key(path) == "0123abc" and (pixels(path) == image).all()
+        path.write_bytes(encode(image))
+        assert read_key(path) is None
+        path.write_bytes(encode(image, "0123abc")[:-30])
+        assert read_key(path) is None, "cut short"
+    assert read_key(tmp_path / "nowhere.png") is None
+    with pytest.raises(OutputError, match="WebP: expected at most 16383 pixels a side"):
+        webp_bytes(np.zeros((1, 16384, 3), np.uint8))
+
+
+# --- resume ---
+
+
+def test_resume_renders_what_is_missing_and_nothing_else(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    command = [*trained(shells_folder), "--output", str(out), "--resume", "--json", "-"]
+    assert cli.main([*trained(shells_folder), "--output", str(tmp_path / "whole")]) == 0
+    assert cli.main([*trained(shells_folder), "--output", str(out), "--frames", "1:3"]) == 0
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    capsys.readouterr()
+    assert cli.main(command) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 3
+    for path in (tmp_path / "whole").iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+    assert {name: (out / name).stat().st_mtime_ns for name in before} == before
+    assert cli.main(command) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["frames"] == 0 and figures["ms_median"] is None
+    assert cli.main(command[:-2]) == 0
+    assert "0 pictures (5 were there already)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["--background", "black"], ["--samples", "2"], ["--size", "24x20"]])
+def test_resume_does_not_mix_two_runs(
+    options: list[str], shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    assert cli.main([*trained(shells_folder), "--output", str(out), "--frames", "1:3"]) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert cli.main([*trained(shells_folder), "--output", str(out), "--resume", *options]) == 1
+    assert "r_1.png: --resume: expected a frame of this asset, these views" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_resume_replaces_no_stranger(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    out.mkdir()
+    (out / "r_1.png").write_text("mine")
+    assert cli.main([*trained(shells_folder), "--output", str(out), "--resume"]) == 1
+    assert "r_1.png: --resume: expected a frame" in capsys.readouterr().err
+    assert (out / "r_1.png").read_text() == "mine" and len(list(out.iterdir())) == 1
+
+
+@pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
+def test_ctrl_c_in_the_middle_then_resume(name: str, shells_folder: Path, tmp_path: Path) -> None:
+    """A real interrupt of a real process, at some frame."""
+    target = tmp_path / name
+    folder = target if name == "frames" else tmp_path / "turn.mp4.frames"
+    command = [str(shells_folder), "--orbit", "200", "--size", "96x96", "--output", str(target)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "player", *command],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (folder.is_dir() and len(list(folder.glob("orbit_*.png"))) >= 3):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    assert process.returncode == 130
+    assert errors == (
+        f"vfr-play: interrupted; the frames that were finished are kept in {folder}; --resume goes on\n"
+    )
+    done = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert 3 <= len(done) < 200 and all(path.startswith("orbit_") for path in done), "no half written file"
+    assert all(read_key(folder / path) for path in done)
+    if name != "frames":
+        assert not target.exists()
+    assert cli.main([*command, "--resume", "--json", str(tmp_path / "figures.json")]) == 0
+    assert json.loads((tmp_path / "figures.json").read_text())["frames"] == 200 - len(done)
+    if name == "frames":
+        assert len(list(folder.iterdir())) == 200
+        assert {path: (folder / path).stat().st_mtime_ns for path in done} == done
+    else:
+        assert len(decode(target)) == 200 and not folder.exists()
+
+
+# --- video ---
+
+
+def decode(path: Path) -> list[np.ndarray]:
+    import av
+
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+@pytest.mark.extra
+def test_a_video_shows_the_frames_at_the_paths_rate(
+    asset: Asset, shells_folder: Path, tmp_path: Path
+) -> None:
+    """An odd size, which H.264 cannot store: filled up by copies of the last column and row."""
+    import av
+
+    turn = orbit(read_cameras(asset.path("cameras.json")), 6, (65, 49))
+    path = tmp_path / "path.json"
+    path.write_bytes(write_camera_path(turn, 12))
+    target = tmp_path / "turn.mp4"
+    assert cli.main([str(shells_folder), "--cameras", str(path), "--output", str(target)]) == 0
+    with av.open(str(target)) as container:
+        stream = container.streams.video[0]
+        assert float(stream.average_rate or 0) == 12 and stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p", "what browsers show"
+    frames = decode(target)
+    assert len(frames) == 6 and frames[0].shape == (50, 66, 3)
+    with Renderer(asset, 1) as renderer:
+        for decoded, camera in zip(frames, turn, strict=True):
+            picture = renderer.render(camera).to_uint8().astype(int)
+            # noise of one pixel is lost in colour at half resolution; the mean says that colours are right
+            assert np.abs(decoded[:49, :65] - picture).mean() < 8
+            assert np.abs(decoded[:49, :65].mean(axis=(0, 1)) - picture.mean(axis=(0, 1))).max() < 2.5
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["path.json", "turn.mp4"]
+
+
+@pytest.mark.extra
+def test_plain_colours_of_a_video_are_right(tmp_path: Path) -> None:
+    colours = [(255, 255, 255), (0, 0, 0), (200, 30, 30), (30, 200, 30), (30, 30, 200)]
+    write_video(tmp_path / "a.mp4", [np.full((32, 32, 3), c, np.uint8) for c in colours], 29.97)
+    for frame, colour in zip(decode(tmp_path / "a.mp4"), colours, strict=True):
+        assert np.abs(frame.mean(axis=(0, 1)) - colour).max() < 4
+
+
+@pytest.mark.extra
+def test_videos_that_cannot_be(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "turn.mp4"
+    views = json.loads((shells_folder / "cameras.json").read_text())
+    views["frames"][2] |= {"w": 20, "h": 20}
+    mixed = tmp_path / "mixed.json"
+    mixed.write_text(json.dumps(views))
+    assert cli.main([str(shells_folder), "--cameras", str(mixed), "--output", str(target)]) == 1
+    assert "expected views of one size for a video, got [(20, 20), (48, 40)]" in capsys.readouterr().err
+    with pytest.raises(OutputError, match=r"turn\.mp4: cannot write: "):
+        write_video(target, [np.zeros((8, 40_000, 3), np.uint8)], 30)
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert cli.main([*trained(shells_folder), "--output", str(target)]) == 1
+    assert "pip install 'vfr-bake[video]'; or write pictures: --output DIR" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mixed.json"], "said before anything was rendered"

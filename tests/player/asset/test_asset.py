@@ -1,0 +1,322 @@
+"""The format: round trip, and every way to break it."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset, GridArrays, checksums, read_manifest, write_asset
+from player.asset.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
+from player.asset.packing import pack_codes, pack_masks, unpack_codes
+from player.errors import FormatError, IntegrityError, OutputError, VersionError
+
+SMALLEST = Manifest(
+    generator="t",
+    resolution=6,
+    feature_resolution=6,
+    step=0.1,
+    density_range=(0, 1),
+    n_channels=1,
+    view_size=(1, 1),
+)
+"""Nothing that need not be said."""
+
+
+def parts(asset: Asset) -> tuple[Manifest, GridArrays, bytes, bytes, bytes]:
+    rest = (asset.path(name).read_bytes() for name in ("head.onnx", "mesh.ply", "cameras.json"))
+    return (asset.manifest, asset.arrays, *rest)
+
+
+def test_round_trip_is_byte_for_byte(asset: Asset, tmp_path: Path) -> None:
+    write_asset(tmp_path / "copy", *parts(asset))
+    again = Asset.open(tmp_path / "copy", verify=True)
+    assert again.manifest == asset.manifest
+    for name in (*FILES, "manifest.json"):
+        assert (tmp_path / "copy" / name).read_bytes() == (asset.folder / name).read_bytes()
+    for name in vars(asset.arrays):
+        assert (getattr(again.arrays, name) == getattr(asset.arrays, name)).all()
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (70,), (0, 3), (1, 3), (70, 1), (70, 5)])
+def test_packed_codes_come_back(shape: tuple[int, ...]) -> None:
+    for dtype in (np.int8, np.uint8):
+        info = np.iinfo(dtype)
+        codes = np.random.default_rng(0).integers(info.min, info.max + 1, shape, dtype)
+        again = unpack_codes(pack_codes(codes), shape, np.dtype(dtype).str[1:], "codes")
+        assert again.dtype == dtype and np.array_equal(again, codes)
+
+
+def test_what_is_added_at_the_end_is_listed_and_a_failure_there_leaves_nothing(
+    asset: Asset, tmp_path: Path
+) -> None:
+    def finish(folder: Path) -> dict[str, bytes]:
+        assert folder != tmp_path / "a" and not (tmp_path / "a").exists()
+        assert Asset.open(folder, verify=True).manifest.files.keys() == set(FILES)
+        return {"report.json": b"{}"}
+
+    def fail(folder: Path) -> dict[str, bytes]:
+        raise OutputError("it plays black")
+
+    write_asset(tmp_path / "a", *parts(asset), finish=finish)
+    assert Asset.open(tmp_path / "a", verify=True).path("report.json").read_bytes() == b"{}"
+    with pytest.raises(OutputError, match="it plays black"):
+        write_asset(tmp_path / "b", *parts(asset), finish=fail)
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_an_asset_moves(broken_folder: Path, tmp_path: Path) -> None:
+    broken_folder.rename(tmp_path / "elsewhere")
+    assert Asset.open(tmp_path / "elsewhere", verify=True).path("mesh.ply").is_file()
+
+
+def test_scale_and_world(asset: Asset) -> None:
+    assert math.isclose(asset.scale, 2)
+    assert asset.world_from_model[:3, 3].tolist() == [1, 2, 3]
+
+
+def test_existing_folder_is_kept_without_force(asset: Asset, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match="already exists: add --force"):
+        write_asset(tmp_path / "out", *parts(asset))
+    assert (tmp_path / "out" / "mine.txt").read_text() == "mine"
+    write_asset(tmp_path / "out", *parts(asset), force=True)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted([*FILES, "manifest.json"])
+
+
+def test_full_disk_leaves_nothing(asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np.lib.format, "write_array", full)
+    with pytest.raises(OutputError, match=r"out: cannot write: No space left on device"):
+        write_asset(tmp_path / "out", *parts(asset))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_such_folder(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"nowhere: expected the folder of an asset, got nothing"):
+        Asset.open(tmp_path / "nowhere")
+    with pytest.raises(FormatError, match=r"not an asset: expected manifest\.json in it, got none"):
+        Asset.open(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FormatError, match=r"file: expected the folder of an asset, got a file"):
+        Asset.open(tmp_path / "file")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_missing_cut_and_changed_files_are_named(name: str, broken_folder: Path) -> None:
+    path = broken_folder / name
+    data = path.read_bytes()
+    changed = bytearray(data)
+    changed[-1] ^= 1
+    path.write_bytes(bytes(changed))
+    with pytest.raises(IntegrityError, match=rf"{name}: sha256: expected [0-9a-f]{{16}}\.\.\., got"):
+        Asset.open(broken_folder, verify=True)
+    failed = [n for n, error in checksums(broken_folder, read_manifest(broken_folder)) if error]
+    assert failed == [name]
+    path.write_bytes(data[:-1])
+    with pytest.raises(
+        IntegrityError, match=rf"{name}: size: expected {len(data)} bytes, got {len(data) - 1}"
+    ):
+        Asset.open(broken_folder)
+    path.unlink()
+    with pytest.raises(FormatError, match=rf"{name}: no such file: expected a file of {len(data)} bytes"):
+        Asset.open(broken_folder)
+
+
+def npy(array: np.ndarray, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def replace_file(folder: Path, name: str, data: bytes) -> None:
+    """Put `data` in place of a file and tell the manifest its size."""
+    (folder / name).write_bytes(data)
+    edit(folder, lambda m: m["files"][name].update(bytes=len(data)))
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    path = folder / "manifest.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def test_arrays_that_do_not_fit(broken_folder: Path, asset: Asset) -> None:
+    a = asset.arrays
+    packed = pack_codes(a.density)
+    bad: list[tuple[str, bytes, str]] = [
+        ("density.codes", pack_codes(a.density[:-1]), f"expected {len(a.density)} packed codes, got"),
+        ("density.codes", pack_codes(np.append(a.density, np.uint8(0))), "packed codes, got more"),
+        ("density.codes", pack_codes(np.zeros(1 << 20, np.uint8)), "packed codes, got more"),
+        ("density.codes", packed + b"tail", "packed codes, got more"),
+        ("density.codes", packed[:-9], "packed codes, got"),
+        ("density.codes", b"PK\x03\x04 not a stream", "expected packed codes, got something else"),
+        ("density.codes", b"", f"expected {len(a.density)} packed codes, got 0"),
+        ("features.codes", pack_codes(a.features[:, :3]), "packed codes, got"),
+        ("brick_coords.npy", npy(a.brick_coords[::-1].copy()), "expected bricks sorted"),
+        ("brick_coords.npy", npy(a.brick_coords[:-1]), "packed bytes, got more"),
+        ("brick_coords.npy", npy(a.brick_coords + np.uint16(1)), "expected coordinates below 9"),
+        ("brick_coords.npy", npy(np.asfortranarray(a.brick_coords)), "C order"),
+        ("brick_coords.npy", npy(np.array([{}], object), allow_pickle=True), "expected a numpy array"),
+        ("brick_coords.npy", npy(a.brick_coords) + b"tail", "bytes as its header says"),
+        ("brick_coords.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
+        ("brick_coords.npy", b"", "expected a numpy array"),
+        ("brick_masks.bits", npy(a.brick_masks), "expected packed bytes, got something else"),
+        ("brick_masks.bits", pack_masks(a.brick_masks)[:-9], "packed bytes, got"),
+        ("feature_coords.npy", npy(a.feature_coords[::-1].copy()), "expected bricks sorted"),
+        ("feature_masks.bits", pack_masks(a.feature_masks[:-1]), "packed bytes, got"),
+    ]
+    for name, data, message in bad:
+        good = (broken_folder / name).read_bytes()
+        replace_file(broken_folder, name, data)
+        with pytest.raises(FormatError, match=message) as caught:
+            Asset.open(broken_folder)
+        assert re.search(r"\.(npy|bits|codes): ", str(caught.value)) and "\n" not in str(caught.value)
+        replace_file(broken_folder, name, good)
+    Asset.open(broken_folder)
+
+
+def test_vertices_beyond_the_grid(broken_folder: Path) -> None:
+    edit(broken_folder, lambda m: m.update(resolution=63))
+    with pytest.raises(FormatError, match="expected coordinates below 8, got 8"):
+        Asset.open(broken_folder)
+    arrays = GridArrays(
+        np.zeros((1, 3), np.uint16),
+        np.full((1, 8), 2**7, np.uint64),
+        np.zeros(8, np.uint8),
+        np.zeros((0, 3), np.uint16),
+        np.zeros((0, 8), np.uint64),
+        np.zeros((0, 1), np.int8),
+    )
+    with pytest.raises(FormatError, match="expected vertices up to 6, got one at 7"):
+        arrays.check(SMALLEST, "")
+
+
+BAD_MANIFESTS: list[tuple[dict[str, Any], str]] = [
+    ({"format": "other"}, 'format: expected "vfr-asset", got'),
+    ({"resolution": True}, r"resolution: expected an integer in 1\.\.2048, got True"),
+    ({"resolution": 64.0}, "resolution: expected an integer"),
+    ({"resolution": 0}, "resolution: expected an integer"),
+    ({"resolution": 10**400}, "resolution: expected an integer"),
+    ({"step": -1}, "step: expected a number"),
+    ({"step": False}, "step: expected a number"),
+    ({"step": "1"}, "step: expected a number"),
+    ({"step": 1e-8}, "step: expected at most 65536 steps"),
+    ({"aabb": [[1, 1, 1], [-1, -1, -1]]}, "aabb: expected lower corner below upper"),
+    ({"aabb": [[1, 1], [2, 2]]}, "aabb: expected 3 numbers"),
+    (
+        {"world_from_model": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+        "world_from_model: expected a rot",
+    ),
+    (
+        {"world_from_model": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+        "world_from_model: expected",
+    ),
+    ({"density_range": [1, 1]}, "density_range: expected low < high"),
+    ({"density_range": [0, 1000]}, "density_range: expected a number"),
+    ({"background": [0, 0, 2]}, "background: expected a number"),
+    ({"colour_space": "linear"}, "colour_space: expected one of"),
+    ({"view_size": [800]}, "view_size: expected 2 integers"),
+    ({"generator": 3}, "generator: expected text"),
+    ({"provenance": []}, "provenance: expected an object"),
+    ({"files": {"../x": {"bytes": 1, "sha256": "0" * 64}}}, "files: expected plain file names"),
+    ({"files": {"/etc/passwd": {"bytes": 1, "sha256": "0" * 64}}}, "files: expected plain file names"),
+    ({"files": {"C:x": {"bytes": 1, "sha256": "0" * 64}}}, "files: expected plain file names"),
+    ({"files": {"..": {"bytes": 1, "sha256": "0" * 64}}}, "files: expected plain file names"),
+    ({"files": {"a": {"bytes": -1, "sha256": "0" * 64}}}, "bytes: expected an integer"),
+    ({"files": {"a": {"bytes": 1, "sha256": "xyz"}}}, "sha256: expected 64"),
+    ({"files": {"a": {"bytes": 1}}}, "expected bytes and sha256"),
+    ({"files": {}}, r"files: expected brick_coords\.npy"),
+    ({"surprise": 1}, "surprise: expected no such key"),
+    ({"version": "1.0"}, "version: expected 2 integers"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_MANIFESTS)
+def test_bad_manifest(change: dict[str, Any], message: str, asset: Asset) -> None:
+    document = json.loads(manifest_bytes(asset.manifest)) | change
+    with pytest.raises(FormatError, match=message) as caught:
+        parse_manifest(json.dumps(document).encode(), "m.json")
+    assert "\n" not in str(caught.value)
+
+
+def keys_of_a_manifest() -> list[str]:
+    return [key for key in json.loads(manifest_bytes(SMALLEST)) if key != "format"]
+
+
+@pytest.mark.parametrize("key", keys_of_a_manifest())
+def test_missing_key(key: str, asset: Asset) -> None:
+    document = json.loads(manifest_bytes(asset.manifest))
+    del document[key]
+    with pytest.raises(FormatError, match=key):
+        parse_manifest(json.dumps(document).encode(), "m.json")
+
+
+def test_versions(asset: Asset) -> None:
+    document = json.loads(manifest_bytes(asset.manifest))
+    newer = document | {"version": [3, 7], "surprise": 1}
+    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(3, 7))
+    for version, fix in (([4, 0], "install a newer vfr-bake"), ([2, 1], "bake the asset again")):
+        with pytest.raises(VersionError, match=rf"m\.json: version: expected 3\.x, got {version[0]}.*{fix}"):
+            parse_manifest(json.dumps(document | {"version": version}).encode(), "m.json")
+
+
+def test_rays_begin_at_the_camera_in_a_box_and_in_older_assets(asset: Asset) -> None:
+    with pytest.raises(FormatError, match=r"near: expected 0 unless contracted, got 0\.2"):
+        replace(asset.manifest, near=0.2)
+    document = json.loads(manifest_bytes(asset.manifest))
+    del document["near"]
+    with pytest.raises(FormatError, match="near: expected this key"):
+        parse_manifest(json.dumps(document).encode(), "m")
+    assert parse_manifest(json.dumps(document | {"version": [3, 0]}).encode(), "m").near == 0
+
+
+def test_contracted_space_has_one_box(asset: Asset) -> None:
+    space = ((-2, -2, -2), (2, 2, 2))
+    assert replace(asset.manifest, contracted=True, aabb=space).contracted
+    with pytest.raises(FormatError, match=r"aabb: expected .* where contracted"):
+        replace(asset.manifest, contracted=True)
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_nan_and_infinity_are_refused_both_ways(text: str, asset: Asset) -> None:
+    data = manifest_bytes(asset.manifest).replace(b"30.5", text.encode())
+    with pytest.raises(FormatError, match="is not a number of JSON"):
+        parse_manifest(data, "m.json")
+    with pytest.raises(FormatError, match="expected finite JSON values"):
+        manifest_bytes(replace(asset.manifest, provenance={"psnr": float(text)}))
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{", b"\xff\xfe", b"[" * 100_000, b" " * (MAX_BYTES + 1)])
+def test_not_a_manifest(data: bytes) -> None:
+    with pytest.raises(FormatError, match=r"m\.json: "):
+        parse_manifest(data, "m.json")
+
+
+def test_golden_manifest() -> None:
+    manifest = replace(SMALLEST, feature_resolution=4, step=0.5, view_size=(4, 3), n_samples=0)
+    text = manifest_bytes(manifest).decode()
+    assert "".join(text.split()) == (
+        '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
+        '"contracted":false,"density_range":[0.0,1.0],"feature_resolution":4,"files":{},"format":"vfr-asset","generator":"t","n_channels":1,"n_samples":0,"near":0.0,'
+        '"provenance":{},"resolution":6,"step":0.5,"version":[3,1],"view_size":[4,3],'
+        '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'
+    )
+
+
+def test_path_of_an_unknown_file(asset: Asset) -> None:
+    with pytest.raises(FormatError, match=r"expected one of .*got \.\./x"):
+        asset.path("../x")

@@ -1,0 +1,108 @@
+"""Bricks, the density code and the grid that is built from them, against plain dense arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset
+from player.asset.bricks import (
+    bricks_per_axis,
+    dense_index,
+    live_cells,
+    pack_vertices,
+    stored_bits,
+    unpack_vertices,
+)
+from player.asset.density import decode_density, encode_density
+from player.asset.grid import MAX_DISTANCE, build_grid
+
+RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
+
+
+@pytest.mark.parametrize("density_range", RANGES)
+def test_every_code_survives_decoding_and_encoding(density_range: tuple[float, float]) -> None:
+    codes = np.arange(256)
+    low, high = density_range
+    exact = low + (high - low) * codes / 255
+    assert encode_density(exact, density_range).tolist() == codes.tolist()
+    sigmas = decode_density(codes, density_range)
+    assert sigmas.dtype == np.float32 and np.isfinite(sigmas).all()
+    # float32: half an ulp of the exponent (up to 80 * 2^-24), a few of the sum
+    np.testing.assert_allclose(sigmas, np.exp(exact), rtol=3e-5)
+
+
+def test_codes_are_clipped_and_rounded_to_the_nearest() -> None:
+    log_sigmas = np.array([-np.inf, -1e30, 0.49, 0.51, 254.51, 1e30, np.inf])
+    assert encode_density(log_sigmas, (0.0, 255.0)).tolist() == [0, 0, 0, 1, 255, 255, 255]
+    assert encode_density(np.zeros((0, 2)), (0.0, 1.0)).shape == (0, 2)
+
+
+def random_vertices(resolution: int, share: float, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).random((resolution + 1,) * 3) < share
+
+
+@pytest.mark.parametrize("resolution", [1, 7, 8, 20])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.8, 1.0])
+def test_packing_round_trip_and_live_cells(resolution: int, share: float) -> None:
+    dense = random_vertices(resolution, share, seed=resolution)
+    vertices = np.random.default_rng(1).permutation(np.argwhere(dense))
+    coords, masks, order = pack_vertices(vertices)
+    assert (unpack_vertices(coords, masks) == vertices[order]).all()
+    keys = [tuple(c) for c in coords.tolist()]
+    assert keys == sorted(set(keys))
+    n = bricks_per_axis(resolution)
+    live = live_cells(coords, masks, dense_index(coords, n))
+    found = np.zeros((n * 8,) * 3, bool)
+    found[tuple(unpack_vertices(coords, live).T)] = True
+    expected = np.ones((resolution,) * 3, bool)
+    for i, j, k in np.ndindex(2, 2, 2):
+        expected &= dense[i : i + resolution, j : j + resolution, k : k + resolution]
+    assert (found[:resolution, :resolution, :resolution] == expected).all() and found.sum() == expected.sum()
+
+
+def test_one_missing_corner_kills_eight_cells() -> None:
+    dense = np.ones((21, 21, 21), bool)
+    dense[8, 8, 8] = False
+    coords, masks, _ = pack_vertices(np.argwhere(dense))
+    live = live_cells(coords, masks, dense_index(coords, 3))
+    dead = set(map(tuple, np.argwhere(np.ones((20,) * 3)).tolist()))
+    dead -= set(map(tuple, unpack_vertices(coords, live).tolist()))
+    assert dead == {(7 + i, 7 + j, 7 + k) for i, j, k in np.ndindex(2, 2, 2)}
+
+
+@pytest.mark.parametrize("share", [0.3, 0.97])
+def test_grid_against_dense_arrays(share: float) -> None:
+    resolution, rng = 37, np.random.default_rng(3)
+    dense = random_vertices(resolution, share, seed=4)
+    dense[8:24, :, :] = False
+    vertices = np.argwhere(dense)
+    coords, masks, order = pack_vertices(vertices)
+    vertices = vertices[order]
+    codes = rng.integers(1, 256, len(vertices)).astype(np.uint8)
+    features = rng.integers(-128, 128, (len(vertices), 3)).astype(np.int8)
+    where, both = (coords, masks), (resolution, resolution)
+    box = np.array([[-1] * 3, [1] * 3])
+    grid = build_grid((*where, codes), (*where, features), both, box, 0.1, (0, 1))
+    n = grid.n_per_axis
+    full = np.zeros((n * 8 + 1,) * 3, np.uint8)
+    full[tuple(vertices.T)] = codes
+    apron = grid.codes.reshape(-1, 9, 9, 9)
+    for slot, (x, y, z) in enumerate(grid.slot_coords.tolist()):
+        assert grid.table[(x * n + y) * n + z] == slot
+        assert (apron[slot] == full[x * 8 : x * 8 + 9, y * 8 : y * 8 + 9, z * 8 : z * 8 + 9]).all()
+    rows = np.full((n * 8,) * 3, -1)
+    rows[tuple(vertices.T)] = np.arange(len(vertices))
+    for x, y, z in coords.tolist():
+        got = grid.rows.rows.reshape(-1, 9, 9, 9)[grid.rows.bricks[(x * n + y) * n + z]][:8, :8, :8]
+        assert (got == rows[x * 8 : x * 8 + 8, y * 8 : y * 8 + 8, z * 8 : z * 8 + 8]).all()
+    for at in np.ndindex(n, n, n):
+        entry = int(grid.table.reshape(n, n, n)[at])
+        if entry < 0:
+            nearest = np.abs(grid.slot_coords - at).max(axis=1).min(initial=MAX_DISTANCE)
+            assert -entry == min(nearest, MAX_DISTANCE)
+
+
+def test_grid_of_the_asset_keeps_every_vertex(asset: Asset) -> None:
+    assert stored_bits(asset.arrays.feature_masks).sum() == len(asset.grid.features)
+    assert (asset.grid.features == asset.arrays.features).all()

@@ -1,0 +1,87 @@
+"""Numbers of the manifest at their limits, and matrices that are nearly a similarity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from player.asset.manifest import Manifest
+from player.errors import FormatError
+from tests.player.asset.test_asset import SMALLEST
+
+LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
+    "resolution": (0, 1, 2048, 2049),
+    "feature_resolution": (0, 1, 2048, 2049),
+    "n_samples": (-1, 0, 1024, 1025),
+    "n_channels": (0, 1, 1024, 1025),
+    "density_range": ((-80.5, 1), (-80, 1), (0, 80), (0, 80.5)),
+    "background": ((-0.01, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1.01)),
+    "view_size": ((0, 1), (1, 1), (2**20, 2**20), (1, 2**20 + 1)),
+    "step": (0.9e-9, 1e-4, 1e9, 1.1e9),
+}
+"""Refused, accepted, accepted, refused, as `player.asset.manifest` has it. A step of the least size would
+take more samples than a ray may have."""
+
+
+@pytest.mark.parametrize("key", LIMITS)
+def test_numbers_are_accepted_up_to_their_limits(key: str) -> None:
+    below, least, most, above = LIMITS[key]
+    for value in (least, most):
+        other = {"resolution": 2048} if key == "feature_resolution" else {}
+        other |= {"feature_resolution": 1} if key == "resolution" else {}
+        assert getattr(replace(SMALLEST, **(other | {key: value})), key) == value
+    for value in (below, above):
+        with pytest.raises(FormatError, match=f"{key}: expected"):
+            replace(SMALLEST, **{key: value})
+
+
+def rotation(random: np.random.Generator) -> np.ndarray:
+    """Any rotation is as likely as any other: a normal quaternion."""
+    w, x, y, z = (q := random.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def with_matrix(linear: np.ndarray, last: tuple[float, ...] = (0, 0, 0, 1)) -> Manifest:
+    rows = [(*row, 5.0) for row in linear.tolist()]
+    return replace(SMALLEST, world_from_model=(*map(tuple, rows), last))
+
+
+def test_every_rotation_with_one_scale_is_a_world_and_no_reflection_is() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        linear = rotation(random) * 10 ** random.uniform(-3, 3)
+        assert with_matrix(linear).world_from_model[0][3] == 5
+        axis = random.integers(3)
+        mirrored = linear.copy()
+        mirrored[:, axis] *= -1
+        with pytest.raises(FormatError, match="world_from_model: expected a rotation"):
+            with_matrix(mirrored)
+
+
+@pytest.mark.parametrize("first", range(3))
+@pytest.mark.parametrize("second", range(3))
+def test_an_axis_of_another_length_or_aslant_is_refused(first: int, second: int) -> None:
+    """By a thousandth of the scale: a ten-thousandth is rounding."""
+    for size in (1e-6, 1.0, 1e6):
+        linear = np.eye(3)
+        linear[first, second] += 2e-3
+        with pytest.raises(FormatError, match="world_from_model: expected a rotation"):
+            with_matrix(linear * size)
+        linear = np.eye(3)
+        linear[first, second] += 2e-5
+        with_matrix(linear * size)
+
+
+@pytest.mark.parametrize("last", [(0, 0, 0, 2), (1e-3, 0, 0, 1), (0, 0, -1, 1)])
+def test_the_last_row_is_that_of_an_affine_map(last: tuple[float, ...]) -> None:
+    with pytest.raises(FormatError, match="world_from_model: expected a rotation"):
+        with_matrix(np.eye(3), last)

@@ -1,0 +1,120 @@
+"""Vectors in registers: the exponential against float64, and reading from many places."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit, types
+from numba.extending import intrinsic
+
+from player.compiled.lanes import INT, LANES, LONG, gather, load, store
+
+
+def _address(context: Any, b: Any, kind: Any, array: Any) -> Any:
+    return context.make_array(kind)(context, b, array).data
+
+
+def _exp(_: Any, x: Any, out: Any) -> Any:
+
+    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
+        x, out = (_address(context, b, *pair) for pair in zip(signature.args, arguments, strict=True))
+        store(out, LONG(0), load(b, x, LONG(0)).exp())
+        return context.get_dummy_value()
+
+    return types.void(x, out), generate
+
+
+def _fma(_: Any, x: Any, y: Any, out: Any) -> Any:
+
+    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
+        x, y, out = (_address(context, b, *pair) for pair in zip(signature.args, arguments, strict=True))
+        first, second = load(b, x, LONG(0)), load(b, y, LONG(0))
+        store(out, LONG(0), first.call("fma", second, load(b, out, LONG(0))))
+        return context.get_dummy_value()
+
+    return types.void(x, y, out), generate
+
+
+def _gather(_: Any, words: Any, index: Any, out: Any) -> Any:
+
+    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
+        words, index, out = (
+            _address(context, b, *pair) for pair in zip(signature.args, arguments, strict=True)
+        )
+        at = load(b, index, LONG(0), INT)
+        low, high = gather(words, at, 4, at >= 0, LONG).halves()
+        store(out, LONG(0), low)
+        store(out, LONG(LANES), high)
+        return context.get_dummy_value()
+
+    return types.void(words, index, out), generate
+
+
+exp_lanes: Any = intrinsic(_exp)
+fma_lanes: Any = intrinsic(_fma)
+gather_lanes: Any = intrinsic(_gather)
+
+
+@njit
+def exp_of(x, out):
+    for first in range(0, x.size, LANES):
+        exp_lanes(x[first : first + LANES], out[first : first + LANES])
+
+
+@njit
+def fused(x, y, out):
+    fma_lanes(x, y, out)
+
+
+@njit
+def gathered(words, index, out):
+    gather_lanes(words, index, out)
+
+
+def test_exp_is_that_of_float64() -> None:
+    random = np.random.default_rng(0)
+    x = np.concatenate([random.uniform(-87, 88.7, 16_000), random.normal(0, 1e-3, 1_584)]).astype(np.float32)
+    found = np.empty_like(x)
+    exp_of(x, found)
+    np.testing.assert_allclose(found, np.exp(x.astype(np.float64)), rtol=2.5e-7)
+
+
+@pytest.mark.parametrize("value", [-0.0, 0.0, -95.0, -103.0, -104.5, -1e30, 89.5, 1e30, np.inf, -np.inf])
+def test_exp_at_the_ends_of_float32(value: float) -> None:
+    x, found = np.full(LANES, value, np.float32), np.empty(LANES, np.float32)
+    exp_of(x, found)
+    with np.errstate(over="ignore", under="ignore"):
+        wanted = np.exp(x.astype(np.float64)).astype(np.float32)
+    np.testing.assert_allclose(found, wanted, rtol=2.5e-7, atol=1.5e-45)
+
+
+def test_exp_of_no_number_is_none() -> None:
+    found = np.empty(LANES, np.float32)
+    exp_of(np.full(LANES, np.nan, np.float32), found)
+    assert np.isnan(found).all()
+
+
+def test_lanes_read_where_they_are_told_to() -> None:
+    words = np.arange(-50, 50, dtype=np.int32)
+    index = np.random.default_rng(1).integers(0, 99, LANES).astype(np.int32)
+    index[::5] = -1
+    found = np.empty((2, LANES), np.int32)
+    gathered(words, index, found)
+    held = index >= 0
+    assert (found[0] == np.where(held, words[index], 0)).all()
+    assert (found[1] == np.where(held, words[index + 1], 0)).all()
+
+
+def test_multiply_and_add_are_rounded_once() -> None:
+    """On a processor that has no instruction for it, too: there a function of the C library is called."""
+    random = np.random.default_rng(1)
+    for _ in range(100):
+        x, y = random.normal(size=(2, LANES)).astype(np.float32)
+        z = (-x * y).astype(np.float32)  # what is left is what a product rounded to float32 has lost
+        out = z.copy()
+        fused(x, y, out)
+        exact = x.astype(np.float64) * y + z  # products of float32, and this sum, are exact in float64
+        np.testing.assert_array_equal(out, exact.astype(np.float32))
+        assert np.abs(exact).max() > 0

@@ -1,0 +1,300 @@
+"""Writing: what a name holds before, during and after, and when something goes wrong."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from player.errors import OutputError, VfrError
+from player.files.files import check_target, new_folder, write_bytes
+
+FULL = "No space left on device"
+
+
+def refuse(number: int) -> Callable[..., Any]:
+    """A function of the system that fails with this error."""
+
+    def refused(*arguments: object, **options: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return refused
+
+
+class FullDisk(io.FileIO):
+    """Three bytes fit."""
+
+    def write(self, data: Any) -> int:
+        super().write(data[:3])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A folder `result` with a file in it, alone in its parent."""
+    folder = tmp_path / "place" / "result"
+    folder.mkdir(parents=True)
+    (folder / "old").write_bytes(b"old")
+    return folder
+
+
+@pytest.fixture
+def no_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A system, or a disk, that cannot exchange two names in one step."""
+    monkeypatch.setattr("player.files.replace.exchange", lambda one, other: False)
+
+
+@pytest.fixture
+def read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = tmp_path / "read only"
+    folder.mkdir()
+    folder.chmod(0o555)
+    if os.access(folder, os.W_OK):  # to root nothing is: the system's answer is then played
+        monkeypatch.setattr(tempfile, "mkstemp", refuse(errno.EACCES))
+        monkeypatch.setattr(tempfile, "mkdtemp", refuse(errno.EACCES))
+    yield folder
+    folder.chmod(0o755)
+
+
+# --- check_target ---
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_a_target_that_exists_is_refused_unless_forced(tmp_path: Path, kind: str) -> None:
+    target = tmp_path / "target"
+    check_target(target)
+    target.mkdir() if kind == "folder" else target.write_bytes(b"")
+    with pytest.raises(OutputError) as caught:
+        check_target(target)
+    assert str(caught.value) == f"{target}: already exists: add --force to replace it"
+    assert isinstance(caught.value, VfrError)
+    check_target(target, force=True)
+
+
+# --- write_bytes ---
+
+
+def test_write_bytes_makes_parents_and_replaces(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "file.bin"
+    for data in (b"one", b"", b"another" * 1000):
+        write_bytes(path, data)
+        assert tree(path.parent) == {"file.bin": data}
+
+
+@pytest.mark.parametrize("step", ["write", "fsync", "rename"])
+def test_a_failure_midway_leaves_the_old_file(
+    step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file.bin"
+    path.write_bytes(b"old content")
+    if step == "write":
+        monkeypatch.setattr(os, "fdopen", lambda handle, mode: FullDisk(handle, mode))
+    elif step == "fsync":
+        monkeypatch.setattr(os, "fsync", refuse(errno.ENOSPC))
+    else:
+        monkeypatch.setattr(Path, "replace", refuse(errno.ENOSPC))
+    with pytest.raises(OutputError) as caught:
+        write_bytes(path, b"new content")
+    assert str(caught.value) == f"{path}: cannot write: {FULL}"
+    assert tree(tmp_path) == {"file.bin": b"old content"}
+
+
+def test_an_interrupt_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(handle: int) -> None:
+        raise KeyboardInterrupt
+
+    path = tmp_path / "file.bin"
+    path.write_bytes(b"old content")
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_bytes(path, b"new content")
+    assert tree(tmp_path) == {"file.bin": b"old content"}
+
+
+def test_a_failure_leaves_nothing_where_nothing_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fdopen", lambda handle, mode: FullDisk(handle, mode))
+    with pytest.raises(OutputError, match=FULL):
+        write_bytes(tmp_path / "file.bin", b"new content")
+    assert names(tmp_path) == []
+
+
+def test_write_bytes_into_a_read_only_folder(read_only: Path) -> None:
+    path = read_only / "file.bin"
+    with pytest.raises(OutputError) as caught:
+        write_bytes(path, b"data")
+    assert str(caught.value) == f"{path}: cannot write: {os.strerror(errno.EACCES)}"
+    assert names(read_only) == []
+
+
+def test_write_bytes_where_it_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"mine")
+    for path in (tmp_path / "folder", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match="cannot write") as caught:
+            write_bytes(path, b"data")
+        assert str(caught.value).startswith(f"{path}: ")
+    assert names(tmp_path) == ["file", "folder"] and names(tmp_path / "folder") == []
+    assert (tmp_path / "file").read_bytes() == b"mine"
+
+
+# --- new_folder ---
+
+
+def test_a_folder_appears_complete(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "result"
+    with new_folder(path) as folder:
+        assert folder.parent == path.parent  # a rename never crosses to another disk
+        (folder / "file").write_bytes(b"data")
+        (folder / "sub").mkdir()
+        assert not path.exists()
+    assert names(path) == ["file", "sub"] and names(path.parent) == ["result"]
+
+
+@pytest.mark.parametrize("error", [ValueError("mine"), KeyboardInterrupt(), OutputError("a/b: says enough")])
+@pytest.mark.parametrize("force", [False, True])
+def test_an_exception_inside_passes_and_removes_the_folder(
+    error: BaseException, force: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "result"
+    if force:
+        path.mkdir()
+        (path / "old").write_bytes(b"old")
+    with pytest.raises(type(error)) as caught, new_folder(path, force) as folder:
+        (folder / "file").write_bytes(b"data")
+        raise error
+    assert caught.value is error
+    assert names(tmp_path) == (["result"] if force else [])
+    assert not force or tree(path) == {"old": b"old"}
+
+
+def test_a_full_disk_inside_names_the_folder(tmp_path: Path) -> None:
+    path = tmp_path / "result"
+    with pytest.raises(OutputError) as caught, new_folder(path) as folder:
+        with FullDisk(str(folder / "file"), "w") as file:
+            file.write(b"data")
+    assert str(caught.value) == f"{path}: cannot write: {FULL}"
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_exists_is_refused_before_the_work(old: Path) -> None:
+    with pytest.raises(OutputError, match="already exists"), new_folder(old):
+        pytest.fail("the block was entered")
+    assert tree(old) == {"old": b"old"} and names(old.parent) == ["result"]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+@pytest.mark.parametrize("in_one_step", [True, False])
+def test_force_replaces_at_the_end(
+    kind: str, in_one_step: bool, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if not in_one_step:
+        request.getfixturevalue("no_exchange")
+    path = tmp_path / "result"
+    if kind == "folder":
+        path.mkdir()
+        (path / "old").write_bytes(b"old")
+    else:
+        path.write_bytes(b"old")
+    with new_folder(path, force=True) as folder:
+        (folder / "new").write_bytes(b"new")
+        assert (path / "old" if kind == "folder" else path).read_bytes() == b"old"
+    assert tree(path) == {"new": b"new"} and names(tmp_path) == ["result"]
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_a_failure_in_replacing_restores_the_old_folder(
+    failing: int, old: Path, no_exchange: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first rename puts the old folder aside, the second would put the new one in its place."""
+    rename, calls = Path.replace, []
+
+    def replace(self: Path, target: Path) -> Path:
+        calls.append(target)
+        return refuse(errno.EACCES)() if len(calls) == failing else rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(OutputError) as caught, new_folder(old, force=True) as folder:
+        (folder / "new").write_bytes(b"new")
+    assert str(caught.value) == f"{old}: cannot write: {os.strerror(errno.EACCES)}"
+    assert tree(old) == {"old": b"old"} and names(old.parent) == ["result"]
+
+
+def test_an_old_folder_that_cannot_be_restored_is_kept(
+    old: Path, no_exchange: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rename, calls = Path.replace, []
+
+    def replace(self: Path, target: Path) -> Path:
+        calls.append(target)
+        return refuse(errno.EIO)() if len(calls) > 1 else rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(OutputError) as caught, new_folder(old, force=True) as folder:
+        (folder / "new").write_bytes(b"new")
+    kept = Path(calls[0])
+    assert str(caught.value).startswith(f"{old}: cannot put the old one back: ")
+    assert str(caught.value).endswith(f"it is in {kept}")
+    assert tree(kept) == {"old": b"old"} and names(old.parent) == [kept.name]
+
+
+def test_new_folder_in_a_read_only_folder(read_only: Path) -> None:
+    path = read_only / "result"
+    with pytest.raises(OutputError) as caught, new_folder(path):
+        pytest.fail("the block was entered")
+    assert str(caught.value) == f"{path}: cannot write: {os.strerror(errno.EACCES)}"
+    assert names(read_only) == []
+
+
+# --- permissions ---
+
+
+@pytest.mark.parametrize("mask", [0o000, 0o022, 0o027, 0o077])
+def test_permissions_are_those_of_anything_new(mask: int, tmp_path: Path) -> None:
+    """Temporary files are private; what takes their place is what `open` and `mkdir` would have made."""
+    with umask(mask):
+        (tmp_path / "plain").write_bytes(b"")
+        (tmp_path / "plain folder").mkdir()
+        write_bytes(tmp_path / "file", b"data")
+        with new_folder(tmp_path / "folder"):
+            pass
+        assert os.umask(mask) == mask  # asking for it did not change it
+    assert (tmp_path / "file").stat().st_mode == (tmp_path / "plain").stat().st_mode
+    assert (tmp_path / "folder").stat().st_mode == (tmp_path / "plain folder").stat().st_mode
+
+
+def test_target_in_a_file_or_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused before any work; `os.access` answers as it does to anyone but root."""
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="file is a file, not a folder"):
+        check_target(tmp_path / "file" / "a" / "b.png")
+    check_target(tmp_path / "a" / "b.png")
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)
+    with pytest.raises(OutputError, match=r"the folder .* is read-only"):
+        check_target(tmp_path / "a" / "b.png")
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != "file")
+    with pytest.raises(OutputError, match="file: cannot write: it is read-only"):
+        check_target(tmp_path / "file", force=True)

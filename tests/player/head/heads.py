@@ -1,0 +1,79 @@
+"""Heads as they once were written, and a head played in integers as a processor without VNNI does."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import numpy as np
+from scipy.special import expit
+
+from exporters import onnx_head
+from exporters.onnx_head import HeadWeights, Range, head_onnx
+from player.head.graph import HeadArrays, Layer, Rounding
+from tests.reference import gelu
+
+
+def head_onnx_of_before(weights: HeadWeights, ranges: list[Range]) -> bytes:
+    """A head in 8 bits as versions before 0.1.0 wrote it: codes of weights up to 127, whatever their
+    neighbours."""
+
+    def scales(weight: np.ndarray) -> np.ndarray:
+        return (np.maximum(np.abs(weight).max(axis=0), 1e-12) / 127).astype(np.float32)
+
+    with mock.patch.object(onnx_head, "weight_scales", scales):
+        return head_onnx(weights, ranges)
+
+
+def play_in_integers(
+    head: HeadArrays, features: np.ndarray, dirs: np.ndarray, saturating: bool = False
+) -> np.ndarray:
+    """rgb [n, 3] of a head in 8 bits; layers of codes in integers, the others in float64.
+
+    saturating: products of the inputs 2i and 2i + 1 are added up in 16 bits, from -32768 to 32767, as
+    onnxruntime does on processors with AVX2 that have no VNNI.
+    """
+    roundings = iter(head.roundings)
+    h = features.astype(np.float64)
+    for layer in head.spatial:
+        h = gelu(_plain(h, layer))
+    codes, zero = _codes(h, next(roundings))
+    exponents = np.array(_exponents(head.form.sh_degree)).reshape(-1, 3)
+    terms = np.prod(dirs[:, None].astype(np.float64) ** exponents, axis=-1)
+    encoded = _in_codes(codes, zero, head.to_sh, saturating) * _plain(terms, head.harmonics)
+    z = gelu(_in_codes(codes, zero, head.bottleneck, saturating) + encoded @ head.from_sh)
+    for layer in head.directional:
+        codes, zero = _codes(z, next(roundings))
+        z = gelu(_in_codes(codes, zero, layer, saturating))
+    return expit(_plain(z, head.output))
+
+
+def _exponents(sh_degree: int) -> list[tuple[int, int, int]]:
+    """Powers of x, y and z of all monomials from the first order on: by order, then x's power, then y's."""
+    return [
+        (x, y, order - x - y)
+        for order in range(1, sh_degree)
+        for x in range(order, -1, -1)
+        for y in range(order - x, -1, -1)
+    ]
+
+
+def _plain(x: np.ndarray, layer: Layer) -> np.ndarray:
+    return x @ layer.weight.astype(np.float64) + layer.bias
+
+
+def _codes(x: np.ndarray, rounding: Rounding) -> tuple[np.ndarray, int]:
+    levels = np.rint(x / np.float64(rounding.scale)) + rounding.zero
+    return np.clip(levels, 0, 255).astype(np.int64), rounding.zero
+
+
+def _in_codes(codes: np.ndarray, zero: int, layer: Layer, saturating: bool) -> np.ndarray:
+    weight = layer.weight.astype(np.int64)
+    if len(weight) % 2:
+        codes, weight = np.pad(codes, ((0, 0), (0, 1))), np.pad(weight, ((0, 1), (0, 0)))
+    products = codes[:, :, None] * weight
+    pairs = products[:, ::2] + products[:, 1::2]
+    if saturating:
+        pairs = np.clip(pairs, -(2**15), 2**15 - 1)
+    sums = pairs.sum(axis=1) - zero * weight.sum(axis=0) + layer.bias
+    assert layer.scale is not None
+    return sums * layer.scale.astype(np.float64)

@@ -1,0 +1,95 @@
+"""Fields in all of space on a contracted grid, and what a ray through them must give, without any
+skipping."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from player.asset.bricks import pack_vertices
+from player.asset.density import encode_density
+from player.asset.grid import SparseGrid, build_grid
+from player.march.contracted import MAX_SPEED, enter_space, lattice
+
+RESOLUTION = 48
+STEP = 4 / RESOLUTION / float(MAX_SPEED)
+RANGE = (-16.0, 8.0)
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def in_space(contracted: np.ndarray) -> np.ndarray:
+    """[n, 3] contracted points back in space; those outside the ball of radius 2 far away. Only tests may do
+    this."""
+    r = np.linalg.norm(contracted, axis=-1, keepdims=True)
+    outside = contracted / np.maximum(r, 1e-9) / np.maximum(2 - r, 1e-3)
+    return np.where(r <= 1, contracted, outside)
+
+
+def vertices_and_codes(log_sigma: Function, keep: Function) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stored vertices in the order on disk, where they are in space, their density codes."""
+    axis = np.arange(RESOLUTION + 1)
+    vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = in_space(vertices * (4 / RESOLUTION) - 2)
+    vertices = vertices[keep(points)]
+    vertices = vertices[pack_vertices(vertices)[2]]
+    points = in_space(vertices * (4 / RESOLUTION) - 2)
+    return vertices, points, encode_density(log_sigma(points), RANGE)
+
+
+def contracted_grid(log_sigma: Function, keep: Function) -> SparseGrid:
+    """The grid of a field, with features that are linear in the contracted position and one that is 50."""
+    vertices, _, codes = vertices_and_codes(log_sigma, keep)
+    coords, masks, _ = pack_vertices(vertices)
+    features = np.concatenate([vertices * 4 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
+    box = np.array([[-2.0] * 3, [2.0] * 3])
+    where, both = (coords, masks), (RESOLUTION, RESOLUTION)
+    return build_grid((*where, codes), (*where, features), both, box, STEP, RANGE, True)
+
+
+def naive(
+    grid: SparseGrid, codes: np.ndarray, ray_o: np.ndarray, ray_d: np.ndarray
+) -> tuple[float, float, int, np.ndarray]:
+    """(opacity, depth, samples taken, features at every sample) of one ray; `codes` is dense, -1 where none
+    is.
+
+    Every lattice sample is looked at. Which cell it is in is float32, as the format says, the rest float64.
+    """
+    rays = enter_space(grid, ray_o[None], ray_d[None])
+    table = lattice(float(grid.step))
+    n = np.flatnonzero(table[0] < rays.length[0])
+    ray = np.zeros(len(n), np.int64)
+    cos, sin = rays.lattice_turned(ray, table[1, n], table[2, n])
+    g = rays.on_grid(ray, cos, sin)
+    ways = rays.ways(ray, cos, sin)
+    tau, taken, samples = 0.0, 0, []
+    for place, way, s in zip(g.T, ways, table[0, n], strict=True):
+        cell = np.clip(place.astype(np.int32), 0, RESOLUTION - 1)
+        x, y, z = cell
+        around = codes[x : x + 2, y : y + 2, z : z + 2]
+        if (around < 0).any():
+            continue
+        f = place.astype(np.float64) - cell
+        code = around
+        for share in f:
+            code = code[0] * (1 - share) + code[1] * share
+        optical = float(np.exp(RANGE[0] + (RANGE[1] - RANGE[0]) * code / 255)) * float(way)
+        samples.append((float(s), np.exp(-tau) * -np.expm1(-optical), place))
+        tau += optical
+        taken += 1
+        if tau > -np.log(1e-3):
+            break
+    total = sum(weight for _, weight, _ in samples)
+    if not total:
+        return 0.0, 0.0, taken, np.zeros(4)
+    mean = sum(s * weight for s, weight, _ in samples) / total
+    depth = float(rays.distances(np.zeros(1, np.int64), np.float32([mean]))[0])
+    features = sum(weight * np.append(place * 4 - 96, 50) for _, weight, place in samples)
+    return -np.expm1(-tau), depth, taken, np.asarray(features)
+
+
+def dense_codes(log_sigma: Function, keep: Function) -> np.ndarray:
+    vertices, _, codes = vertices_and_codes(log_sigma, keep)
+    dense = np.full((RESOLUTION + 1,) * 3, -1.0)
+    dense[tuple(vertices.T)] = codes
+    return dense

@@ -1,0 +1,331 @@
+"""The viewer: its parts, what it says when it cannot open, and a real browser that looks at it."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from player.app import cli
+from player.asset.asset import Asset
+from player.cameras.transforms import read_cameras
+from player.errors import ConfigError
+from player.render import Renderer
+from player.viewer.layers import LAYERS, layer_picture
+from player.viewer.resolution import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, STILL_SECONDS, Pace, fitted
+from player.viewer.server import free_port
+from tests.player.conftest import write_shells
+from tests.player.viewer.viewer_client import SECONDS, Server
+
+WINDOW = {"width": 900, "height": 500}
+
+
+# --- sizes ---
+
+
+@pytest.mark.parametrize("rate", [2e4, 1e6, 1e9])
+def test_pace_finds_the_size_that_the_time_allows(rate: float) -> None:
+    """A machine of `rate` pixels a second with 5 ms a picture on top."""
+    pace = Pace()
+    for _ in range(40):
+        width, height = pace.moving(1000, 800)
+        pace.measured(width * height, 0.005 + width * height / rate)
+    n = np.prod(pace.moving(1000, 800))
+    wanted = (SHARE * FRAME_SECONDS - 0.005) * rate
+    assert n == pytest.approx(np.clip(wanted, LEAST, 800_000), rel=0.05)
+    assert np.prod(pace.sharp(1000, 800)) >= n
+
+
+def test_one_hiccup_halves_the_picture_at_most() -> None:
+    pace = Pace()
+    before = np.prod(pace.moving(1000, 1000))
+    pace.measured(int(before), 10.0)
+    assert np.prod(pace.moving(1000, 1000)) > before * 0.45
+    for _ in range(20):
+        pace.measured(int(before), 10.0)
+    assert np.prod(pace.moving(1000, 1000)) == pytest.approx(LEAST, rel=0.05)
+
+
+@pytest.mark.parametrize("rate", [6e4, 1e6, 1e9])
+def test_the_sharp_picture_is_there_within_a_second(rate: float) -> None:
+    """After the camera has stood still for long enough, of any window, on a machine that has a picture of
+    LEAST pixels ready in the time that a picture may take."""
+    pace = Pace()
+    for size in ((1000, 800), (3000, 2000), (70, 50)):
+        for _ in range(40):
+            width, height = pace.moving(*size)
+            pace.measured(width * height, 0.005 + width * height / rate)
+        width, height = pace.sharp(*size)
+        assert STILL_SECONDS + 0.005 + width * height / rate < 1
+        assert width * height >= min(0.9 * (SHARP_SECONDS - 0.1) * rate, size[0] * size[1]), (
+            "no smaller either"
+        )
+
+
+def test_a_window_of_one_pixel_and_a_flat_one() -> None:
+    assert fitted(1, 1, 0.0) == (1, 1) and fitted(3000, 2, 600) == (949, 1)
+
+
+# --- layers ---
+
+
+def test_layers_show_what_they_say(asset: Asset) -> None:
+    with Renderer(asset, 1) as renderer:
+        frame = renderer.render(read_cameras(asset.path("cameras.json"))[0], background=(0.0, 0.0, 1.0))
+    pictures = {layer: layer_picture(frame, layer) for layer in LAYERS}
+    assert all(picture.shape == (40, 48, 3) and picture.dtype == np.uint8 for picture in pictures.values())
+    met = frame.opacity > 0.5
+    assert (pictures["colour"] == frame.to_uint8()).all()
+    assert (pictures["opacity"][..., 1] == np.floor(frame.opacity * 255 + 0.5)).all()
+    decoded = pictures["normals"][met] / 127.5 - 1
+    assert np.abs(decoded - frame.normals[met]).max() < 0.01 and not pictures["normals"][~met].any()
+    # lightness falls with depth and rises with the number of samples
+    light = {name: picture.astype(float) @ [0.2, 0.7, 0.1] for name, picture in pictures.items()}
+    assert np.corrcoef(light["depth"][met], frame.depth[met])[0, 1] < -0.9
+    assert np.corrcoef(light["samples"].ravel(), frame.n_samples.ravel())[0, 1] > 0.9
+
+
+def test_layers_of_an_empty_picture(asset: Asset) -> None:
+    camera = read_cameras(asset.path("cameras.json"))[0]
+    away = camera.transformed(np.diag([1.0, 1, 1, 1]))
+    away.c2w[:3, 3] += 1e3
+    with Renderer(asset, 1) as renderer:
+        frame = renderer.render(away)
+    for layer in LAYERS[1:4]:
+        assert not layer_picture(frame, layer).any()
+
+
+# --- where it cannot open ---
+
+
+def test_without_viser_it_says_what_to_install_and_how_to_render(
+    shells_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main([str(shells_folder)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "pip install 'vfr-bake[viewer]'" in error
+    assert f"or render files: vfr-play {shells_folder} --orbit 60 --output frames/" in error
+
+
+def test_a_port_that_is_taken() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"viewer: --port {port} at 127.0.0.1: expected a free port"):
+            free_port("127.0.0.1", port)
+    assert 8080 <= free_port("127.0.0.1", None) < 8180
+
+
+def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Said at once: the server itself would look for a port without end."""
+    assert cli.main([str(shells_folder), "--host", "192.0.2.1", "--port", "8080"]) == 1
+    assert "viewer: --port 8080 at 192.0.2.1: expected a free port, got: " in capsys.readouterr().err
+    assert cli.main([str(shells_folder), "--background", "transparent"]) == 1
+    assert "expected a colour for the viewer" in capsys.readouterr().err
+
+
+# --- in a browser ---
+
+
+@pytest.fixture(scope="module")
+def server(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    server = Server(tmp_path_factory.mktemp("viewer") / "errors.txt", shells_folder)
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = next(filter(None, map(shutil.which, names)), None)
+    if path is None:
+        pytest.fail("expected Chromium, got none: make system-libraries installs it")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+               "--disable-background-networking", "--disable-component-update", "--disable-sync"]  # fmt: skip
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=options)
+        yield browser
+        browser.close()
+
+
+# Every size that the viewer states, in order: what is between two looks at the page is not missed.
+WATCH = """() => {
+  const input = [...document.querySelectorAll('input:disabled')].find(i => /^\\d+x\\d+, /.test(i.value));
+  window.sizes = [];
+  let last = '';
+  setInterval(() => {
+    if (input.value === last) return;
+    last = input.value;
+    window.sizes.push(last.split(',')[0].split('x').map(Number));
+  }, 5);
+}"""
+
+
+def wait_for(what: Callable[[], object], page: Page) -> None:
+    end = time.monotonic() + SECONDS
+    while not what():
+        assert time.monotonic() < end, "waited in vain"
+        page.wait_for_timeout(50)
+
+
+def opened(browser: Browser, server: Server) -> Page:
+    page = browser.new_page(viewport=WINDOW)  # type: ignore[arg-type]
+    page.set_default_timeout(SECONDS * 1000)
+    page.goto(server.address)
+    page.wait_for_function(
+        "() => [...document.querySelectorAll('input:disabled')].some(i => /^\\d+x\\d+, /.test(i.value))"
+    )
+    page.evaluate(WATCH)
+    settle(page)
+    return page
+
+
+def sizes(page: Page) -> list[int]:
+    """Pixels of each picture that was shown since the last look; the present one remains."""
+    found = page.evaluate("() => window.sizes.splice(0, window.sizes.length - 1).concat(window.sizes)")
+    return [width * height for width, height in found]
+
+
+def settle(page: Page) -> np.ndarray:
+    """The part of the page that no control covers, when it has stayed as it is for a second."""
+    before, since = shot(page), time.monotonic()
+    end = time.monotonic() + SECONDS
+    while time.monotonic() - since < 1:
+        assert time.monotonic() < end, "the picture never came to rest"
+        page.wait_for_timeout(100)
+        after = shot(page)
+        if np.abs(after - before).max() > 0:
+            before, since = after, time.monotonic()
+    return before
+
+
+def shot(page: Page) -> np.ndarray:
+    data = page.screenshot(clip={"x": 0, "y": 200, "width": 560, "height": 300})
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+
+def drag(page: Page, dx: int) -> None:
+    page.mouse.move(280, 350)
+    page.mouse.down()
+    page.mouse.move(280 + dx, 360, steps=12)
+    page.mouse.up()
+
+
+def choose(page: Page, option: str, dropdown: int = 0) -> None:
+    page.locator("input.mantine-Select-input:visible").nth(dropdown).click()
+    page.get_by_role("option", name=option).click()
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> float:
+    """Share of the pixels that differ clearly."""
+    return float((np.abs(after - before).max(axis=-1) > 24).mean())
+
+
+def test_a_drag_changes_the_picture_and_standing_still_sharpens_it(browser: Browser, server: Server) -> None:
+    page = opened(browser, server)
+    before = settle(page)
+    whole = sizes(page)[-1]
+    assert changed(before, np.full_like(before, 255)) > 0.1, "there is something to see"
+    drag(page, 150)
+    after = settle(page)
+    seen = sizes(page)
+    assert changed(before, after) > 0.05
+    assert min(seen) < whole / 2, "smaller pictures while it moved"
+    # not the same: viser itself takes fewer pixels of the screen when the browser is slow
+    assert seen[-1] > 2 * min(seen) and seen[-1] >= 0.4 * whole, "and a large one in the end"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    with Image.open(download.value.path()) as picture:
+        scale = WINDOW["width"] / picture.width
+        exact = picture.convert("RGB").resize((WINDOW["width"], WINDOW["height"]))
+    assert 0.2 < scale < 5
+    error = np.abs(np.asarray(exact)[200:, :560].astype(int) - after)
+    assert error.mean() < 4, "what is shown is the screenshot, but for JPEG and scaling"
+    page.close()
+
+
+def test_layers_training_views_and_a_recorded_path(browser: Browser, server: Server, asset: Asset) -> None:
+    from player.cameras.views import frame_rate, read_views
+
+    page = opened(browser, server)
+    colour = settle(page)
+    choose(page, "opacity")
+    wait_for(lambda: changed(colour, shot(page)) > 0.05, page)
+    grey = settle(page)
+    assert np.ptp(grey, axis=-1).mean() < 3
+    choose(page, "colour")
+    views = []
+    for number in ("3", "1"):
+        field = page.locator("input[inputmode=decimal]").nth(2)  # after fetches and field of view
+        field.fill(number)
+        field.press("Enter")
+        views.append(settle(page))
+        page.get_by_role("button", name="Record this view").click()
+    assert changed(*views) > 0.05
+    save = page.get_by_role("button", name="Save path of 2 views")
+    with page.expect_download() as download:
+        save.click()
+    path = Path(download.value.path())
+    path = path.rename(path.with_suffix(".json"))
+    cameras = read_views(path)
+    trained = read_cameras(asset.path("cameras.json"))
+    assert len(cameras) == 61 and frame_rate(path) == 30
+    for camera, number in ((cameras[0], 3), (cameras[-1], 1)):
+        np.testing.assert_allclose(camera.c2w, trained[number].c2w, atol=1e-3)
+        focal = trained[number].fy / trained[number].height
+        assert camera.fy / camera.height == pytest.approx(focal, rel=0.01)
+    page.close()
+
+
+def test_two_clients_and_one_that_vanishes(browser: Browser, server: Server) -> None:
+    one, two = opened(browser, server), opened(browser, server)
+    first = settle(one)
+    choose(two, "opacity")
+    drag(two, -120)
+    second = settle(two)
+    assert changed(first, second) > 0.05
+    assert changed(first, settle(one)) < 0.01, "each has a camera and controls of its own"
+    drag(two, 60)  # it is in the middle of rendering when it goes
+    two.goto("about:blank")  # without a goodbye
+    two.close()
+    drag(one, 150)
+    assert changed(first, settle(one)) > 0.05
+    one.close()
+    assert server.process.poll() is None and "Traceback" not in server.errors.read_text()
+
+
+def test_another_asset_of_the_scene(browser: Browser, shells_folder: Path, tmp_path: Path) -> None:
+    server = Server(tmp_path / "errors.txt", shells_folder, write_shells(tmp_path / "other", sign=-1))
+    page = opened(browser, server)
+    first = settle(page)
+    choose(page, "other")
+    wait_for(lambda: changed(first, shot(page)) > 0.05, page)
+    choose(page, shells_folder.name)
+    wait_for(lambda: changed(first, shot(page)) < 0.01, page)
+    page.close()
+    assert server.stop() == 130
+
+
+def test_ctrl_c_ends_it(shells_folder: Path, tmp_path: Path) -> None:
+    server = Server(tmp_path / "errors.txt", shells_folder)
+    assert server.stop() == 130
+    assert server.errors.read_text().endswith("vfr-play: interrupted\n")
+
+
+def test_what_it_prints(server: Server, shells_folder: Path) -> None:
+    assert server.line == f"{shells_folder}: look at it at {server.address}\n"
+    assert server.address.startswith("http://127.0.0.1:")
+    said = server.errors.read_text()
+    assert "the viewer runs until Ctrl-C" in said and "no display here" in said
+    assert f"vfr-play {shells_folder} --orbit 60 --output frames/" in said
