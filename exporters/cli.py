@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from exporters.formats import FOLDERS, FORMATS, POINTS, ExportOptions
+from exporters.options import FOLDERS, FORMATS, POINTS, ExportOptions
 from player.app.commands import run
 from player.app.option_types import gigabytes, number, part, size, whole
 from player.app.options import MAX_MEMORY

@@ -1,6 +1,6 @@
 """From an asset to the file or folder that was asked for: reads, changes, writes, compares.
 
-Meshes are the matter of `exporters.mesh_export`. Everything is made and read back in
+Meshes are the matter of `exporters.export_mesh`. Everything is made and read back in
 memory, or in a folder beside the target, before the target's name appears.
 """
 
@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from exporters.asset_mesh import Scene
-from exporters.crop import parse_crop
-from exporters.formats import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
-from exporters.inner_region import inner_region
-from exporters.mesh import TriangleMesh
-from exporters.mesh_export import export_mesh, mesh_paths, world_mesh
+from exporters.export_mesh import export_mesh, mesh_paths, world_mesh
+from exporters.options import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
+from exporters.shapes.crop import parse_crop
+from exporters.shapes.mesh import TriangleMesh
+from exporters.surface.inner_region import inner_region
+from exporters.surface.remade import Scene
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names, read_cameras
@@ -93,10 +93,10 @@ def export_asset(
 
 
 def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
-    from exporters.npz import npz_bytes
-    from exporters.parity import check_volume_bytes
-    from exporters.vdb import vdb_bytes
-    from exporters.volume import asset_volume
+    from exporters.formats.npz import npz_bytes
+    from exporters.formats.parity import check_volume_bytes
+    from exporters.formats.vdb import vdb_bytes
+    from exporters.shapes.volume import asset_volume
 
     frame = options.frame or "world"
     box = None if options.crop is None else parse_crop(options.crop)
@@ -119,8 +119,8 @@ def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tu
 def _points(
     asset: Asset, target: Path, options: ExportOptions, report: Report
 ) -> tuple[bytes, dict[str, Any]]:
-    from exporters.parity import check_points_bytes
-    from exporters.points import points_bytes
+    from exporters.formats.parity import check_points_bytes
+    from exporters.formats.points import points_bytes
 
     cloud, facts = _cloud(asset, options, options.points or POINTS, report)
     moved = _in_frame(cloud, asset, options, "ply")
@@ -130,7 +130,7 @@ def _points(
 
 
 def _cameras(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
-    from exporters.cameras import transforms_bytes
+    from exporters.formats.transforms import transforms_bytes
 
     cameras = _trained(asset)
     data = transforms_bytes(cameras, _matrix(asset, options, "json"), str(target))
@@ -138,7 +138,7 @@ def _cameras(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes,
 
 
 def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
-    from exporters.asset_head import head_bytes
+    from exporters.head.asset_head import head_bytes
 
     inputs = ["codes", "weights", "dirs"] if options.decode else ["features", "dirs"]
     return head_bytes(asset, options.decode, str(target)), {"inputs": inputs, "outputs": ["rgb"]}
@@ -147,8 +147,8 @@ def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, di
 def _export_colmap(
     asset: Asset, target: Path, options: ExportOptions, force: bool, report: Report
 ) -> dict[str, Any]:
-    from exporters.cameras import moved_cameras
-    from exporters.colmap import colmap_files
+    from exporters.formats.colmap import colmap_files
+    from exporters.formats.transforms import moved_cameras
 
     cloud, facts = _cloud(asset, options, options.points or POINTS, report)
     cameras = moved_cameras(_trained(asset), _matrix(asset, options, "colmap"))
@@ -170,7 +170,7 @@ def _export_colmap(
 def _cloud(
     asset: Asset, options: ExportOptions, n_points: int, report: Report
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    from exporters.points import sample_points
+    from exporters.formats.points import sample_points
 
     scene = Scene(asset, report)
     mesh, facts = world_mesh(scene, options)
@@ -183,7 +183,7 @@ def _in_frame(mesh: TriangleMesh, asset: Asset, options: ExportOptions, name: st
 
 
 def _matrix(asset: Asset, options: ExportOptions, name: str) -> np.ndarray:
-    from exporters.frames import frame_matrix
+    from exporters.formats.axes import frame_matrix
 
     return frame_matrix(options.frame or "world", asset.world_from_model, name)
 

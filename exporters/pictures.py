@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from exporters.exr import exr_channels, exr_header, load_openexr, write_exr
+from exporters.formats.exr import exr_channels, exr_header, load_openexr, write_exr
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
@@ -30,7 +30,7 @@ def export_pictures(
         target: the new folder; it appears when every picture is in it.
         cameras: WORLD frame, at least one.
         names: of the files, without suffix, one a camera (`player.cameras.transforms.frame_names`).
-        half: see `exporters.exr`.
+        half: see `exporters.formats.exr`.
         force: replace a folder that exists.
         progress: called with the number done and the total after each picture.
 
@@ -39,7 +39,7 @@ def export_pictures(
 
     Raises:
         ConfigError: no camera, or a picture that is too large.
-        OutputError, ParityError, MissingExtraError: as `exporters.exr.write_exr`.
+        OutputError, ParityError, MissingExtraError: as `exporters.formats.exr.write_exr`.
     """
     load_openexr()
     if not cameras:

@@ -28,7 +28,7 @@ def python_command(module: str, *arguments: str) -> list[str]:
         module: its full name; it runs as `__main__`.
         arguments: its `sys.argv[1:]`.
 
-    >>> python_command("exporters.unwrap", "folder")[1:3]
+    >>> python_command("exporters.mesh.unwrap", "folder")[1:3]
     ['-I', '-c']
     """
     path = [place for place in sys.path if Path(place).is_absolute()]

@@ -40,7 +40,7 @@ def gelu(x: np.ndarray) -> np.ndarray:
 
 
 def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    """rgb [n, 3] of a head (`exporters.onnx_head.HeadWeights`) at `features` [n, n_channels], `dirs` [n,
+    """rgb [n, 3] of a head (`exporters.head.onnx_head.HeadWeights`) at `features` [n, n_channels], `dirs` [n,
     3].
     """
     h = np.asarray(features, np.float64)

@@ -97,7 +97,7 @@ STARTERS = re.compile(
     r"|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*)\b|mp\.spawn"
 )
 """What starts an interpreter, or decides where one looks for modules."""
-SUBPROCESSES = {"player/proof.py", "exporters/unwrap.py", "vfr_bake/bench/process.py"}
+SUBPROCESSES = {"player/proof.py", "exporters/mesh/unwrap.py", "vfr_bake/bench/process.py"}
 
 
 @pytest.mark.parametrize("path", [*MODULES, *sorted((REPOSITORY / "examples").glob("*.py"))], ids=str)
@@ -131,13 +131,12 @@ def test_there_are_modules() -> None:
 def test_player_and_exporters_start_without(missing: list[str]) -> None:
     program = (
         f"import sys; sys.modules.update(dict.fromkeys({missing!r})); "
-        "import player.app.cli, player.app.play; "
-        "import player.viewer.server, player.app.cluster, player.app.info, player.terminal; "
-        "import exporters.cli, exporters.ply, exporters.obj, exporters.glb, exporters.surface; "
-        "import exporters.parity, exporters.onnx_head, exporters.export, exporters.exr, exporters.pictures; "
-        "import exporters.simplify, exporters.colmap, exporters.asset_head; "
-        "import exporters.usd, exporters.vdb, exporters.npz; "
-        "import exporters.mesh_export, exporters.tsdf, exporters.unwrap; "
+        "import player.app.cli, player.app.play, player.app.cluster, player.app.info; "
+        "import player.viewer.server, player.terminal; "
+        "import exporters.cli, exporters.export, exporters.export_mesh, exporters.pictures; "
+        "from exporters.formats import colmap, exr, glb, npz, obj, parity, ply, usd, vdb; "
+        "from exporters.head import asset_head, onnx_head; "
+        "from exporters.mesh import simplify, unwrap; from exporters.surface import components, tsdf; "
         "print('torch' in sys.modules and sys.modules['torch'])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=REPOSITORY)

@@ -1,6 +1,6 @@
 """The head, compiled by numba: the same graph that onnxruntime runs, in blocks whose numbers stay in cache.
 
-A head as `exporters.onnx_head` writes it is a dozen small matrix products with a GELU behind each.
+A head as `exporters.head.onnx_head` writes it is a dozen small matrix products with a GELU behind each.
 onnxruntime makes a pass over memory of every operation, and a third of its time goes into GELU alone; here
 all operations are done on a block of pixels (`player.head.dense_tiles`, `player.head.activations`), in
 float32 and in 8 bits.

@@ -1,4 +1,5 @@
-"""The one graph that a head has: its nodes, written by `exporters.onnx_head` and recognised here as a whole.
+"""The one graph that a head has: its nodes, written by `exporters.head.onnx_head` and recognised here as a
+whole.
 
 With F the composited `features` of a pixel and d its unit direction (row vectors, y = x @ W + b):
     h   = gelu(... gelu(F S0 + s0) ...)                      spatial layers

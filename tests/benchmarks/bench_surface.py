@@ -24,12 +24,12 @@ import numpy as np
 import open3d
 from PIL import Image
 
-from exporters import surface_colour
-from exporters.asset_mesh import Scene
-from exporters.asset_surface import code_and_slope, voxel_size
-from exporters.formats import Method
-from exporters.mesh import TriangleMesh
-from exporters.ply import read_ply
+from exporters.formats.ply import read_ply
+from exporters.options import Method
+from exporters.shapes.mesh import TriangleMesh
+from exporters.surface import shaded_colours as surface_colour
+from exporters.surface.marching_cubes import code_and_slope, voxel_size
+from exporters.surface.remade import Scene
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras

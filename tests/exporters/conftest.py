@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporters.ply import ply_bytes
+from exporters.formats.ply import ply_bytes
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
@@ -14,7 +14,7 @@ from tests.exporters.meshes import box
 from tests.exporters.solids import ball, cube, write_solid
 from tests.player import conftest as shells
 
-collect_ignore = ["blender_look.py"]  # runs inside Blender
+collect_ignore = ["formats/blender_look.py"]  # runs inside Blender
 
 BOX = ((1.25, 2.25, 3.0), (1.75, 2.5, 4.0))
 """Corners of the asset's mesh, world frame: three edges of different length."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exporters.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh
 
 
 def tetrahedron() -> TriangleMesh:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from exporters.ply import ply_bytes
+from exporters.formats.ply import ply_bytes
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from exporters import cli, export
-from exporters.glb import parse_glb
-from exporters.ply import ply_bytes, read_ply
+from exporters.formats.glb import parse_glb
+from exporters.formats.ply import ply_bytes, read_ply
 from player.asset.asset import GridArrays, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from exporters import cli, export
-from exporters.formats import ExportOptions, check_options
-from exporters.ply import read_ply
+from exporters.formats.ply import read_ply
+from exporters.options import ExportOptions, check_options
 from player.app.option_types import part, size
 from player.asset.asset import Asset
 from player.errors import ConfigError, ParityError
@@ -165,7 +165,7 @@ def test_the_asset_is_not_overwritten(shells_asset: Path, capsys: pytest.Capture
 def test_an_export_that_fails_its_comparison_leaves_the_old_file(
     shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from exporters import exr, stl
+    from exporters.formats import exr, stl
 
     target = tmp_path / "a.stl"
     target.write_text("old")

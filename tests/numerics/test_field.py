@@ -11,7 +11,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from exporters.spherical_harmonics import MAX_DEGREE, sh_monomials
+from exporters.head.spherical_harmonics import MAX_DEGREE, sh_monomials
 from tests.reference import hash_grid_feature, spherical_harmonics
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from exporters.colour import linear_from_srgb, srgb_from_linear
+from exporters.shapes.colour import linear_from_srgb, srgb_from_linear
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import decode_density, encode_density

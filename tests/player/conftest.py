@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporters.onnx_head import HeadWeights, head_onnx
+from exporters.head.onnx_head import HeadWeights, head_onnx
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from exporters.ply import parse_ply
+from exporters.formats.ply import parse_ply
 from player.app.info import facts, page
 from player.asset.asset import Asset
 from player.asset.bricks import bricks_per_axis, pack_vertices

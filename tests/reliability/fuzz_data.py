@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from exporters.crop import parse_crop
+from exporters.shapes.crop import parse_crop
 from player.cameras.colmap import read_points
 from player.cameras.transforms import read_cameras
 from player.cameras.views import read_views

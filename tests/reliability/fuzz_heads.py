@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import onnx
 
-from exporters.onnx_head import head_onnx
+from exporters.head.onnx_head import head_onnx
 from player.compiled.compiling import available
 from player.head.head import Head
-from tests.exporters.test_onnx_head import random_head
+from tests.exporters.head.test_onnx_head import random_head
 from tests.reliability.fuzz_targets import Target, check_colours
 from tests.reliability.mutations import broken_bytes
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from exporters.mesh import TriangleMesh
-from exporters.ply import ply_bytes
+from exporters.formats.ply import ply_bytes
+from exporters.shapes.mesh import TriangleMesh
 from player.errors import VfrError
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.fuzz_assets import BrokenAsset, asset_targets, whole_asset

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from exporters.cli import main as export_main
-from exporters.ply import read_ply
+from exporters.formats.ply import read_ply
 from player.app.cli import main as play_main
 from player.asset.asset import Asset
 from tests.player.conftest import write_shells

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from exporters.crop import parse_crop
+from exporters.shapes.crop import parse_crop
 from player.asset.asset import Asset
 from player.asset.manifest import NAME, parse_manifest
 from player.asset.packing import pack_codes, pack_masks

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from exporters.asset_mesh import Removed
-from exporters.mesh import TriangleMesh
-from exporters.onnx_head import head_onnx
-from exporters.ply import ply_bytes
+from exporters.formats.ply import ply_bytes
+from exporters.head.onnx_head import head_onnx
+from exporters.shapes.mesh import TriangleMesh
+from exporters.surface.remade import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
 from player.asset.packing import pack_codes

@@ -1,7 +1,7 @@
 """The exported head in torch, to be tuned: in float32, or as it is played in 8 bits.
 
 Letters as in `player.head.graph`. What 8 bits round, activations to 256 levels of a fixed range and weights
-as `exporters.onnx_head.weight_scales` says, is rounded in the same places, and learns as if it were not
+as `exporters.head.onnx_head.weight_scales` says, is rounded in the same places, and learns as if it were not
 (straight through).
 """
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-from exporters.onnx_head import HeadWeights, Layer, Range, levels
+from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics
 
@@ -26,7 +26,7 @@ class FoldedHead(nn.Module):
         weights: what it begins with.
         units: [n_channels] what composites are counted in, so that channels of small codes are learned as
             fast as those of large ones.
-        ranges: of the hidden activations, as `exporters.int8_head` finds them, where the wide layers are to
+        ranges: of the hidden activations, as `exporters.head.ranges` finds them, where the wide layers are to
             be multiplied in 8 bits.
     """
 

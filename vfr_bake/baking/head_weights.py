@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from exporters.onnx_head import HeadWeights, Layer
+from exporters.head.onnx_head import HeadWeights, Layer
 from vfr_bake.field.head import Head
 
 

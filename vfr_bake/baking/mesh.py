@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from exporters.asset_mesh import Removed, Report, Scene
-from exporters.asset_surface import extract_asset_surface
-from exporters.inner_region import inner_region
-from exporters.mesh import TriangleMesh
-from exporters.simplify import simplify_mesh
+from exporters.mesh.simplify import simplify_mesh
+from exporters.shapes.mesh import TriangleMesh
+from exporters.surface.inner_region import inner_region
+from exporters.surface.marching_cubes import extract_asset_surface
+from exporters.surface.remade import Removed, Report, Scene
 from player.asset.asset import Asset
 from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError

@@ -17,7 +17,7 @@ import torch
 from numba import get_num_threads
 from torch import Tensor
 
-from exporters.onnx_head import HeadWeights, Range
+from exporters.head.onnx_head import HeadWeights, Range
 from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from vfr_bake.baking.folded_head import FoldedHead

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from exporters.int8_head import activation_ranges
-from exporters.onnx_head import HeadWeights, Range
+from exporters.head.onnx_head import HeadWeights, Range
+from exporters.head.ranges import activation_ranges
 from player.asset.grid import SparseGrid
 from vfr_bake.baking.folded_head import runner
 from vfr_bake.baking.grids import Layout

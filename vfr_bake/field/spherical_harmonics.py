@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from exporters.spherical_harmonics import sh_monomials
+from exporters.head.spherical_harmonics import sh_monomials
 
 
 class SphericalHarmonics(nn.Module):

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from exporters.colmap import colmap_files
-from exporters.mesh import TriangleMesh
+from exporters.formats.colmap import colmap_files
+from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
 from player.cameras.keyframes import smooth_path
 from player.cameras.nerfstudio import write_camera_path

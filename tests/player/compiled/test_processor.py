@@ -107,7 +107,7 @@ PRINTED = """
 import sys
 from pathlib import Path
 import numpy as np
-from exporters.onnx_head import head_onnx
+from exporters.head.onnx_head import head_onnx
 from player.compiled import contracted_march as contracted_march_compiled
 from player.head import compiled as head_compiled
 from player.compiled import march as march_compiled
@@ -116,7 +116,7 @@ from player.asset.asset import Asset
 from player.head.head import Head
 from player.render import render
 from player.cameras.transforms import read_cameras
-from tests.exporters.test_onnx_head import random_head
+from tests.exporters.head.test_onnx_head import random_head
 from tests.player.march.contracted_scene import contracted_grid
 from tests.player.march.test_contracted_march import bumps, some_rays
 

@@ -7,8 +7,8 @@ from unittest import mock
 import numpy as np
 from scipy.special import expit
 
-from exporters import onnx_head
-from exporters.onnx_head import HeadWeights, Range, head_onnx
+from exporters.head import onnx_head
+from exporters.head.onnx_head import HeadWeights, Range, head_onnx
 from player.head.graph import HeadArrays, Layer, Rounding
 from tests.reference import gelu
 

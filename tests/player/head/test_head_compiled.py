@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporters.int8_head import activation_ranges
-from exporters.onnx_head import HeadWeights, head_onnx
+from exporters.head.onnx_head import HeadWeights, head_onnx
+from exporters.head.ranges import activation_ranges
 from player.compiled.scratch import CANARIES
 from player.errors import FormatError
 from player.head.compiled import CompiledHead
@@ -17,7 +17,7 @@ from player.head.dense_tiles import MULTIPLIES_BYTES
 from player.head.graph import read_head
 from player.head.head import CHUNK, Head
 from player.head.program import BLOCK, DENSE_BYTES, DENSE_CODES, program_of
-from tests.exporters.test_onnx_head import inputs, random_head
+from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.player.head.heads import head_onnx_of_before, play_in_integers
 from tests.reference import evaluate_head
 

@@ -12,12 +12,12 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from exporters.int8_head import activation_ranges
-from exporters.onnx_head import head_onnx
+from exporters.head.onnx_head import head_onnx
+from exporters.head.ranges import activation_ranges
 from player.errors import FormatError
 from player.head.graph import PAIR_LIMIT, pair_sums, read_head
 from player.head.head import Head
-from tests.exporters.test_onnx_head import inputs, random_head
+from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.player.head.heads import head_onnx_of_before, play_in_integers
 
 N_CHANNELS = 8

@@ -14,8 +14,8 @@ import onnxruntime
 import pytest
 import torch
 
-from exporters.onnx_head import head_onnx
-from exporters.ply import read_ply
+from exporters.formats.ply import read_ply
+from exporters.head.onnx_head import head_onnx
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.asset.vertex_rows import vertex_rows

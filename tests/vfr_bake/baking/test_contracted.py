@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from exporters.export import export_asset
-from exporters.ply import read_ply
+from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.asset.vertex_rows import vertex_rows
 from player.cameras.camera import Camera
@@ -206,6 +206,6 @@ def test_exports_hold_the_inner_region_in_world_units(model: Model, folder: Path
 
 
 def _options(**settings: object) -> object:
-    from exporters.formats import ExportOptions
+    from exporters.options import ExportOptions
 
     return ExportOptions(**settings)  # type: ignore[arg-type]

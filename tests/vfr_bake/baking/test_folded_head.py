@@ -9,8 +9,8 @@ import onnxruntime
 import pytest
 import torch
 
-from exporters.int8_head import activation_ranges
-from exporters.onnx_head import HeadWeights, head_onnx
+from exporters.head.onnx_head import HeadWeights, head_onnx
+from exporters.head.ranges import activation_ranges
 from vfr_bake.baking.folded_head import FoldedHead, runner
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.baking.refinement import Steps, Stored, refine

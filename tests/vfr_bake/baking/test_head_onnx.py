@@ -17,11 +17,11 @@ import pytest
 import torch
 from torch.nn.functional import gelu
 
-from exporters.asset_head import comparisons, head_bytes
-from exporters.int8_head import activation_ranges
-from exporters.onnx_head import HeadWeights, Range, head_onnx, weight_scales
+from exporters.head.asset_head import comparisons, head_bytes
+from exporters.head.onnx_head import HeadWeights, Range, head_onnx, weight_scales
+from exporters.head.ranges import activation_ranges
 from player.asset.asset import Asset
-from tests.exporters import block
+from tests.exporters.formats import block
 from vfr_bake.baking.head_weights import fold_head
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.head import Head
@@ -118,7 +118,7 @@ def test_int8_is_torch_s_quantisation(
 def quantised(
     weights: HeadWeights, ranges: tuple[Range, ...], features: torch.Tensor, dirs: torch.Tensor
 ) -> torch.Tensor:
-    """The head with the rounding of `exporters.onnx_head`, done by torch."""
+    """The head with the rounding of `exporters.head.onnx_head`, done by torch."""
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.tensor(array, dtype=torch.float32)

@@ -1,0 +1,130 @@
+"""GLB, binary glTF 2.0: the file that engines, Blender and web viewers open with its colours.
+
+glTF is Y up and metres: a mesh given Z up is turned by (x, y, z) -> (x, z, -y). COLOR_0 is LINEAR light by
+the specification (sRGB bytes there look washed out), stored as normalised 16-bit numbers, because 8 would
+show bands in the dark. With a texture the colours are its texels alone, a PNG inside the file, which the
+specification takes as sRGB; a COLOR_0 beside it would be multiplied with it, and is left out. The picture's
+light is already in the colours, so the material is unlit (KHR_materials_unlit), double sided, and for viewers
+without that extension not metallic and fully rough.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from exporters.shapes.colour import linear_from_srgb
+from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.texture import Texture
+from player.errors import ConfigError, FormatError
+
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+
+
+def glb_bytes(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
+    """The file's content, Y up, for a mesh that is Z up; with a texture instead of vertex colours if one is
+    given. The same mesh gives the same bytes.
+
+    Raises ConfigError for a mesh without faces (glTF has no empty accessors) or one of 4 GiB and more.
+    """
+    if not len(mesh.faces):
+        raise ConfigError("GLB: mesh: expected at least one face, got none")
+    positions = y_up(mesh.vertices).astype("<f4")
+    normals = y_up(mesh.normals).astype("<f4")
+    arrays = [(positions, _FLOAT, "VEC3", _ARRAY_BUFFER), (normals, _FLOAT, "VEC3", _ARRAY_BUFFER)]
+    if texture is None:
+        colours = mesh.colours / 255
+        colours[:, :3] = linear_from_srgb(colours[:, :3])
+        arrays.append((np.rint(colours * 65535).astype("<u2"), _USHORT, "VEC4", _ARRAY_BUFFER))
+    else:
+        arrays.append((texture.uvs.astype("<f4"), _FLOAT, "VEC2", _ARRAY_BUFFER))
+    arrays.append((mesh.faces.astype("<u4").reshape(-1), _UINT, "SCALAR", _ELEMENT_ARRAY_BUFFER))
+    accessors, views, offset = [], [], 0
+    for index, (array, component, kind, target) in enumerate(arrays):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
+        accessors.append({"bufferView": index, "componentType": component, "count": len(array), "type": kind})
+        offset += array.nbytes  # every array is a multiple of 4 bytes long
+    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    picture = b""
+    if texture is None:
+        accessors[2] |= {"normalized": True}
+    else:
+        picture = texture.png()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(picture)})
+        picture += b"\0" * (-len(picture) % 4)
+        offset += len(picture)
+    colour = "COLOR_0" if texture is None else "TEXCOORD_0"
+    primitive = {
+        "attributes": {"POSITION": 0, "NORMAL": 1, colour: 2},
+        "indices": 3,
+        "material": 0,
+        "mode": 4,
+    }
+    material: dict[str, Any] = {
+        "doubleSided": True,
+        "extensions": {"KHR_materials_unlit": {}},
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+    }
+    document: dict[str, Any] = {
+        "asset": {"generator": "vfr-bake", "version": "2.0"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "mesh"}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    if texture is not None:
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        document["textures"] = [{"source": 0, "sampler": 0}]
+        document["images"] = [{"bufferView": len(views) - 1, "mimeType": "image/png"}]
+        document["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + offset
+    if total >= 1 << 32:
+        raise ConfigError(f"GLB: mesh: expected less than 4 GiB, got {total} bytes")
+    return b"".join(
+        [
+            struct.pack("<4sII", b"glTF", 2, total),
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", offset, b"BIN\0"),
+            *(array.tobytes() for array, *_ in arrays),
+            picture,
+        ]
+    )
+
+
+def y_up(vectors: np.ndarray) -> np.ndarray:
+    """[n, 3] vectors of a Z-up world in a Y-up one: a quarter turn about x.
+
+    >>> y_up(np.array([[1.0, 2.0, 3.0]])).tolist()
+    [[1.0, 3.0, -2.0]]
+    """
+    return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1)
+
+
+def parse_glb(data: bytes, where: str) -> tuple[dict, bytes]:
+    """The document and the buffer of a file as `glb_bytes` lays it out; FormatError if the chunks do not fill
+    it.
+    """
+    magic, version, total = struct.unpack_from("<4sII", data)
+    if (magic, version, total) != (b"glTF", 2, len(data)):
+        raise FormatError(
+            f"{where}: header: expected glTF 2 of {len(data)} bytes, got {magic!r} {version} of {total}"
+        )
+    n_text, kind = struct.unpack_from("<I4s", data, 12)
+    n_buffer, buffer_kind = struct.unpack_from("<I4s", data, 20 + n_text)
+    if (kind, buffer_kind) != (b"JSON", b"BIN\0") or 28 + n_text + n_buffer != len(data):
+        raise FormatError(
+            f"{where}: chunks: expected JSON and BIN that fill the file, got {kind!r}, {buffer_kind!r}"
+        )
+    return json.loads(data[20 : 20 + n_text]), data[28 + n_text :]

@@ -1,0 +1,147 @@
+"""Wavefront OBJ: text, `v x y z r g b` (sRGB in [0, 1], the widely read extension for vertex colours), `vn`,
+`f v//vn`.
+
+Numbers are written in fixed point by numpy, digit by digit for a whole array, because Python's formatting
+takes seconds for a million faces. OBJ has no alpha per vertex: it is left out.
+
+With a texture there are three files: `v x y z`, `vt u v` (origin at the LOWER left, unlike glTF's), `vn` and
+`f v/vt/vn` in the OBJ, a material without light in the MTL, and the picture as a PNG.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.texture import Texture
+from player.errors import ConfigError
+
+_CHUNK = 1 << 17  # rows turned into text at once: tens of megabytes of scratch memory
+
+
+def obj_bytes(mesh: TriangleMesh) -> bytes:
+    """The file's content; positions to nine digits of the largest one, colours to 1e-4 (8 bits survive).
+
+    Raises ConfigError for a coordinate of 1e15 or more.
+
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
+    >>> mesh = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, white)
+    >>> print(obj_bytes(mesh).decode().splitlines()[-1])
+    f 1//1 2//2 3//3
+    """
+    decimals = _decimals(mesh)
+    parts = [b"# vfr-bake: v x y z r g b (sRGB), vn, f\n"]
+    for start in range(0, len(mesh.vertices), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        position = _fixed(mesh.vertices[rows], decimals)
+        colour = _fixed(mesh.colours[rows, :3] / 255, 4)
+        parts.append(_lines(["v ", *_joined([*position, *colour], " "), "\n"]))
+    return b"".join([*parts, *_rows("vn ", mesh.normals, 6), *_faces(mesh.faces, "//", 2)])
+
+
+def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[str, bytes]:
+    """The files of a mesh with a texture, `.png`, `.mtl` and `.obj`; they name each other `stem` plus suffix.
+
+    Raises ConfigError for a coordinate of 1e15 or more, or a stem that is no plain word: MTL cannot quote.
+
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
+    >>> mesh = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, white)
+    >>> files = textured_obj_files(mesh, Texture(np.float32([[0, 0], [1, 0], [0, 1]]),
+    ...     np.zeros((2, 2, 3), np.uint8)), "one")
+    >>> files[".obj"].decode().splitlines()[-1], "map_Kd one.png" in files[".mtl"].decode()
+    ('f 1/1/1 2/2/2 3/3/3', True)
+    """
+    if not stem or any(character.isspace() for character in stem):
+        raise ConfigError(
+            f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"
+        )
+    flipped = np.stack([texture.uvs[:, 0], 1 - texture.uvs[:, 1].astype(np.float64)], axis=-1)
+    head = f"# vfr-bake: v, vt, vn, f\nmtllib {stem}.mtl\nusemtl surface\n".encode()
+    obj = b"".join(
+        [
+            head,
+            *_rows("v ", mesh.vertices, _decimals(mesh)),
+            *_rows("vt ", flipped, 7),
+            *_rows("vn ", mesh.normals, 6),
+            *_faces(mesh.faces, "/", 3),
+        ]
+    )
+    mtl = f"newmtl surface\nillum 0\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd {stem}.png\n".encode()
+    return {".png": texture.png(), ".mtl": mtl, ".obj": obj}
+
+
+def _decimals(mesh: TriangleMesh) -> int:
+    largest = float(np.abs(mesh.vertices).max(initial=0.0))
+    if largest >= 1e15:
+        raise ConfigError(f"OBJ: vertices: expected coordinates below 1e15, got {largest:g}")
+    return min(max(8 - math.floor(math.log10(largest)), 0), 15) if largest else 1
+
+
+def _rows(word: str, values: np.ndarray, decimals: int) -> list[bytes]:
+    """`values` [n, m], a line each."""
+    return [
+        _lines([word, *_joined(_fixed(values[start : start + _CHUNK], decimals), " "), "\n"])
+        for start in range(0, len(values), _CHUNK)
+    ]
+
+
+def _faces(faces: np.ndarray, separator: str, n_times: int) -> list[bytes]:
+    """Lines of faces whose corners repeat the vertex's number `n_times`."""
+    lines = []
+    for start in range(0, len(faces), _CHUNK):
+        corners = _fixed(faces[start : start + _CHUNK] + 1, 0)
+        words = [word for c in corners for word in [*([c, separator] * (n_times - 1)), c]]
+        lines.append(_lines(["f ", *_joined(words, " ", every=2 * n_times - 1), "\n"]))
+    return lines
+
+
+def _fixed(values: np.ndarray, decimals: int) -> list[np.ndarray]:
+    """The columns of `values` [n, m] as fixed-point text: m arrays [n, width] of ASCII codes, 0 where nothing
+    is.
+    """
+    scaled = np.rint(np.asarray(values, np.float64) * 10.0**decimals).astype(np.int64)
+    magnitude = np.abs(scaled)
+    n_digits = max(len(str(int(magnitude.max(initial=0)))), decimals + 1)
+    columns = []
+    for column in range(scaled.shape[1]):
+        rest = magnitude[:, column].copy()
+        text = np.zeros((len(rest), n_digits), np.uint8)
+        for place in range(n_digits - 1, -1, -1):
+            before = n_digits - 1 - place  # digits already written
+            shown = (rest > 0) | (before <= decimals)
+            rest, digit = np.divmod(rest, 10)
+            text[:, place] = np.where(shown, digit + ord("0"), 0)
+        whole = n_digits - decimals
+        sign = np.where(scaled[:, column] < 0, ord("-"), 0).astype(np.uint8)[:, None]
+        pieces = [sign, text[:, :whole]]
+        if decimals:
+            pieces += [np.full((len(text), 1), ord("."), np.uint8), text[:, whole:]]
+        columns.append(np.concatenate(pieces, axis=1))
+    return columns
+
+
+def _joined(parts: list, separator: str, every: int = 1) -> list:
+    """`parts` with `separator` between each group of `every`."""
+    joined: list = []
+    for index, part in enumerate(parts):
+        if index and index % every == 0:
+            joined.append(separator)
+        joined.append(part)
+    return joined
+
+
+def _lines(parts: list) -> bytes:
+    """One line per row: arrays [n, width] of ASCII codes (0 is nothing) and constant strings side by side."""
+    n_rows = next(len(part) for part in parts if isinstance(part, np.ndarray))
+    columns = [
+        part
+        if isinstance(part, np.ndarray)
+        else np.broadcast_to(np.frombuffer(part.encode(), np.uint8), (n_rows, len(part)))
+        for part in parts
+    ]
+    text = np.concatenate(columns, axis=1)
+    return text[text != 0].tobytes()

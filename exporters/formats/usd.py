@@ -1,0 +1,98 @@
+"""USD: the mesh for film, Omniverse, Unreal and Blender, as .usdc (binary) or .usda (text).
+
+Written by Pixar's own library (the package usd-core). The stage says what glTF and OBJ can only assume:
+`upAxis`, `metersPerUnit = 1` (a world unit is taken as a metre, as glTF takes it). `primvars:displayColor` is
+LINEAR light by the specification; `displayOpacity` is there only if some vertex is not opaque.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from exporters.shapes.colour import linear_from_srgb
+from exporters.shapes.mesh import TriangleMesh
+from player.errors import ConfigError, FormatError, MissingExtraError
+
+
+def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
+    """The file's content; the same mesh gives the same bytes.
+
+    Args:
+        mesh: at least one face, in the coordinates of the file.
+        suffix: ".usdc" or ".usda".
+        up: "Y" or "Z", the axis that is up in those coordinates.
+
+    Raises:
+        ConfigError: no face.
+        MissingExtraError: the package `usd-core` is not installed.
+    """
+    if not len(mesh.faces):
+        raise ConfigError("USD: mesh: expected at least one face, got none")
+    Usd, UsdGeom, Vt = _pxr()
+    colours = linear_from_srgb(mesh.colours[:, :3] / 255).astype(np.float32)
+    vertices = mesh.vertices.astype(np.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / f"mesh{suffix}")
+        stage = Usd.Stage.CreateNew(path)
+        stage.SetMetadata("comment", "vfr-bake: a world unit is a metre; displayColor is linear light")
+        UsdGeom.SetStageUpAxis(stage, up)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        root = UsdGeom.Xform.Define(stage, "/scene")
+        stage.SetDefaultPrim(root.GetPrim())
+        prim = UsdGeom.Mesh.Define(stage, "/scene/mesh")
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(mesh.faces), 3))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.reshape(-1)))
+        prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals.astype(np.float32)))
+        prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateDoubleSidedAttr(True)
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
+        prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colours))
+        if (mesh.colours[:, 3] < 255).any():
+            opacity = (mesh.colours[:, 3] / 255).astype(np.float32)
+            prim.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex).Set(Vt.FloatArray.FromNumpy(opacity))
+        stage.GetRootLayer().Save()
+        del prim, root, stage  # the file is closed before its folder goes, which Windows asks for
+        return Path(path).read_bytes()
+
+
+def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
+    """What a file holds: `vertices`, `normals` [n, 3], `colours` [n, 4] linear, `faces` [m, 3], `up`,
+    `metres`, by another reading of the library; FormatError if it is no such mesh."""
+    Usd, UsdGeom, _ = _pxr()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"mesh{suffix}"
+        path.write_bytes(data)
+        try:
+            stage = Usd.Stage.Open(str(path))
+        except Exception as error:  # the library has one exception for everything
+            raise FormatError(f"{where}: expected USD, got: {str(error).splitlines()[0]}") from error
+        prim = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
+        if not prim or set(prim.GetFaceVertexCountsAttr().Get()) != {3}:
+            raise FormatError(f"{where}: expected triangles in /scene/mesh, got none")
+        opacity = prim.GetDisplayOpacityAttr().Get()
+        rgb = np.array(prim.GetDisplayColorAttr().Get())
+        alpha = np.ones(len(rgb)) if opacity is None else np.array(opacity)
+        found = {
+            "vertices": np.array(prim.GetPointsAttr().Get()),
+            "normals": np.array(prim.GetNormalsAttr().Get()),
+            "colours": np.concatenate([rgb, alpha[:, None]], axis=1),
+            "faces": np.array(prim.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3),
+            "up": str(UsdGeom.GetStageUpAxis(stage)),
+            "metres": UsdGeom.GetStageMetersPerUnit(stage),
+        }
+        del prim, stage
+    return found
+
+
+def _pxr() -> tuple[Any, Any, Any]:
+    try:
+        from pxr import Usd, UsdGeom, Vt
+    except ImportError as error:
+        raise MissingExtraError("USD: needs usd-core: pip install 'vfr-bake[export]'") from error
+    return Usd, UsdGeom, Vt

@@ -1,0 +1,1 @@
+"""The head as ONNX, built from weights and read out of an asset."""

@@ -1,0 +1,53 @@
+"""Ranges of the head's hidden activations, for multiplying in 8 bits.
+
+Letters as in `player.head.graph`: h is what the spatial MLP emits, z_i what directional layer i emits.
+Both come out of a GELU, so they are never below -0.17.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from exporters.head.onnx_head import HeadWeights, Range
+from exporters.head.spherical_harmonics import sh_monomials
+
+COVERED = 99.99
+"""Percentage of the activations inside a range; the rare larger ones are clipped, and the others keep a
+finer step."""
+
+
+def activation_ranges(weights: HeadWeights, features: np.ndarray, dirs: np.ndarray) -> tuple[Range, ...]:
+    """The range of h, and of each z_i that another directional layer takes in.
+
+    Args:
+        weights: the head.
+        features: [n, n_channels] composited features like those that will be played, n at least 1.
+        dirs: [n, 3] their unit view directions.
+    """
+    h = features.astype(np.float64)
+    for weight, bias in weights.spatial:
+        h = _gelu(h @ weight + bias)
+    encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * _basis(weights, dirs)
+    d_bottleneck, d_sh, bias = weights.directional_first
+    z = _gelu(h @ d_bottleneck + encoded @ d_sh + bias)
+    ranges = [_range(h)]
+    for weight, bias in weights.directional:
+        ranges.append(_range(z))
+        z = _gelu(z @ weight + bias)
+    return tuple(ranges)
+
+
+def _basis(weights: HeadWeights, dirs: np.ndarray) -> np.ndarray:
+    exponents, coefficients = sh_monomials(weights.sh_degree)
+    monomials = np.prod(dirs[:, None, :].astype(np.float64) ** exponents, axis=-1)
+    return np.repeat(monomials @ coefficients, weights.n_sh_features, axis=1)
+
+
+def _range(values: np.ndarray) -> Range:
+    low, high = np.percentile(values, [100 - COVERED, COVERED])
+    return min(float(low), 0.0), max(float(high), 0.0)
+
+
+def _gelu(x: np.ndarray) -> np.ndarray:
+    """The tanh form, within 5e-4 of the exact one: near enough for a range, and numpy alone can do it."""
+    return 0.5 * x * (1 + np.tanh(0.7978845608 * (x + 0.044715 * x**3)))

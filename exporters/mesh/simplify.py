@@ -1,0 +1,99 @@
+"""Fewer faces: quadric edge collapse (Garland and Heckbert 1997) by Open3D, colours and normals kept.
+
+Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha: that
+is taken from the nearest vertex of the source. It stops early where every edge that is left would fold the
+surface: a mesh with many thin parts keeps more faces than were asked for (lego, 380,541 faces: 20,000 are
+reached, of 5,000 remain 11,721). The command says so.
+
+Of millions of faces that takes minutes, so that vertices in the same small cube are made one first, until
+FIRST times as many faces are left as are asked for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from exporters.mesh.open3d_package import require_open3d
+from exporters.shapes.mesh import TriangleMesh
+from player.errors import ConfigError, DataError, MissingExtraError
+
+FIRST = 12
+"""Faces for each that is asked for, from which edges are collapsed."""
+
+
+def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
+    """The mesh with `n_faces` faces, or as few as can be reached; itself if it has no more. The same mesh
+    gives the same result.
+
+    Args:
+        mesh: any mesh; parts that are not connected are simplified together.
+        n_faces: 1 or more; a closed surface needs 4.
+
+    Raises:
+        ConfigError: `n_faces` below 1.
+        DataError: nothing is left of the mesh.
+        MissingExtraError: Open3D is not installed.
+
+    >>> empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)),
+    ...     np.zeros((0, 4), np.uint8))
+    >>> simplify_mesh(empty, 100) is empty
+    True
+    """
+    if n_faces < 1:
+        raise ConfigError(f"--faces: expected 1 or more, got {n_faces}")
+    if len(mesh.faces) <= n_faces:
+        return mesh
+    open3d = require_open3d("--faces")
+    source = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.vertices, np.float64)),
+        open3d.utility.Vector3iVector(np.ascontiguousarray(mesh.faces)),
+    )
+    source.vertex_normals = open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.normals, np.float64))
+    source.vertex_colors = open3d.utility.Vector3dVector(mesh.colours[:, :3] / 255)
+    if len(mesh.faces) > 2 * FIRST * n_faces:
+        a, b = mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]]
+        edge = float(np.linalg.norm(b - a, axis=1).mean())
+        average = open3d.geometry.SimplificationContraction.Average
+        source = source.simplify_vertex_clustering(
+            edge * (len(mesh.faces) / (FIRST * n_faces)) ** 0.5, average
+        )
+    result = source.simplify_quadric_decimation(n_faces)
+    faces = np.asarray(result.triangles, np.int32)
+    a, b, c = faces.T
+    whole = (a != b) & (b != c) & (c != a)
+    if not whole.any():
+        raise DataError(f"--faces: expected something left of {len(mesh.faces)} faces at {n_faces}, got none")
+    used, numbers = np.unique(faces[whole], return_inverse=True)
+    vertices = np.asarray(result.vertices)[used]
+    faces = numbers.reshape(-1, 3).astype(np.int32)
+    colours = np.empty((len(used), 4), np.uint8)
+    colours[:, :3] = np.rint(np.clip(np.asarray(result.vertex_colors)[used], 0, 1) * 255)
+    colours[:, 3] = _alpha(mesh, vertices)
+    normals = _unit(np.asarray(result.vertex_normals)[used], vertices, faces)
+    return TriangleMesh(vertices, faces, normals, colours)
+
+
+def _alpha(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
+    alpha = mesh.colours[:, 3]
+    if (alpha == alpha[0]).all():
+        return np.full(len(vertices), alpha[0])
+    try:
+        from scipy.spatial import KDTree
+    except ImportError as error:
+        raise MissingExtraError("--faces: needs scipy: pip install 'vfr-bake[export]'") from error
+    return alpha[KDTree(mesh.vertices).query(vertices)[1]]
+
+
+def _unit(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Averaged normals at unit length; where they cancelled, the mean of the faces around, by area."""
+    length = np.linalg.norm(normals, axis=-1)
+    lost = ~(length > 1e-6)
+    if lost.any():
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        around = np.zeros_like(vertices)
+        for k in range(3):
+            np.add.at(around, faces[:, k], np.cross(b - a, c - a))
+        normals = np.where(lost[:, None], around, normals)
+        length = np.linalg.norm(normals, axis=-1)
+    known = length[:, None] > 0
+    return np.where(known, normals / np.where(known, length[:, None], 1), [0.0, 0.0, 1.0])

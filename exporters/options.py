@@ -1,0 +1,160 @@
+"""What `vfr-export` can write, and which settings go with it. No numpy: `vfr-export --help` reads this."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from player.errors import ConfigError
+
+Frame = Literal["world", "model", "gltf", "blender"]
+Method = Literal["density", "tsdf"]
+
+FORMATS = {
+    ".ply": "binary PLY; colours are sRGB bytes. With --points N a point cloud instead of a mesh",
+    ".obj": "Wavefront OBJ, `v x y z r g b` in sRGB",
+    ".glb": "binary glTF 2.0; linear COLOR_0, unlit material; Y up as glTF wants it: (x, y, z) -> (x, z, -y)",
+    ".stl": "binary STL: the shape alone, no colours",
+    ".usdc": "USD, binary (.usda: text); linear displayColor, metersPerUnit 1, upAxis",
+    ".usda": "USD, text",
+    ".vdb": "OpenVDB volume: `density`, and with --colour `color` (linear)",
+    ".npz": "the same volume as numpy arrays, and what they mean as JSON inside",
+    ".json": "transforms.json of the training cameras",
+    ".onnx": "the head as an ONNX graph; --decode puts the decode of the features in front",
+}
+"""Files, by suffix."""
+
+FOLDERS = {
+    "exr": "pictures of many layers (colour, depth, position, normals, features), one OpenEXR a camera",
+    "colmap": "COLMAP text: the training cameras and a point cloud",
+}
+"""Folders, by --format."""
+
+MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
+"""The files that hold a mesh."""
+
+COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+
+POINTS = 100_000
+"""Points of a COLMAP model, unless asked for another number."""
+
+TEXTURE_FACES = 200_000
+"""Faces of a mesh with a texture, unless asked for another number: laying out more takes minutes."""
+
+_SURFACE = {"frame", "crop", "method", "level"}
+_MESH = _SURFACE | {"faces", "lods"}
+_TAKES = {
+    "mesh": _MESH,
+    "textured": _MESH | {"texture", "time_limit"},
+    "points": _SURFACE | {"points"},
+    "volume": {"frame", "crop", "colour"},
+    "json": {"frame"},
+    "colmap": _SURFACE | {"points"},
+    "exr": {"cameras", "views", "size", "half"},
+    "onnx": {"decode"},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """The settings of an export; what is None or False has not been asked for."""
+
+    format: str | None = None
+    """Of FOLDERS, or a suffix without its dot; None reads it off the target."""
+    frame: Frame | None = None
+    """None is the world; `exporters.formats.axes` describes them."""
+    crop: str | None = None
+    """`exporters.shapes.crop` reads it."""
+    method: Method | None = None
+    """Makes the surface again, by marching cubes on the density or from fused depth; None is as baked."""
+    level: float | None = None
+    """Density of the surface, 1/model unit; given, the surface is made again."""
+    faces: int | None = None
+    lods: int | None = None
+    """Files of half the faces each, the first included."""
+    texture: int | None = None
+    """Texels along each side of a picture, in place of vertex colours."""
+    time_limit: float | None = None
+    """Seconds that laying out a texture may take."""
+    points: int | None = None
+    cameras: Path | None = None
+    """A transforms.json; None is the training cameras."""
+    views: slice | None = None
+    size: tuple[int, int] | None = None
+    """Width and height of pictures."""
+    half: bool = False
+    colour: bool = False
+    """Colours in a volume."""
+    decode: bool = False
+    force: bool = False
+    max_memory: float | None = None
+    """Gigabytes that the asset may take when it is opened; a share of the machine's if None."""
+
+
+def check_options(target: Path, options: ExportOptions) -> str:
+    """The name of the format, "ply", ..., "exr", after checking that it takes every setting that is given.
+
+    Raises ConfigError in one line: an unknown suffix or format (with the known ones), a setting that does
+    nothing there.
+
+    >>> check_options(Path("scene.GLB"), ExportOptions(faces=1000))
+    'glb'
+    >>> check_options(Path("head.onnx"), ExportOptions(faces=1000))
+    Traceback (most recent call last):
+    player.errors.ConfigError: head.onnx: --faces does nothing for onnx; it takes --decode
+    """
+    name = options.format
+    if name is None:
+        suffix = target.suffix.lower()
+        if suffix not in FORMATS:
+            raise ConfigError(
+                f"{target}: suffix: expected one of {', '.join(FORMATS)}, or a folder with --format "
+                f"{' or '.join(FOLDERS)}, got {suffix or 'none'}"
+            )
+        name = suffix[1:]
+    elif name not in FOLDERS and f".{name}" not in FORMATS:
+        known = [*(suffix[1:] for suffix in FORMATS), *FOLDERS]
+        raise ConfigError(f"--format: expected one of {', '.join(known)}, got {name}")
+    kind = _kind(name, options)
+    default = ExportOptions()
+    for key in sorted(set().union(*_TAKES.values()) - _TAKES[kind]):
+        if getattr(options, key) != getattr(default, key):
+            takes = ", ".join(_flag(option) for option in sorted(_TAKES[kind]))
+            raise ConfigError(
+                f"{target}: {_flag(key)} does nothing for {kind_name(name, kind)}; it takes {takes}"
+            )
+    _check_ranges(options)
+    return name
+
+
+def _kind(name: str, options: ExportOptions) -> str:
+    if name == "ply" and options.points is not None:
+        return "points"
+    if name in MESHES:
+        return "textured" if name in ("obj", "glb") else "mesh"
+    return "volume" if name in ("vdb", "npz") else name
+
+
+def _flag(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
+
+
+def _check_ranges(options: ExportOptions) -> None:
+    for key, low, high in (("faces", 1, None), ("points", 1, None), ("lods", 2, 10), ("texture", 16, 16384)):
+        value = getattr(options, key)
+        if value is not None and (value < low or (high is not None and value > high)):
+            wanted = f"{low} or more" if high is None else f"{low} to {high}"
+            raise ConfigError(f"--{key}: expected {wanted}, got {value}")
+    if options.time_limit is not None and not options.time_limit > 0:
+        raise ConfigError(f"--time-limit: expected seconds > 0, got {options.time_limit:g}")
+    if options.time_limit is not None and options.texture is None:
+        raise ConfigError("--time-limit: expected it with --texture, got it alone")
+    if options.level is not None and options.method == "tsdf":
+        raise ConfigError("--level: expected --method density, got tsdf, which has no level")
+
+
+def kind_name(name: str, kind: str) -> str:
+    """How a message calls what is written."""
+    mesh, volume = f"a {name} mesh", f"a {name} volume"
+    return {"points": "a point cloud", "mesh": mesh, "textured": mesh, "volume": volume}.get(kind, name)

@@ -1,0 +1,1 @@
+"""What is exported: meshes, their colours and textures, crops, volumes."""

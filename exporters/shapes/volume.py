@@ -1,0 +1,162 @@
+"""The density of an asset as other programs take a volume: values at the points of a sparse grid.
+
+Letters: vertex i (three integers, 0..R) of the asset's grid is at `matrix @ (i, 1)` in the frame of the
+export. sigma is the density there, in 1/unit of that frame: a world in millimetres has densities a thousand
+times smaller than one in metres. What is not listed is empty. The player interpolates log sigma, other
+programs sigma itself: between two vertices theirs is the denser one, so that a surface is fuller there by a
+fraction of a voxel.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from exporters.shapes.crop import CropBox
+from player.asset.asset import Asset
+from player.asset.bricks import unpack_vertices
+from player.asset.density import decode_density
+from player.asset.grid import SparseGrid
+from player.asset.vertex_rows import VertexRows, vertex_rows
+from player.errors import ConfigError, ShapeError
+from player.head.head import Head
+from player.march.fetches import MIN_TOTAL, stored_features
+from player.render import default_threads
+
+_ROWS = 1 << 16  # vertices at a time: some megabytes of scratch memory a thread
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Densities, and colours if asked for, at vertices of a sparse grid.
+
+    >>> matrix = np.diag([2.0, 2, 2, 1])
+    >>> volume = Volume(np.array([[1, 0, 2]], np.int32), np.ones(1, np.float32), None, matrix)
+    >>> volume.points().tolist(), round(volume.level, 3)
+    ([[2.0, 0.0, 4.0]], 0.347)
+    """
+
+    index: np.ndarray
+    """[n, 3] int32, 0 or more, each vertex once."""
+    density: np.ndarray
+    """[n] float32, 1/unit of the frame, > 0."""
+    colours: np.ndarray | None
+    """[n, 3] uint8 sRGB: what the head says of this vertex alone, seen against the slope of the density."""
+    matrix: np.ndarray
+    """[4, 4] float64: frame from index; vertices are where the values are, not corners of voxels."""
+
+    def __post_init__(self) -> None:
+        n = len(self.index)
+        shapes = {"index": (n, 3), "density": (n,), "matrix": (4, 4)}
+        if self.colours is not None:
+            shapes["colours"] = (n, 3)
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ShapeError(
+                    f"volume: {name}: expected {list(shape)}, got {list(getattr(self, name).shape)}"
+                )
+
+    @property
+    def voxel(self) -> float:
+        """Distance between vertices, units of the frame; the mean of the axes, which may differ by little."""
+        return float(np.cbrt(np.linalg.det(self.matrix[:3, :3])))
+
+    @property
+    def level(self) -> float:
+        """The density that is half opaque over a voxel: a level for a surface, 1/unit of the frame."""
+        return math.log(2) / self.voxel
+
+    def for_blender(self) -> Volume:
+        """Half a voxel lower along each axis of the grid: Blender's renderer (Cycles, 3.4 and 4.5 alike)
+        draws the value of vertex i at i + 1/2, where OpenVDB has it at i."""
+        shift = np.eye(4)
+        shift[:3, 3] = -0.5
+        return replace(self, matrix=self.matrix @ shift)
+
+    def points(self) -> np.ndarray:
+        """[n, 3] float64: where the vertices are, in the frame."""
+        return self.index @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+
+
+def asset_volume(
+    asset: Asset, frame_from_world: np.ndarray, box: CropBox | None = None, colour: bool = False
+) -> tuple[Volume, float]:
+    """The volume of an asset in a frame, and the share of its vertices that the crop removed.
+
+    Args:
+        asset: an open asset.
+        frame_from_world: [4, 4] similarity, as `exporters.formats.axes.frame_matrix` makes it.
+        box: keep the vertices in it (world units); None keeps all.
+        colour: ask the head for colours too.
+
+    Raises ConfigError: no vertex is in the box.
+    """
+    manifest, arrays = asset.manifest, asset.arrays
+    low, high = np.array(manifest.aabb)
+    model_from_index = np.eye(4)
+    model_from_index[:3, :3] = np.diag((high - low) / manifest.resolution)
+    model_from_index[:3, 3] = low
+    world_from_index = asset.world_from_model @ model_from_index
+    matrix = frame_from_world @ world_from_index
+    index = unpack_vertices(arrays.brick_coords, arrays.brick_masks).astype(np.int32)
+    keep = np.arange(len(index))
+    if box is not None:
+        points = index @ world_from_index[:3, :3].T + world_from_index[:3, 3]
+        keep = np.flatnonzero(box.holds(points))
+        if not len(keep):
+            corners = [", ".join(f"{x:.4g}" for x in p) for p in (points.min(axis=0), points.max(axis=0))]
+            raise ConfigError(
+                f"--crop: expected a box with some of the volume in it, got none of its {len(index)} "
+                f"vertices; they are from ({corners[0]}) to ({corners[1]})"
+            )
+    scale = np.cbrt(np.linalg.det((frame_from_world @ asset.world_from_model)[:3, :3]))
+    densities = decode_density(arrays.density[keep], (manifest.density_range[0], manifest.density_range[1]))
+    volume = Volume(
+        index[keep],
+        (densities / np.float32(scale)).astype(np.float32),
+        _colours(asset, index[keep]) if colour else None,
+        matrix,
+    )
+    return volume, 1 - len(keep) / max(len(index), 1)
+
+
+def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
+    """[n, 3] uint8: the features at each vertex through the head, as if it alone were the whole pixel."""
+    head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+    grid, arrays = asset.grid, asset.arrays
+    codes = np.asarray(arrays.density)
+    rows = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
+
+    def part(start: int) -> np.ndarray:
+        some = slice(start, start + _ROWS)
+        dirs = _slope(grid, rows, codes, index[some])
+        values, total = stored_features(grid, index[some].T.astype(np.float32))
+        rgb = head(values / np.maximum(total, MIN_TOTAL)[:, None], dirs)
+        return np.floor(np.clip(np.nan_to_num(rgb), 0, 1) * 255 + 0.5).astype(np.uint8)
+
+    with ThreadPoolExecutor(default_threads()) as pool:
+        parts = list(pool.map(part, range(0, len(index), _ROWS)))
+    return np.concatenate([np.zeros((0, 3), np.uint8), *parts])
+
+
+def _slope(grid: SparseGrid, rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[n, 3] float32 unit directions up the density, which is how a surface is looked at; down where it is
+    flat, inside a solid, which nobody sees."""
+    slope = np.empty((len(index), 3))
+    for axis in range(3):
+        step = np.zeros(3, np.int64)
+        step[axis] = 1
+        rise = _codes_at(rows, codes, index + step) - _codes_at(rows, codes, index - step)
+        slope[:, axis] = rise * grid.cells_per_unit[axis]
+    length = np.linalg.norm(slope, axis=-1, keepdims=True)
+    down = np.array([0.0, 0.0, -1.0])
+    return np.where(length > 0, slope / np.where(length > 0, length, 1), down).astype(np.float32)
+
+
+def _codes_at(rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[n] float64 codes at vertices that may lie outside; 0 where none is stored."""
+    found = rows.find(index)
+    return np.where(found >= 0, codes[np.maximum(found, 0)], 0).astype(np.float64)

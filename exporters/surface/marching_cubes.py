@@ -1,0 +1,262 @@
+"""The surface of a baked asset: marching cubes on its own sparse density, block by block.
+
+Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
+(`player.asset.density`); v, the size of a voxel; dt, the step of the march. The default level is the density
+that is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields
+are soft at their surface, and of the levels tried this one has the player's outlines and lies on known
+geometry in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what
+no training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where
+they end.
+
+Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
+not by the box. A corner of the mesh lies on an edge of the grid, and the edge's number is what joins it
+between blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+from player.errors import ConfigError, DataError, MissingExtraError
+
+BLOCK = 64
+"""Cells along each side of a block: 1 MB of codes."""
+_CLIP = math.log(50.0)  # log(sigma / level) beyond this counts as this: see `exporters.surface.components`
+_NUDGE = 1e-2  # codes: no corner of a cell is nearer to the level, so that no vertex of the mesh is on one
+_ROUNDS = 4  # of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
+_REACH = 0.5  # voxels that a vertex is moved by at most
+_AT_ONCE = 1 << 18
+
+
+def extract_asset_surface(
+    grid: SparseGrid,
+    level: float | None = None,
+    progress: Callable[[float], object] | None = None,
+    stride: int = 1,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The surface where a grid's density equals `level`.
+
+    Args:
+        grid: the sparse grid, cubic voxels.
+        level: density in 1/model unit; None is `half_opaque`, or the middle of what is stored if
+            nothing is that dense.
+        progress: called with the share done in (0, 1] after each block.
+        stride: 2 looks at every second vertex along each axis only, and makes a quarter of the faces; a power
+            of two up to BLOCK. Vertices are on the level all the same.
+
+    Returns:
+        vertices [n_vertices, 3] float64, model frame, on the level to a hundredth of a voxel where the
+        density has a slope there; faces [n_faces, 3] int32, counter-clockwise seen from the side of lower
+        density; normals [n_vertices, 3] float64, unit, along the falling density.
+
+    Raises:
+        ConfigError: a level outside the stored densities; the message has their range.
+        DataError: no live cell.
+        MissingExtraError: scikit-image is not installed.
+    """
+    try:
+        import skimage.measure  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("the mesh: needs scikit-image: pip install 'vfr-bake[export]'") from error
+    code_level = _code_level(grid, level)
+    corners, faces = [], []
+    n_corners = 0
+    for block, n_blocks, part in _blocks(grid, code_level, stride):
+        if part is not None:
+            corners.append(part[0])
+            faces.append(part[1] + n_corners)
+            n_corners += len(part[0])
+        if progress is not None:
+            progress((block + 1) / n_blocks)
+    if not n_corners:
+        raise DataError("surface: expected a surface at this level, got none")
+    g, triangles = _joined(np.concatenate(corners), np.concatenate(faces))
+    g = onto_level(grid, g * stride, code_level, stride)
+    normals = _normals(grid, g, triangles, code_level)
+    vertices = grid.aabb_min.astype(np.float64) + g / grid.cells_per_unit.astype(np.float64)
+    return vertices, triangles, normals
+
+
+def voxel_size(grid: SparseGrid) -> float:
+    """Edge of a voxel, model units."""
+    return 1 / float(grid.cells_per_unit[0])
+
+
+def half_opaque(grid: SparseGrid) -> float:
+    """The density, in 1/model unit, that is half opaque over two voxels or steps, whichever are longer."""
+    return math.log(2) / (2 * max(voxel_size(grid), float(grid.step)))
+
+
+def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int = 1) -> np.ndarray:
+    """Points [n, 3] float64 (grid coordinates), moved along the gradient of the code onto `code_level`.
+
+    Newton's iteration, at most half of `stride` voxels in all; a point that leaves the live cells stays where
+    it was.
+    """
+    moved = g.copy()
+    for start in range(0, len(g), _AT_ONCE):
+        here = g[start : start + _AT_ONCE].copy()
+        first = here.copy()
+        settled = np.zeros(len(here), bool)
+        for _ in range(_ROUNDS):
+            codes, slopes, known = code_and_slope(grid, here)
+            square = np.sum(slopes**2, axis=-1)
+            apart = code_level - codes
+            usable = known & (square > 1.0) & ~settled  # below a code a voxel the direction is noise
+            step = np.where(usable, apart / np.where(usable, square, 1), 0)[:, None] * slopes
+            candidate = here + step
+            near = np.linalg.norm(candidate - first, axis=-1) <= _REACH * stride
+            settled |= ~(usable & near)
+            here = np.where(settled[:, None], here, candidate)
+        end, _, known = code_and_slope(grid, here)
+        begin, _, was_known = code_and_slope(grid, first)
+        better = known & (~was_known | (np.abs(end - code_level) <= np.abs(begin - code_level)))
+        moved[start : start + _AT_ONCE] = np.where(better[:, None], here, first)
+    return moved
+
+
+def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The interpolated code [n] at points [n, 3] (grid coordinates), its gradient [n, 3] in codes a voxel,
+    and whether the point is in a live cell [n] bool: elsewhere both are 0."""
+    cell = np.clip(np.floor(g).astype(np.int64), 0, grid.resolution - 1)
+    brick, local = cell >> 3, cell & 7
+    n = grid.n_per_axis
+    slot = grid.table.take((brick[:, 0] * n + brick[:, 1]) * n + brick[:, 2]).astype(np.int64)
+    inside = np.all((g >= 0) & (g <= grid.resolution), axis=-1)
+    held = np.maximum(slot, 0)
+    bits = grid.live.take(held * 64 + local[:, 0] * 8 + local[:, 1])
+    known = inside & (slot >= 0) & ((bits >> local[:, 2].astype(np.uint8)) & 1).astype(bool)
+    at = held * 729 + local[:, 0] * 81 + local[:, 1] * 9 + local[:, 2]
+    fraction = g - cell
+    share = [(1 - fraction[:, axis], fraction[:, axis]) for axis in range(3)]
+    codes, slopes = np.zeros(len(g)), np.zeros((len(g), 3))
+    for x, y, z in np.ndindex(2, 2, 2):
+        corner = grid.density.take(at + (x * 81 + y * 9 + z)).astype(np.float64)
+        codes += corner * share[0][x] * share[1][y] * share[2][z]
+        slopes[:, 0] += (2 * x - 1) * corner * share[1][y] * share[2][z]
+        slopes[:, 1] += (2 * y - 1) * corner * share[0][x] * share[2][z]
+        slopes[:, 2] += (2 * z - 1) * corner * share[0][x] * share[1][y]
+    return np.where(known, codes, 0), np.where(known[:, None], slopes, 0), known
+
+
+def _code_level(grid: SparseGrid, level: float | None) -> float:
+    if not grid.live.any():
+        raise DataError("surface: expected an asset with live cells, got none")
+    low, slope = float(grid.density_low), float(grid.density_slope)
+    lowest, highest = _stored_range(grid)
+    least, most = math.exp(low + slope * lowest), math.exp(low + slope * highest)
+    if level is None:
+        level = half_opaque(grid)
+        if not least < level < most:
+            level = math.sqrt(least * most)
+    if not (math.isfinite(level) and least < level < most):
+        raise ConfigError(
+            f"--level: expected a density between {least:.4g} and {most:.4g}, the range of the asset "
+            f"(without it {half_opaque(grid):.4g}), got {level:g}"
+        )
+    return (math.log(level) - low) / slope
+
+
+def _stored_range(grid: SparseGrid) -> tuple[int, int]:
+    """Smallest and largest code at the corners of live cells, up to what their bricks hold besides."""
+    held = grid.codes
+    return int(held.min()), int(held.max())
+
+
+def _blocks(
+    grid: SparseGrid, code_level: float, stride: int
+) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray] | None]]:
+    """Number of the block, how many there are, and its corners (grid coordinates over `stride`) and faces, or
+    None."""
+    from skimage.measure import marching_cubes
+
+    wide = BLOCK // 8
+    owner = grid.slot_coords // wide
+    names, which = np.unique(owner, axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(names)))
+    limit = _CLIP / float(grid.density_slope)
+    for number, name in enumerate(names):
+        slots = order[ends[number - 1] if number else 0 : ends[number]]
+        volume = np.full((BLOCK + 1,) * 3, -limit, np.float32)
+        live = np.zeros((BLOCK + 1,) * 3, bool)
+        for slot in slots:
+            x, y, z = (grid.slot_coords[slot] - name * wide) * 8
+            codes = grid.codes[slot].reshape(9, 9, 9)
+            values = np.clip(codes - code_level, -limit, limit)
+            near = np.abs(values) < _NUDGE
+            values[near] = np.where(values[near] < 0, -_NUDGE, _NUDGE)
+            volume[x : x + 9, y : y + 9, z : z + 9] = values
+            bits = grid.live[slot * 64 : (slot + 1) * 64].reshape(8, 8, 1)
+            # marching_cubes asks at a cell's last corner whether the cell is to be cut
+            live[x + 1 : x + 9, y + 1 : y + 9, z + 1 : z + 9] = np.unpackbits(
+                bits, axis=2, bitorder="little"
+            ).astype(bool)
+        if stride > 1:  # a cell of the coarser grid is live if one in it is; what is not stored is empty
+            volume = np.ascontiguousarray(volume[::stride, ::stride, ::stride])
+            n = BLOCK // stride
+            cells = live[1:, 1:, 1:].reshape(n, stride, n, stride, n, stride).any(axis=(1, 3, 5))
+            live = np.pad(cells, ((1, 0),) * 3)
+        part = None
+        if volume.min() < 0 < volume.max():
+            try:
+                corners, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="ascent", mask=live)
+                part = corners.astype(np.float64) + name * (BLOCK // stride), faces.astype(np.int64)
+            except RuntimeError:  # the level is crossed, but in no live cell
+                part = None
+        yield number, len(names), part
+
+
+def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of all blocks with those on the same edge of the grid made one, and the faces of three corners.
+
+    A corner that is on no edge is inside a cell, and belongs to that block alone.
+    """
+    nearest = np.rint(g)
+    whole = np.abs(g - nearest) < 3e-5
+    on_edge = whole.sum(axis=1) == 2
+    start = np.where(whole, nearest, np.floor(g)).astype(np.int64)
+    axis = np.argmin(whole, axis=1)
+    name = ((start[:, 0] << 40) | (start[:, 1] << 20) | start[:, 2]) * 3 + axis
+    name[~on_edge] = -1 - np.arange(int((~on_edge).sum()))
+    _, first, number = np.unique(name, return_index=True, return_inverse=True)
+    triangles = number.reshape(-1)[faces]
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    return g[first], triangles.astype(np.int32)
+
+
+def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: float) -> np.ndarray:
+    """Differences of the clipped code over half a voxel to both sides; over one side where the other is not
+    stored; and where they vanish, the mean of the faces around, by area."""
+    limit = _CLIP / float(grid.density_slope)
+    normals = np.zeros_like(g)
+    for start in range(0, len(g), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        here = np.clip(code_and_slope(grid, g[rows])[0] - code_level, -limit, limit)
+        for axis in range(3):
+            sides = []
+            for sign in (-1, 1):
+                at = g[rows].copy()
+                at[:, axis] += sign * 0.5
+                codes, _, known = code_and_slope(grid, at)
+                sides.append(
+                    np.where(known, sign * (np.clip(codes - code_level, -limit, limit) - here), np.nan)
+                )
+            both = np.stack(sides)
+            counted = np.isfinite(both)
+            total = np.where(counted, both, 0).sum(axis=0)
+            normals[rows, axis] = -total / np.maximum(counted.sum(axis=0), 1)
+    flat = np.linalg.norm(normals, axis=-1) < 0.1
+    if flat.any():
+        a, b, c = (g[faces[:, k]] for k in range(3))
+        around = np.zeros_like(g)
+        for k in range(3):
+            np.add.at(around, faces[:, k], np.cross(b - a, c - a))
+        normals[flat] = around[flat]
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])

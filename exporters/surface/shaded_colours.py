@@ -1,0 +1,123 @@
+"""The colour of a surface: what the asset's head says of short rays onto it.
+
+A ray starts a few voxels above the point and is marched as the player marches, so that a point that is a
+little beside the surface still gets the surface's colour. One number a point has to stand for all directions:
+it is the mean over the directions of training cameras that see the point, or, where none does, the view along
+the normal. docs/exports.md has the measurement that chose between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from exporters.surface.depth_views import TOLERANCE, DepthView, cosines_in_view
+from exporters.surface.marching_cubes import voxel_size
+from player.asset.asset import Asset
+from player.head.head import Head
+from player.render import choose_march, default_threads
+
+STAND_OFF = 3.0
+"""Voxels above the surface at which a ray starts."""
+MAX_DIRECTIONS = 4
+"""Cameras that count for a point, at most: eight are no nearer to the player's pictures (docs/exports.md)."""
+_RAYS = 1 << 14
+_LEAST = 0.1  # opacity below which a ray has met too little to have a colour
+
+Progress = Callable[[int, int], object]
+"""Called with (done, of)."""
+
+
+def surface_colours(
+    asset: Asset,
+    points: np.ndarray,
+    normals: np.ndarray,
+    views: list[DepthView],
+    progress: Progress | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """sRGB colours of points on a surface, and which points have one.
+
+    Args:
+        asset: its grid and its head are asked.
+        points: [n, 3] world frame, within a few voxels of the surface.
+        normals: [n, 3] unit, world frame, outwards.
+        views: the training cameras that may be averaged over; none for the view along the normal alone.
+        progress: called with (done, of) after each view and at the end.
+
+    Returns:
+        rgb [n, 3] float32, 0..1; known [n] bool: False where no ray met anything.
+    """
+    with _Shader(asset) as shade:
+        total = np.zeros((len(points), 3), np.float32)
+        weight = np.zeros(len(points), np.float32)
+        n_used = np.zeros(len(points), np.int32)
+        tolerance = TOLERANCE * voxel_size(asset.grid) * asset.scale
+        for done, index in enumerate(_spread(len(views))):
+            open_ = np.flatnonzero(n_used < MAX_DIRECTIONS)
+            cosines = cosines_in_view(views[index], points[open_], normals[open_], tolerance)
+            rows = open_[cosines > 0]
+            rays = points[rows] - views[index].camera.c2w[:3, 3]
+            rgb, opacity = shade(points[rows], rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+            counted = np.where(opacity > _LEAST, cosines[cosines > 0], 0).astype(np.float32)
+            total[rows] += rgb * counted[:, None]
+            weight[rows] += counted
+            n_used[rows] += counted > 0
+            if progress is not None:
+                progress(done + 1, len(views) + 1)
+        rest = np.flatnonzero(n_used == 0)
+        rgb, opacity = shade(points[rest], -normals[rest])
+        total[rest], weight[rest] = rgb, opacity > _LEAST
+        if progress is not None:
+            progress(len(views) + 1, len(views) + 1)
+    known = weight > 0
+    return np.where(known[:, None], total / np.where(known, weight, 1)[:, None], 0), known
+
+
+class _Shader:
+    """Colours of rays, in tasks of a few threads; a context manager."""
+
+    def __init__(self, asset: Asset) -> None:
+        self._asset = asset
+        self._march = choose_march("auto")[1].march
+        self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+        self._model_from_world = np.linalg.inv(asset.world_from_model)
+        self._pool = ThreadPoolExecutor(default_threads(), thread_name_prefix="vfr-export")
+
+    def __enter__(self) -> _Shader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __call__(self, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """rgb [n, 3] float32 and opacity [n] float32 seen along `dirs` [n, 3] (world) at `points` [n, 3]."""
+        rgb, opacity = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+        parts = [slice(start, start + _RAYS) for start in range(0, len(points), _RAYS)]
+        for part, (colours, solid) in zip(
+            parts, self._pool.map(lambda p: self._task(points[p], dirs[p]), parts), strict=True
+        ):
+            rgb[part], opacity[part] = colours, solid
+        return rgb, opacity
+
+    def _task(self, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        matrix = self._model_from_world
+        rays_d = (dirs @ matrix[:3, :3].T * self._asset.scale).astype(np.float32)
+        reach = np.float32(STAND_OFF * voxel_size(self._asset.grid))
+        rays_o = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32) - reach * rays_d
+        bounds = np.zeros(len(points), np.float32), np.full(len(points), 3 * reach, np.float32)
+        result = self._march(self._asset.grid, rays_o, rays_d, self._asset.manifest.n_samples, bounds)
+        rgb = np.zeros((len(points), 3), np.float32)
+        opacity = result.opacity[result.hits]
+        rgb[result.hits] = self._head(result.features / opacity[:, None], rays_d[result.hits])
+        return rgb, result.opacity
+
+
+def _spread(n: int) -> list[int]:
+    """0..n - 1 in an order whose every beginning is spread evenly: steps of the golden section.
+
+    >>> _spread(5)
+    [0, 2, 4, 1, 3]
+    """
+    return sorted(range(n), key=lambda index: (index * 0.6180339887498949) % 1)

@@ -1,0 +1,111 @@
+"""A second way to a surface: training cameras' depth pictures, fused by Open3D (Curless and Levoy 1996).
+
+Where marching cubes asks what the density is at a place, this asks how far the cameras see: fog in front of a
+surface counts for less, thin parts that few pixels hit for nothing. Pixels of less than half opacity are left
+out, and so are those beside a jump in depth, whose mean lies between two surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from exporters.mesh.open3d_package import require_open3d
+from exporters.surface.depth_views import DepthView
+from player.errors import DataError
+
+TRUNCATION = 3.0
+"""Voxels on both sides of a surface that a depth is believed for."""
+JUMP = 5.0
+"""Voxels between neighbouring pixels that make two surfaces of them; one seen at 80 degrees stays below."""
+_BLOCKS = 50_000  # of 8^3 voxels, made room for at once; it grows
+_LEAST_WEIGHT = 1.0  # views that must have seen a voxel
+
+
+def fuse_depth(
+    views: list[DepthView], voxel: float, progress: Callable[[int, int], object] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The surface that depth pictures agree on.
+
+    Args:
+        views: cameras and pictures of depth, world frame.
+        voxel: edge of the voxels, world units.
+        progress: called with (done, of) after each view.
+
+    Returns:
+        vertices [n_vertices, 3] float64, world frame; faces [n_faces, 3] int32, counter-clockwise seen from
+        the cameras; normals [n_vertices, 3] float64, unit, towards the cameras.
+
+    Raises:
+        DataError: no view sees anything.
+        MissingExtraError: Open3D is not installed.
+    """
+    open3d = require_open3d("--method tsdf")
+    core, tensor = open3d.core, open3d.core.Tensor
+    grid = open3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
+    )
+    for done, view in enumerate(views):
+        camera = view.camera
+        depth = reliable_depth(view, JUMP * voxel)
+        if depth.any():
+            # Open3D counts pixel centres at whole numbers, and its cameras look along +z with y down.
+            lens = np.array(
+                [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]], np.float64
+            )
+            pose = np.linalg.inv(camera.c2w @ np.diag([1.0, -1.0, -1.0, 1.0]))
+            picture = open3d.t.geometry.Image(tensor(depth))
+            where = (tensor(lens), tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
+            grid.integrate(grid.compute_unique_block_coordinates(picture, *where), picture, *where)
+        if progress is not None:
+            progress(done + 1, len(views))
+    try:
+        mesh = grid.extract_triangle_mesh(weight_threshold=_LEAST_WEIGHT).to_legacy()
+    except RuntimeError:  # a grid without a block
+        mesh = open3d.geometry.TriangleMesh()
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int32)
+    if not len(faces):
+        raise DataError("--method tsdf: expected a surface in the training cameras' views, got none")
+    return _in_order(vertices, faces)
+
+
+def reliable_depth(view: DepthView, jump: float) -> np.ndarray:
+    """Depth along the camera's axis [height, width] float32, 0 where there is none to believe: nothing hit,
+    or a neighbour that is farther or nearer by more than `jump` (world units)."""
+    camera = view.camera
+    columns, rows = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
+    hit = np.isfinite(view.distance)
+    z = np.where(hit, view.distance / np.sqrt(1 + columns**2 + rows**2), np.nan)
+    padded = np.pad(z, 1, mode="edge")
+    good = hit.copy()
+    for row, column in ((0, 1), (2, 1), (1, 0), (1, 2)):
+        beside = padded[row : row + z.shape[0], column : column + z.shape[1]]
+        good &= ~(np.abs(beside - z) > jump)  # NaN, where nothing was hit, is no neighbour
+    return np.where(good, z, 0).astype(np.float32)
+
+
+def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices sorted by place and faces by number, whatever order they came in; normals of the faces around,
+    by area."""
+    places, number = np.unique(vertices, axis=0, return_inverse=True)
+    corners = number.reshape(-1)[faces]
+    corners = corners[
+        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    ]
+    first = np.argmin(corners, axis=1)
+    turned = np.stack(
+        [np.take_along_axis(corners, (first[:, None] + k) % 3, 1)[:, 0] for k in range(3)], axis=-1
+    )
+    triangles = np.unique(turned, axis=0)
+    a, b, c = (places[triangles[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    normals = np.zeros_like(places)
+    for k in range(3):
+        np.add.at(normals, triangles[:, k], across)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    return places, triangles.astype(np.int32), normals

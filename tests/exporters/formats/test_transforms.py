@@ -1,0 +1,135 @@
+"""transforms.json and COLMAP: the training cameras see the exported world as they saw their own."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from exporters import cli
+from exporters.formats import colmap
+from exporters.formats.axes import FRAMES, frame_matrix
+from exporters.formats.colmap import colmap_files
+from exporters.formats.points import sample_points
+from exporters.formats.transforms import check_cameras, moved_cameras, transforms_bytes
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.rotations import quaternion, rotation_matrix
+from player.cameras.transforms import read_cameras
+from player.errors import ParityError
+from tests.exporters.conftest import BOX
+from tests.exporters.meshes import box
+
+
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixels [n, 2] of points [n, 3], written out: x right, y up, looks along -z."""
+    local = (points - camera.c2w[:3, 3]) @ camera.c2w[:3, :3]
+    x = camera.cx + camera.fx * local[:, 0] / -local[:, 2]
+    y = camera.cy - camera.fy * local[:, 1] / -local[:, 2]
+    return np.stack([x, y], axis=-1)
+
+
+def trained(asset: Asset) -> list[Camera]:
+    return read_cameras(asset.path("cameras.json"), (48, 40))
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_cameras_see_the_moved_mesh_where_it_was(
+    frame: str, opened: Asset, shells_asset: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "cameras.json"
+    assert cli.main([str(shells_asset), str(path), "--frame", frame]) == 0
+    corners = box(*BOX).vertices
+    matrix = frame_matrix(frame, opened.world_from_model)
+    moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    for before, after in zip(trained(opened), read_cameras(path), strict=True):
+        assert before.name == after.name
+        np.testing.assert_allclose(project(after, moved), project(before, corners), rtol=0, atol=1e-8)
+
+
+def test_in_the_world_they_are_the_asset_s(opened: Asset, shells_asset: Path, tmp_path: Path) -> None:
+    assert cli.main([str(shells_asset), str(tmp_path / "cameras.json")]) == 0
+    for before, after in zip(trained(opened), read_cameras(tmp_path / "cameras.json"), strict=True):
+        assert before.c2w.tobytes() == after.c2w.tobytes()
+
+
+def test_pycolmap_reads_the_model(
+    opened: Asset, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An independent program, on its own axes: a point lands on the same pixel."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pycolmap
+
+    target = tmp_path / "sparse"
+    arguments = [str(shells_asset), f"{target}/", "--format", "colmap", "--points", "50", "--frame", "model"]
+    assert cli.main(arguments) == 0
+    assert "5 cameras, 50 points" in capsys.readouterr().out
+    model = pycolmap.Reconstruction(str(target))
+    assert model.num_images() == 5 and model.num_cameras() == 1 and model.num_points3D() == 50
+    world = sample_points(box(*BOX), 50).vertices
+    places = np.array([model.points3D[i].xyz for i in range(1, 51)])
+    moved = np.c_[world, np.ones(50)] @ np.linalg.inv(opened.world_from_model).T
+    np.testing.assert_allclose(places, moved[:, :3], rtol=0, atol=1e-6)
+    by_name = {image.name: image for image in model.images.values()}
+    for camera in trained(opened):
+        image = by_name[camera.name.removeprefix("./")]
+        pixels = np.array([image.project_point(place) for place in places])
+        np.testing.assert_allclose(pixels, project(camera, world), rtol=0, atol=1e-4)
+
+
+def test_quaternions_survive() -> None:
+    random = np.random.default_rng(0)
+    turns = [np.eye(3), *(np.diag(signs) for signs in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1]))]
+    for _ in range(50):
+        q, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        turns.append(q * np.sign(np.linalg.det(q)))
+    for turn in turns:
+        q = quaternion(turn)
+        assert abs(np.linalg.norm(q) - 1) < 1e-12 and q[np.abs(q) > 1e-12][0] > 0
+        np.testing.assert_allclose(rotation_matrix(q), turn, rtol=0, atol=1e-12)
+
+
+def test_lenses_are_shared_and_names_may_have_spaces() -> None:
+    camera = Camera("./my pictures/a b.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
+    other = camera.resized(8, 6)
+    files = colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
+    assert files["cameras.txt"].decode().splitlines()[1:] == [
+        "1 PINHOLE 4 3 5.0 5.5 2.0 1.5",
+        "2 PINHOLE 8 6 10.0 11.0 4.0 3.0",
+    ]
+    images = files["images.txt"].decode().splitlines()
+    assert [line.split(" ", 8)[8] for line in images[1::2]] == [
+        f"{number} my pictures/a b.png" for number in (1, 2, 1)
+    ]
+    assert files == colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
+
+
+def test_parity() -> None:
+    camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
+    assert transforms_bytes([camera], np.eye(4), "t.json")
+    (moved,) = moved_cameras(
+        [camera], np.array([[1.0, 0, 0, 1e-3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    )
+    with pytest.raises(ParityError, match=r"t\.json: a: pose: 0\.001 apart"):
+        check_cameras([camera], [moved], "t.json", 1e-9)
+    with pytest.raises(ParityError, match="cameras: expected 1, got 0"):
+        check_cameras([camera], [], "t.json", 0.0)
+    with pytest.raises(ParityError, match="expected a 4x3, got a 8x6"):
+        check_cameras([camera], [camera.resized(8, 6)], "t.json", 0.0)
+
+
+def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quaternion, a translation and a point that are not those of the source."""
+    camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
+    corners = box((0, 0, 0), (1, 1, 1))
+    monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))
+    with pytest.raises(ParityError, match=r"images\.txt: a: pose: 2 apart"):
+        colmap_files([camera], corners)
+    monkeypatch.undo()
+    monkeypatch.setattr(colmap, "_numbers", lambda values: " ".join(f"{value:.3f}" for value in values))
+    with pytest.raises(ParityError, match=r"points3D\.txt: expected 8 points as sampled"):
+        colmap_files([camera], replace(corners, vertices=corners.vertices + 1 / 3))

@@ -1,0 +1,61 @@
+"""Fewer faces, with the shape and the colours of the source."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exporters.mesh.simplify import simplify_mesh
+from player.errors import ConfigError, MissingExtraError
+from tests.exporters.meshes import box, sphere
+
+
+@pytest.mark.needs("open3d")
+def test_a_sphere_keeps_its_shape_and_colours() -> None:
+    mesh = sphere(60)
+    few = simplify_mesh(mesh, 800)
+    assert len(few.faces) <= 800 < len(mesh.faces)
+    radius = np.linalg.norm(few.vertices, axis=-1)
+    assert 0.98 < radius.min() and radius.max() < 1.02
+    unit = few.vertices / radius[:, None]
+    assert (few.normals * unit).sum(axis=-1).min() > 0.97
+    expected = np.rint((unit[:, [2, 0]] + 1) / 2 * 255)
+    assert np.abs(few.colours[:, :2] - expected).max() < 12 and (few.colours[:, 2:] == 255).all()
+    a, b, c = (few.vertices[few.faces[:, k]] for k in range(3))
+    volume = (a * np.cross(b, c)).sum() / 6
+    # 800 flat faces cut two hundredths off a ball; positive: they still look outwards
+    assert abs(volume / (4 / 3 * np.pi) - 1) < 0.04
+
+
+@pytest.mark.needs("open3d")
+def test_the_same_again_and_every_vertex_used() -> None:
+    first, second = simplify_mesh(sphere(30), 200), simplify_mesh(sphere(30), 200)
+    for name in ("vertices", "faces", "normals", "colours"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+    assert np.array_equal(np.unique(first.faces), np.arange(len(first.vertices)))
+
+
+@pytest.mark.needs("open3d")
+def test_alpha_is_that_of_the_nearest_vertex() -> None:
+    mesh = sphere(30)
+    colours = mesh.colours.copy()
+    colours[:, 3] = np.where(mesh.vertices[:, 2] > 0, 255, 100)
+    few = simplify_mesh(replace(mesh, colours=colours), 300)
+    clear = np.abs(few.vertices[:, 2]) > 0.15
+    assert np.array_equal(few.colours[clear, 3], np.where(few.vertices[clear, 2] > 0, 255, 100))
+
+
+def test_enough_already_and_too_few() -> None:
+    mesh = box((0, 0, 0), (1, 1, 1))
+    assert simplify_mesh(mesh, 12) is mesh
+    with pytest.raises(ConfigError, match="--faces: expected 1 or more, got 0"):
+        simplify_mesh(mesh, 0)
+
+
+def test_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(MissingExtraError, match=r"needs open3d: pip install 'vfr-bake\[export\]'"):
+        simplify_mesh(sphere(20), 100)

@@ -1,0 +1,132 @@
+"""What training cameras see: pictures of depth that are known, and points before, behind and beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exporters.shapes.mesh import TriangleMesh, take_faces
+from exporters.surface.depth_views import DepthView, cosines_in_view, depth_views, seen_vertices
+from exporters.surface.remade import Removed, Scene, cleaned
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.errors import DataError
+from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS
+from tests.exporters.meshes import sphere
+from tests.exporters.solids import WORLD_FROM_MODEL
+from tests.player.conftest import look_at
+
+UP = np.array([[0.0, 0.0, 1.0]])
+BLACK = np.zeros((64, 64, 3), np.uint8)
+
+
+def camera(eye: tuple[float, float, float], size: int = 64) -> Camera:
+    return Camera("a", look_at(eye, (0.0, 0.0, 0.0)), size, size, size * 1.5, size * 1.5, size / 2, size / 2)
+
+
+def sphere_view(eye: tuple[float, float, float], radius: float) -> DepthView:
+    """What a camera sees of a ball around the origin."""
+    seen_by = camera(eye)
+    rays_o, rays_d = (a.astype(np.float64) for a in seen_by.rays())
+    along = -(rays_o * rays_d).sum(-1)
+    square = radius**2 - (rays_o**2).sum(-1) + along**2
+    distance = np.where(square > 0, along - np.sqrt(np.maximum(square, 0)), np.inf)
+    return DepthView(seen_by, distance.reshape(64, 64).astype(np.float32), BLACK)
+
+
+def all_around(radius: float) -> list[DepthView]:
+    eyes = [(4, 0.1, 0.1), (-4, 0.1, 0.1), (0.1, 4, 0.1), (0.1, -4, 0.1), (0.1, 0.1, 4), (0.1, 0.1, -4)]
+    return [sphere_view(eye, radius) for eye in eyes]
+
+
+def test_before_behind_beside_and_turned_away() -> None:
+    view = DepthView(camera((0.0, 0.001, 5.0)), np.full((64, 64), 5.0, np.float32), BLACK)
+    points = np.array([[0, 0, 0], [0, 0, 1], [0, 0, -0.05], [0, 0, -0.2], [9, 0, 0], [0, 0, 9.0]])
+    cosines = cosines_in_view(view, points, np.tile(UP, (6, 1)), 0.1)
+    np.testing.assert_allclose(cosines, [1, 1, 1, 0, 0, 0], rtol=0, atol=1e-5)
+    assert not cosines_in_view(view, points, np.tile(-UP, (6, 1)), 0.1)[:5].any()
+    slanted = np.tile(np.array([[0.6, 0.0, 0.8]]), (1, 1))
+    np.testing.assert_allclose(cosines_in_view(view, points[:1], slanted, 0.1), [0.8], atol=1e-3)
+    nothing = DepthView(view.camera, np.full((64, 64), np.inf, np.float32), BLACK)
+    assert cosines_in_view(nothing, points[3:4], UP, 0.0)[0] == pytest.approx(1)
+    assert len(cosines_in_view(view, points[:0], UP[:0], 0.1)) == 0
+
+
+def test_half_of_a_ball_is_seen_from_one_side() -> None:
+    mesh = sphere(40)
+    seen = seen_vertices([sphere_view((0.0, 0.001, 5.0), 1.0)], mesh.vertices, mesh.normals, 0.02)
+    height = mesh.vertices[:, 2]  # tangents from (0, 0, 5) touch at z = 1/5
+    assert not seen[height < 1 / 5 - 0.05].any()
+    # A pixel inside the outline, 0.05 wide here, the ball is sqrt(2 * 0.05) higher.
+    assert seen[height > 1 / 5 + 0.35].all()
+    assert seen_vertices(all_around(1.0), mesh.vertices, mesh.normals, 0.02).all()
+
+
+def joined(*meshes: TriangleMesh) -> TriangleMesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+    return TriangleMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.colours for mesh in meshes]),
+    )
+
+
+def test_what_is_hidden_and_what_floats_goes() -> None:
+    outer = sphere(120)
+    inner = replace(sphere(30), vertices=sphere(30).vertices * 0.8)
+    # as near as the outer one, but looking inwards
+    wall = replace(sphere(30), vertices=sphere(30).vertices * 0.99, normals=-sphere(30).normals)
+    tiny = np.array([[1.5, 0, 0], [1.5, 0.01, 0], [1.5, 0, 0.01]])
+    out = np.tile([1.0, 0, 0], (3, 1))
+    floater = TriangleMesh(tiny, np.array([[0, 1, 2]], np.int32), out, np.full((3, 4), 255, np.uint8))
+    mesh = joined(outer, inner, wall, floater)
+    kept, removed = cleaned(mesh, all_around(1.0), 0.02)
+    assert removed == Removed(len(inner.faces) + len(wall.faces), 1, 1)
+    assert len(kept.faces) == len(outer.faces) and np.array_equal(kept.vertices, outer.vertices)
+    with pytest.raises(DataError, match=r"expected some of \d+ faces in a training camera's view, got none"):
+        cleaned(replace(inner, vertices=inner.vertices + 100), all_around(1.0), 0.02)
+
+
+@pytest.mark.needs("open3d")
+def test_what_fills_a_hole_stays() -> None:
+    whole, inner = sphere(60), replace(sphere(60), vertices=sphere(60).vertices * 0.9)
+    outer = take_faces(whole, whole.vertices[whole.faces, 0].max(axis=1) < 0.97)
+    kept, removed = cleaned(joined(outer, inner), all_around(1.0), 0.02)
+    assert np.array_equal(kept.vertices[: len(outer.vertices)], outer.vertices)
+    filling = kept.vertices[len(outer.vertices) :]
+    assert 20 < len(filling) < 200 and filling[:, 0].min() > 0.7
+    assert removed.unseen > 0.9 * len(inner.faces)
+
+
+def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
+    shares: list[tuple[int, int]] = []
+    views = depth_views(ball_asset, 32 * 32, lambda done, of: shares.append((done, of)))
+    assert len(views) == 12 and shares[-1] == (12, 12) and views[0].camera.width == 32
+    centre = np.array(WORLD_FROM_MODEL)[:3] @ [*BALL_CENTRE, 1]
+    for view in views:
+        middle = np.linalg.norm(view.camera.c2w[:3, 3] - centre) - 2 * BALL_RADIUS
+        assert np.isfinite(view.distance).any() and np.isinf(view.distance).any()
+        assert view.distance.min() == pytest.approx(middle, abs=0.1)  # a voxel is 0.056 here
+    assert depth_views(ball_asset)[0].camera.width == 64
+
+
+def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:
+    stages = []
+    scene = Scene(ball_asset, lambda stage, done, of: stages.append(stage))
+    for method in ("density", "tsdf"):
+        mesh, removed = scene.surface(method, None)
+        centre = np.array(WORLD_FROM_MODEL)[:3] @ [*BALL_CENTRE, 1]
+        outward = mesh.vertices - centre
+        radius = np.linalg.norm(outward, axis=-1)
+        assert np.abs(radius - 2 * BALL_RADIUS).max() < 2 * 4 / 72
+        cosines = (mesh.normals * outward).sum(-1) / radius
+        # depth comes from the nearest pixel, as wide as a voxel here: steps, and thin faces at their edges
+        assert cosines.min() > 0.99 if method == "density" else cosines.mean() > 0.9
+        assert removed.unseen < 0.02 * len(mesh.faces)
+        assert (mesh.colours == 255).all()
+        assert scene.painted(mesh).colours[:, :3].std(axis=0).min() > 5
+    assert set(stages) == {"views", "surface", "colours", "fusion"}
