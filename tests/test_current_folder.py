@@ -95,7 +95,8 @@ def test_planted_files_run_where_a_process_looks_there(tmp_path: Path) -> None:
     folder.mkdir()
     plant(folder, marker)
     subprocess.run([sys.executable, "-c", "import json"], cwd=folder, capture_output=True, check=False)
-    assert "json" in marker.read_text().split()
+    # Python 3.13 imports linecache before the program's first line, and ends there because ours is empty.
+    assert set(marker.read_text().split()) & {"json", "linecache"}
 
 
 @pytest.mark.parametrize("variable", ["", ".", "{folder}"])
