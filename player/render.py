@@ -65,7 +65,7 @@ class Frame:
     """[h, w] float32, 0..1."""
     depth: np.ndarray
     """[h, w] float32, mean distance along the ray, WORLD units; 0 where nothing was met."""
-    n_samples: np.ndarray
+    n_density_samples: np.ndarray
     """[h, w] int32, density samples taken."""
     background: Background
     """What is behind, or "transparent"."""
@@ -144,7 +144,7 @@ class Renderer:
     def render(
         self,
         camera: Camera,
-        n_samples: int | None = None,
+        n_fetches: int | None = None,
         background: Background | None = None,
         layers: bool = False,
     ) -> Frame:
@@ -152,16 +152,16 @@ class Renderer:
 
         Args:
             camera: in the WORLD frame.
-            n_samples: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
+            n_fetches: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
                 can have.
             background: colour 0..1 or "transparent"; the asset's own if None.
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
         Raises:
-            ConfigError: a picture over MAX_PIXELS, or n_samples out of range.
+            ConfigError: a picture over MAX_PIXELS, or n_fetches out of range.
         """
-        k = self.asset.manifest.n_samples if n_samples is None else n_samples
+        k = self.asset.manifest.n_samples if n_fetches is None else n_fetches
         if k < 0:
             raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
         k = min(k, self._grid.most_samples)
@@ -224,7 +224,7 @@ class Renderer:
             normals[index] = self._normals(rays_o, rays_d, bounds)
         rgb = self._head(result.features, rays_d[result.hits])
         self._write_pixels(
-            (frame.rgb, frame.opacity, frame.depth, frame.n_samples),
+            (frame.rgb, frame.opacity, frame.depth, frame.n_density_samples),
             index,
             result,
             rgb,
@@ -345,7 +345,7 @@ def _renderer(asset: Asset, n_threads: int | None, march: March) -> Renderer:
 def render(
     asset: Asset,
     camera: Camera,
-    n_samples: int | None = None,
+    n_fetches: int | None = None,
     background: Background | None = None,
     n_threads: int | None = None,
     march: March = "auto",
@@ -355,7 +355,7 @@ def render(
     Args:
         asset: an open asset.
         camera: in the WORLD frame, the photographs' own.
-        n_samples: feature fetches a ray; the asset's own if None, every sample if 0.
+        n_fetches: feature fetches a ray; the asset's own if None, every sample if 0.
         background: colour, 3 numbers 0..1, or "transparent"; the asset's own if None.
         n_threads: one for each core if None.
         march: "numba", "numpy", or "auto": numba where it is installed and was not found to be wrong
@@ -376,4 +376,4 @@ def render(
     >>> frame.rgb.shape, frame.opacity.shape, frame.depth.shape, frame.normals.shape
     ((40, 48, 3), (40, 48), (40, 48), (40, 48, 3))
     """
-    return _renderer(asset, n_threads, march).render(camera, n_samples, background)
+    return _renderer(asset, n_threads, march).render(camera, n_fetches, background)

@@ -366,7 +366,7 @@ class BakeConfig:
 
         >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
         (5, 64)
-        >>> BakeConfig(k=3).choice().n_samples, BakeConfig(k="auto").choice().n_samples
+        >>> BakeConfig(k=3).choice().n_fetches, BakeConfig(k="auto").choice().n_fetches
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
         2500
@@ -375,5 +375,5 @@ class BakeConfig:
         if unbounded:
             preset = replace(preset, **UNBOUNDED[self.preset])
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
-        given["n_samples"] = None if self.k == "auto" else self.k
+        given["n_fetches"] = None if self.k == "auto" else self.k
         return replace(preset, **{name: value for name, value in given.items() if value is not None})

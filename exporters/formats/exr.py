@@ -72,7 +72,7 @@ def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, 
         ("position.", "XYZ", np.where(met[..., None], position, 0), np.float32),
         ("normal.", "XYZ", np.where(met[..., None], frame.normals, 0), kind),
         ("opacity.", "V", frame.opacity, kind),
-        ("samples.", "V", frame.n_samples, np.float32),
+        ("samples.", "V", frame.n_density_samples, np.float32),
         ("features.", [f"{k:02d}" for k in range(frame.features.shape[-1])], frame.features, kind),
     ]
     channels = {}

@@ -23,14 +23,14 @@ F32 = np.float32
 
 
 def march(
-    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int, bounds: None = None
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int, bounds: None = None
 ) -> MarchResult:
     """`player.march.contracted_march.march`, compiled: same arguments, same result to float32 rounding."""
     n_rays = len(rays_o)
     rays = enter_space(grid, rays_o, rays_d)
     table = lattice(float(grid.step))
     capacity = table.shape[1]
-    k = min(n_samples, capacity)  # no ray has more samples
+    k = min(n_fetches, capacity)  # no ray has more samples
     out = result_arrays(n_rays, grid.n_channels)
     packet = scratch((SPACE_ROWS + 1, LANES), F32, 0)
     found = scratch((2, capacity, LANES), F32), scratch((SUMS, LANES), F32)

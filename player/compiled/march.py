@@ -26,7 +26,7 @@ def march(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    n_samples: int,
+    n_fetches: int,
     bounds: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> MarchResult:
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
@@ -34,7 +34,7 @@ def march(
     near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
     far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
     capacity = grid.most_samples
-    k = min(n_samples, capacity)  # no ray has more samples
+    k = min(n_fetches, capacity)  # no ray has more samples
     out = result_arrays(n_rays, grid.n_channels)
     packet = scratch((BOX_ROWS + 1, LANES), F32, 0), scratch(LANES, np.int32)
     found = scratch((2, capacity, LANES), F32), scratch((SUMS, LANES), F32)

@@ -39,7 +39,7 @@ def write_pixels(
     start, scale = depth_from
     colour = (0.0, 0.0, 0.0) if behind is None else behind
     _write(
-        frame, index, (result.opacity, result.depth, result.n_samples), result.hits, rgb,
+        frame, index, (result.opacity, result.depth, result.n_density_samples), result.hits, rgb,
         np.array(colour, F32), behind is None, F32(start), F32(scale),
     )  # fmt: skip
 
@@ -62,13 +62,13 @@ def _directions(columns, rows, lens, rotation, rays_d):
 @compiled
 def _write(frame, index, found, hits, rgb, behind, transparent, start, scale):
     to_rgb, to_opacity, to_depth, to_samples = frame
-    opacity, depth, n_samples = found
+    opacity, depth, n_density_samples = found
     hit = 0
     for ray in range(len(index)):
         pixel = index[ray]
         to_opacity[pixel] = opacity[ray]
         to_depth[pixel] = (depth[ray] + start) * scale if depth[ray] > F32(0.0) else F32(0.0)
-        to_samples[pixel] = n_samples[ray]
+        to_samples[pixel] = n_density_samples[ray]
         shaded = hit < len(hits) and hits[hit] == ray
         for c in range(3):
             if not transparent:

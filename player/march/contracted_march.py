@@ -25,7 +25,7 @@ CHUNK = SPARE
 
 
 def march(
-    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int, bounds: None = None
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int, bounds: None = None
 ) -> MarchResult:
     """`player.march.march.march` through a contracted grid, which has no box that could be missed: no
     `bounds`."""
@@ -40,7 +40,7 @@ def march(
     depth = np.where(met, rays.distances(np.arange(len(rays_o)), mean), np.float32(0))
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     return MarchResult(
-        opacity, depth, counts, hits, fetch_features(grid, rays, samples, opacity, hits, n_samples)
+        opacity, depth, counts, hits, fetch_features(grid, rays, samples, opacity, hits, n_fetches)
     )
 
 

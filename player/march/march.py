@@ -51,7 +51,7 @@ class MarchResult(NamedTuple):
     """[n] float32, 0..1."""
     depth: np.ndarray
     """[n] float32, mean t of the weights, model units; 0 where nothing was met."""
-    n_samples: np.ndarray
+    n_density_samples: np.ndarray
     """[n] int32, density samples taken in live cells."""
     hits: np.ndarray
     """[n_hits] int64, the rays that have features, ascending."""
@@ -63,7 +63,7 @@ def march(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    n_samples: int,
+    n_fetches: int,
     bounds: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> MarchResult:
     """March rays and fetch their features.
@@ -72,7 +72,7 @@ def march(
         grid: the sparse grid.
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
-        n_samples: k, feature fetches a ray; 0 fetches at every sample.
+        n_fetches: k, feature fetches a ray; 0 fetches at every sample.
         bounds: optional [n] float32 `near` and `far`: t outside which the caller knows that there is no
             live cell.
     """
@@ -86,7 +86,7 @@ def march(
     met = total > 0
     depth = np.where(met, entries.t + (moment / np.where(met, total, 1)).astype(np.float32), np.float32(0))
     hits = np.flatnonzero(opacity > MIN_OPACITY)
-    features = fetch_features(grid, entries, samples, opacity, hits, n_samples)
+    features = fetch_features(grid, entries, samples, opacity, hits, n_fetches)
     return MarchResult(opacity, depth, counts, hits, features)
 
 

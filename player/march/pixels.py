@@ -67,7 +67,7 @@ def write_pixels(
     depth = result.depth if start == 0 else np.where(result.depth > 0, result.depth + np.float32(start), 0)
     to_opacity[index] = result.opacity
     to_depth[index] = depth * np.float32(scale)
-    to_samples[index] = result.n_samples
+    to_samples[index] = result.n_density_samples
     if behind is None:
         to_rgb[index[result.hits]] = rgb
         return

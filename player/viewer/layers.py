@@ -33,7 +33,7 @@ def layer_picture(frame: Frame, layer: str) -> np.ndarray:
     elif layer == "normals":
         values = np.where(met[..., None], frame.normals / 2 + 0.5, 0)
     else:
-        values = coloured(frame.n_samples / max(float(frame.n_samples.max(initial=0)), 1.0))
+        values = coloured(frame.n_density_samples / max(float(frame.n_density_samples.max(initial=0)), 1.0))
     return np.floor(np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 

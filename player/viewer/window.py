@@ -161,9 +161,9 @@ class Window:
     def _switch(self) -> None:
         """To another asset, with the fetches that it was baked for."""
         self._renderer = self._renderers[self._asset.value]
-        n_samples = self._renderer.asset.manifest.n_samples
-        self._samples.max = max(self._samples.max, n_samples)
-        self._samples.value = n_samples
+        n_fetches = self._renderer.asset.manifest.n_samples
+        self._samples.max = max(self._samples.max, n_fetches)
+        self._samples.value = n_fetches
         self.touch()
 
     def _set_fov(self) -> None:
@@ -332,7 +332,7 @@ def _joined(frames: Sequence[Frame], layer: str) -> Frame:
 
     normals = all_of("normals") if layer == "normals" else None
     return Frame(
-        all_of("rgb"), all_of("opacity"), all_of("depth"), all_of("n_samples"), frames[0].background,
+        all_of("rgb"), all_of("opacity"), all_of("depth"), all_of("n_density_samples"), frames[0].background,
         find_normals=None if normals is None else lambda: normals,
     )  # fmt: skip
 

@@ -53,7 +53,7 @@ class Parts(NamedTuple):
     head: float
     rest: float
     n_rays_hit: float
-    n_samples: float
+    n_density_samples: float
     n_fetches: float
 
     @property
@@ -80,11 +80,11 @@ def measure(
             march.seconds = 0.0
             renderer.render(camera, 1)
             lookups = max(in_march - march.seconds, 0.0) * k / max(k - 1, 1)
-            taken = frame.n_samples[frame.opacity > MIN_OPACITY]
+            taken = frame.n_density_samples[frame.opacity > MIN_OPACITY]
             fetches = np.minimum(taken, k).sum() if k else taken.sum()
             times = (in_march - lookups, lookups, in_head, used - in_march - in_head)
             shares = [1000 * seconds / renderer.n_threads for seconds in times]
-            rows.append([1000 * wall, *shares, len(taken), frame.n_samples.sum(), fetches])
+            rows.append([1000 * wall, *shares, len(taken), frame.n_density_samples.sum(), fetches])
     return Parts(*(statistics.median(column) for column in zip(*rows, strict=True))), frame
 
 
@@ -121,7 +121,7 @@ def bounds(asset: Asset, parts: Parts, rates: tuple[float, float]) -> str:
     """
     flops, speed = rates
     width = asset.manifest.n_channels
-    march = parts.n_samples * (8 + 4 + 1) / speed / 1e6, parts.n_samples * 60 / flops / 1e6
+    march = parts.n_density_samples * (8 + 4 + 1) / speed / 1e6, parts.n_density_samples * 60 / flops / 1e6
     lookups = (
         parts.n_fetches * 8 * (width + 2) / speed / 1e6, parts.n_fetches * 8 * (2 * width + 4) / flops / 1e6
     )  # fmt: skip
@@ -163,7 +163,8 @@ def compare(asset: Asset, cameras: list[Camera], n_threads: int, k: int | None) 
         hit = parts.n_rays_hit / frame.opacity.size
         print(f"{name:6} {n_threads} threads: {line(parts)}")
         print(
-            f"       {100 * hit:.0f} % of the pixels hit, {parts.n_samples / max(parts.n_rays_hit, 1):.1f} "
+            f"       {100 * hit:.0f} % of the pixels hit, "
+            f"{parts.n_density_samples / max(parts.n_rays_hit, 1):.1f} "
             f"density samples and {parts.n_fetches / max(parts.n_rays_hit, 1):.1f} fetches each\n"
             f"       {bounds(asset, parts, rates)}"
         )

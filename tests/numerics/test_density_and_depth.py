@@ -183,8 +183,8 @@ def test_a_fog_of_one_density(module: object, optical: float) -> None:
     limit = float(MAX_TAU)
     inside = round(2 / float(grid.step))
     taken = inside if step_tau == 0 else min(inside, math.floor(limit / step_tau) + 1)
-    assert abs(int(result.n_samples[0]) - taken) <= 1
-    wanted = -mpmath.expm1(-mpmath.mpf(step_tau) * int(result.n_samples[0]))
+    assert abs(int(result.n_density_samples[0]) - taken) <= 1
+    wanted = -mpmath.expm1(-mpmath.mpf(step_tau) * int(result.n_density_samples[0]))
     assert abs(mpmath.mpf(float(result.opacity[0])) - wanted) <= 1e-5 * float(wanted) + 1e-44
     if len(result.hits):  # one constant feature: the weights' sum
         total = float(result.features[0, 0]) / 100

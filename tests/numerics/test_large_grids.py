@@ -116,21 +116,21 @@ def test_compiled_marches_reach_the_last_slot(
     rays = some_rays(40) if grid.contracted else random_rays(40)
     got, expected = compiled.march(grid, *rays, k), plain.march(grid, *rays, k)
     assert len(expected.hits) > 20 and np.abs(expected.features).max() > 20
-    np.testing.assert_array_equal(got.n_samples, expected.n_samples)
+    np.testing.assert_array_equal(got.n_density_samples, expected.n_density_samples)
     np.testing.assert_array_equal(got.hits, expected.hits)
     np.testing.assert_allclose(got.opacity, expected.opacity, rtol=0, atol=5e-6)
     np.testing.assert_allclose(got.depth, expected.depth, rtol=0, atol=1e-5)
     np.testing.assert_allclose(got.features, expected.features, rtol=0, atol=5e-4)
 
 
-@pytest.mark.parametrize("n_samples", [2**31, 10**30])
+@pytest.mark.parametrize("n_fetches", [2**31, 10**30])
 @pytest.mark.parametrize("module", [march_compiled, contracted_march_compiled], ids=["box", "space"])
-def test_no_number_of_fetches_is_too_large(module: ModuleType, n_samples: int, zeros: Zeros) -> None:
+def test_no_number_of_fetches_is_too_large(module: ModuleType, n_fetches: int, zeros: Zeros) -> None:
     """Nothing is allocated or addressed by it beyond the samples that a ray can have."""
     grid = grid_behind(zeros, 8, 5000, contracted=module is contracted_march_compiled)
     rays = some_rays(40) if grid.contracted else random_rays(40)
     np.testing.assert_array_equal(
-        module.march(grid, *rays, n_samples).features, module.march(grid, *rays, 0).features
+        module.march(grid, *rays, n_fetches).features, module.march(grid, *rays, 0).features
     )
 
 

@@ -100,7 +100,7 @@ def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
     step = float(grid.step)
     near, far = np.zeros(400, np.float32), np.full(400, 0.75 * step, np.float32)
     result = module.march(grid, rays_o, np.tile(d, (400, 1)), 0, (near, far))
-    assert result.n_samples.tolist() == [1] * 400
+    assert result.n_density_samples.tolist() == [1] * 400
     sigma = -np.log1p(-result.opacity.astype(np.float64)) / step
     code = (np.log(sigma) + 4) * 255 / 9
     at = rays_o[:, axis].astype(np.float64) * resolution / 2 + resolution / 2
@@ -219,7 +219,7 @@ def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleTyp
 
     a = module.march(grids[0], rays_o, rays_d, 5)
     b = module.march(grids[1], turn(rays_o), turn(rays_d), 5)
-    same = a.n_samples == b.n_samples
+    same = a.n_density_samples == b.n_density_samples
     assert same.mean() > 0.99, "a sample within rounding of a cell's border may fall to either side"
     np.testing.assert_allclose(a.opacity[same], b.opacity[same], rtol=0, atol=2e-5)
     np.testing.assert_allclose(a.depth[same], b.depth[same], rtol=0, atol=2e-4)

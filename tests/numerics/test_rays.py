@@ -82,7 +82,7 @@ def test_entry_and_exit_are_the_fractions(name: str, module: ModuleType) -> None
         place = o[0].astype(np.float64) + float(wanted[0]) * d[0].astype(np.float64)
         np.testing.assert_allclose(entries.point[:, 0], (place + 1) * 8, rtol=0, atol=16 * rounding)
     assert ((entries.point >= 0) & (entries.point <= 16)).all()
-    taken = int(module.march(THIN, o, d, 5).n_samples[0])
+    taken = int(module.march(THIN, o, d, 5).n_density_samples[0])
     # where the lattice ends within rounding of the exit one sample more or less is met
     assert abs(taken - length / float(THIN.step)) <= 1 + 2 * rounding / float(THIN.step)
     assert taken <= most_samples(float(THIN.step))
@@ -104,9 +104,9 @@ def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tupl
         # a direction of 1e-30 along an axis meets its faces within rounding of 1e-6 / 1e-30: all or nothing
         clear = all(abs(abs(x) - 1) > 1e-5 for x in o)
         if clear:
-            assert abs(int(result.n_samples[0]) - length / float(THIN.step)) <= 1.01
+            assert abs(int(result.n_density_samples[0]) - length / float(THIN.step)) <= 1.01
         assert np.isfinite(result.opacity).all() and np.isfinite(result.depth).all()
-        assert int(result.n_samples[0]) <= most_samples(float(THIN.step))
+        assert int(result.n_density_samples[0]) <= most_samples(float(THIN.step))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -117,7 +117,7 @@ def test_directions_that_are_not_unit_end_all_the_same(module: ModuleType, size:
     rays_d = (np.float32([[1, 0, 0], [1, 0, 0], [0.6, 0.8, 0]]) * np.float64(size)).astype(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         result = module.march(THIN, rays_o, rays_d, 5)
-    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
     assert np.isfinite(result.opacity).all()
 
 
@@ -132,7 +132,7 @@ def test_rays_that_are_no_numbers_end_and_spoil_no_other(module: ModuleType, bad
     alone = module.march(THIN, *good, 5)
     for ray in (0, 3):
         assert result.opacity[ray] == alone.opacity[0] and result.depth[ray] == alone.depth[0]
-    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
 
 
 @pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
@@ -145,7 +145,7 @@ def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: Mod
     rays_o = (np.full((200, 3), -far * unit) + offsets).astype(np.float32)
     rays_d = np.full((200, 3), unit, np.float32)
     result = module.march(THIN, rays_o, rays_d, 5)
-    assert (result.n_samples <= most_samples(float(THIN.step))).all()
+    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
     assert np.isfinite(result.features).all()
 
 
@@ -170,7 +170,7 @@ def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pyt
 @pytest.mark.parametrize("module", MARCHES)
 def test_an_empty_box_is_left_in_a_few_jumps(module: ModuleType) -> None:
     result = module.march(fog(1e-6, step=2 / 20000), np.float32([[-3, 5, 0]]), np.float32([[1, 0, 0]]), 5)
-    assert result.n_samples.tolist() == [0] and not result.opacity.any()
+    assert result.n_density_samples.tolist() == [0] and not result.opacity.any()
 
 
 @pytest.mark.parametrize("aabb", [((0, 0, 0), (0, 1, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, 1, 2e9))])

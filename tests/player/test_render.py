@@ -57,7 +57,7 @@ def test_the_picture_shows_something(asset: Asset, camera: Camera) -> None:
     frame = render(asset, camera)
     assert 0.2 < (frame.opacity > 0.5).mean() < 0.8
     assert frame.rgb.dtype == frame.opacity.dtype == frame.depth.dtype == np.float32
-    assert frame.rgb.shape == (40, 48, 3) and frame.opacity.shape == frame.n_samples.shape == (40, 48)
+    assert frame.rgb.shape == (40, 48, 3) and frame.opacity.shape == frame.n_density_samples.shape == (40, 48)
 
 
 @pytest.mark.parametrize("module", ["numpy", pytest.param("numba", marks=pytest.mark.extra)])
@@ -70,7 +70,7 @@ def test_threads_and_tasks_do_not_change_a_bit(
         with Renderer(asset, n_threads, module) as renderer:  # type: ignore[arg-type]
             frames.append(renderer.render(camera.resized(101, 83)))
     for frame in frames[1:]:
-        for name in ("rgb", "opacity", "depth", "n_samples"):
+        for name in ("rgb", "opacity", "depth", "n_density_samples"):
             assert getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes(), name
 
 
@@ -118,9 +118,9 @@ def test_transparent_is_straight_and_composites_to_the_same(asset: Asset, camera
 
 
 def test_default_background_and_k_are_the_assets_own(asset: Asset, camera: Camera) -> None:
-    a, b = render(asset, camera), render(asset, camera, n_samples=5, background=(1.0, 1.0, 1.0))
+    a, b = render(asset, camera), render(asset, camera, n_fetches=5, background=(1.0, 1.0, 1.0))
     assert a.rgb.tobytes() == b.rgb.tobytes()
-    every = render(asset, camera, n_samples=0)
+    every = render(asset, camera, n_fetches=0)
     assert every.opacity.tobytes() == a.opacity.tobytes() and every.rgb.tobytes() != a.rgb.tobytes()
 
 
@@ -141,7 +141,7 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
     with pytest.raises(ConfigError, match=rf"size: expected at most {MAX_PIXELS} pixels .* got 20000x20000"):
         render(asset, camera.resized(20000, 20000))
     with pytest.raises(ConfigError, match="samples: expected 0"):
-        render(asset, camera, n_samples=-1)
+        render(asset, camera, n_fetches=-1)
     with pytest.raises(ConfigError, match="threads: expected at least 1, got 0"):
         Renderer(asset, 0)
     monkeypatch.setattr("player.compiled.compiling.numba", None)

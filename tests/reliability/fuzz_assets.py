@@ -111,8 +111,8 @@ def play(asset: Asset) -> None:
     """A small picture by every march. Raises AssertionError for what is no picture."""
     for march in MARCHES:
         with Renderer(asset, 1, march) as renderer:
-            for n_samples in (None, 0):
-                frame = renderer.render(small_view().transformed(asset.world_from_model), n_samples)
+            for n_fetches in (None, 0):
+                frame = renderer.render(small_view().transformed(asset.world_from_model), n_fetches)
                 assert np.isfinite(frame.rgb).all() and np.isfinite(frame.depth).all(), "not finite"
                 assert ((frame.opacity >= 0) & (frame.opacity <= 1)).all(), "opacity beyond 0..1"
 

@@ -102,7 +102,7 @@ class _Bake:
         self.seconds: dict[str, float] = {}
         self.left_out: dict[str, str] = {}
         self.lookups: dict[str, float] = {}
-        self.n_samples = self.choice.n_samples
+        self.n_fetches = self.choice.n_fetches
         self.plan = make_plan(model, config)
         self.n_rays: int
         self._report = report
@@ -120,7 +120,7 @@ class _Bake:
         tuning = Tuning(self.model, self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, taught)
-        self.n_samples, self.lookups = tuning.n_samples, tuning.lookups
+        self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
         arrays = layout.arrays(stored.density, stored.features)
@@ -268,7 +268,7 @@ class _Bake:
             n_channels=n_channels,
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
-            n_samples=self.n_samples,
+            n_samples=self.n_fetches,
             background=tuple(model.background.tolist()),
             provenance={
                 "bake": asdict(self.config) | asdict(self.choice),
@@ -282,7 +282,7 @@ class _Bake:
         """Play the written files; raises TrainingError where they miss what was asked."""
         asset = Asset.open(folder, verify=True)
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
-        last = self.held_out.measure("files", asset.grid, head, self.n_samples)
+        last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
         n_bytes = file_sizes(folder)
         if last.loss_db > PLAYS_NOTHING:
             raise TrainingError(
@@ -293,7 +293,7 @@ class _Bake:
         megabytes = sum(n_bytes.values()) / 1e6
         ms = None
         if self.config.target_ms is not None:
-            ms = frame_ms(asset, self.model.cameras[0], self.n_samples)
+            ms = frame_ms(asset, self.model.cameras[0], self.n_fetches)
         check_budget(self.config, last.loss_db, megabytes, ms)
         missed = []
         if last.loss_db > self.choice.target_loss_db:

@@ -147,14 +147,14 @@ def teach(
 
 
 def collect_lessons(
-    taught: Taught, grid: SparseGrid, n_samples: int, densities: VertexRows | None = None
+    taught: Taught, grid: SparseGrid, n_fetches: int, densities: VertexRows | None = None
 ) -> Lessons:
     """Lessons from those rays that meet something in the grid.
 
     Args:
         taught: the rays.
         grid: as the player has it.
-        n_samples: the player's k, 0 for every sample.
+        n_fetches: the player's k, 0 for every sample.
         densities: rows of the stored densities, at every sample: for densities that learn.
 
     Raises TrainingError where no ray meets anything.
@@ -162,7 +162,7 @@ def collect_lessons(
     parts = []
     for first in range(0, len(taught.opacity), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_samples)
+        hits, opacity, fetches = player_fetches(grid, taught.rays_o[rows], taught.rays_d[rows], n_fetches)
         of_hits = (column[rows][hits] for column in (taught.rays_d, taught.colours, taught.opacity))
         dirs, colours, full_opacity = of_hits
         parts.append((*fetches, dirs, opacity, colours, full_opacity))
@@ -176,7 +176,7 @@ def collect_lessons(
 
 
 def player_fetches(
-    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_samples: int
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """Where the player fetches features on the rays that hit, and how much each fetch weighs, as
     `player.march.march` composes them.
@@ -190,12 +190,12 @@ def player_fetches(
     is_hit = np.zeros(len(opacity), bool)
     is_hit[hits] = True
     counts = np.bincount(samples.ray, minlength=len(opacity))
-    merged = is_hit[samples.ray] & (counts[samples.ray] > n_samples) & (n_samples > 0)
+    merged = is_hit[samples.ray] & (counts[samples.ray] > n_fetches) & (n_fetches > 0)
     own = Samples(*(column[is_hit[samples.ray] & ~merged] for column in samples))
     ray, s, weights = own
     if merged.any():
         many = Samples(*(column[merged] for column in samples))
-        bins = equal_mass_bins(many, n_samples)
+        bins = equal_mass_bins(many, n_fetches)
         places = bins.s.copy()
         points = np.ascontiguousarray(entries.at(bins.ray, places).T)
         gaps = np.flatnonzero(~corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
@@ -203,7 +203,7 @@ def player_fetches(
             places[gaps] = many.s[heaviest(bins, gaps)]
         ray = np.concatenate([ray, bins.ray])
         s = np.concatenate([s, places])
-        weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_samples)])
+        weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_fetches)])
         order = np.argsort(ray, kind="stable")
         ray, s, weights = ray[order], s[order], weights[order]
     counts = np.bincount(ray, minlength=len(opacity))[hits]

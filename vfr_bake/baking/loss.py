@@ -104,13 +104,13 @@ class HeldOut:
         off = self._opacity * (mean - own)
         return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
 
-    def march(self, grid: SparseGrid, n_samples: int) -> MarchResult:
+    def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the rays compose as played."""
-        return choose_march("auto", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_samples)
+        return choose_march("auto", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_fetches)
 
-    def measure(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
+    def measure(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""
-        return self.measure_march(name, self.march(grid, n_samples), head)
+        return self.measure_march(name, self.march(grid, n_fetches), head)
 
     def measure_march(self, name: str, played: MarchResult, head: Head) -> Stage:
         """Show what was composed, and keep the result under `name`."""
@@ -118,15 +118,15 @@ class HeldOut:
         self.stages.append(stage)
         return stage
 
-    def look(self, name: str, grid: SparseGrid, head: Head, n_samples: int) -> Stage:
+    def look(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, without keeping the result."""
-        return self._stage(name, self.march(grid, n_samples), head)
+        return self._stage(name, self.march(grid, n_fetches), head)
 
     def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
         rgb = (1 - played.opacity[:, None]) * self.background
         hits = played.hits
         rgb[hits] += head(played.features, self.rays_d[hits]) * played.opacity[hits, None]
-        samples = played.n_samples[hits]
+        samples = played.n_density_samples[hits]
         error = float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
         return Stage(
             name,

@@ -34,13 +34,13 @@ Measure = Callable[[int, int], float]
 """Milliseconds of a frame by (head's width, 0 the model's own; lookups a ray, 0 all)."""
 
 
-def frame_ms(asset: Asset, camera: Camera, n_samples: int) -> float:
+def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:
     """Milliseconds of a frame of SIZE x SIZE seen by `camera` (WORLD frame), as the player plays it here."""
     times = []
     with Renderer(asset) as renderer:
         for _ in range(N_FRAMES + 1):
             begin = time.perf_counter()
-            renderer.render(camera.resized(SIZE, SIZE), n_samples)
+            renderer.render(camera.resized(SIZE, SIZE), n_fetches)
             times.append(1000 * (time.perf_counter() - begin))
     return float(np.median(times[1:]))
 
@@ -50,10 +50,10 @@ def measured_in_memory(
 ) -> Measure:
     """How long an asset that is not written yet would take; `head` gives `head.onnx` by its width."""
 
-    def measure(width: int, n_samples: int) -> float:
+    def measure(width: int, n_fetches: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
             asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head(width)})
-            return frame_ms(asset, camera, n_samples)
+            return frame_ms(asset, camera, n_fetches)
 
     return measure
 
@@ -68,19 +68,19 @@ def keep_to_time(
 
     >>> from vfr_bake.baking.presets import PRESETS
     >>> chosen = keep_to_time(PRESETS["balanced"], 100, lambda width, k: width + 6 * k, False, False)
-    >>> chosen.head_width, chosen.n_samples
+    >>> chosen.head_width, chosen.n_fetches
     (64, 4)
     """
-    fewest = choice.n_samples if same_lookups else min(LOOKUPS)
+    fewest = choice.n_fetches if same_lookups else min(LOOKUPS)
     least = np.inf
     for width in (choice.head_width,) if same_head else _widths(choice.head_width):
         took = measure(width, fewest)
         least = min(least, took)
         if took > RESERVE * target_ms:
             continue
-        for k in (fewest,) if same_lookups else _most_first(choice.n_samples):
+        for k in (fewest,) if same_lookups else _most_first(choice.n_fetches):
             if k == fewest or measure(width, k) <= RESERVE * target_ms:
-                return replace(choice, head_width=width, n_samples=k)
+                return replace(choice, head_width=width, n_fetches=k)
     raise TrainingError(
         f"bake: time: expected a frame of {SIZE} x {SIZE} in at most {target_ms:g} ms, got {least:.0f} ms "
         "with the fewest lookups and the smallest head: nothing was written: allow more, or lower "

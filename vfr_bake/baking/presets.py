@@ -27,7 +27,7 @@ class BakeChoice:
     """Most feature channels."""
     channel_loss_db: float
     """Fewer channels are taken where they lose no more than this, before refinement, dB."""
-    n_samples: int
+    n_fetches: int
     """Most feature lookups per ray, k; 0 for every sample."""
     sample_loss_db: float
     """Fewer are taken where they lose no more than this, dB."""
@@ -51,19 +51,19 @@ class BakeChoice:
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=1.95, contracted_resolution=1152, feature_share=0.68, culled_loss_db=0.02,
-        n_channels=22, channel_loss_db=0.03, n_samples=16, sample_loss_db=0.005, code_levels=127,
+        n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005, code_levels=127,
         head_width=0, head_layers=3, head_bands=4, head_bits=8, refine_steps=600,
         minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=1088, feature_share=0.71, culled_loss_db=0.04,
-        n_channels=16, channel_loss_db=0.15, n_samples=12, sample_loss_db=0.05, code_levels=64,
+        n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05, code_levels=64,
         head_width=64, head_layers=3, head_bands=4, head_bits=8, refine_steps=4000,
         minutes=8, mesh_resolution=128, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
-        n_channels=12, channel_loss_db=0.5, n_samples=4, sample_loss_db=0.15, code_levels=50,
+        n_channels=12, channel_loss_db=0.5, n_fetches=4, sample_loss_db=0.15, code_levels=50,
         head_width=32, head_layers=1, head_bands=3, head_bits=8, refine_steps=5000,
         minutes=8, mesh_resolution=112, target_loss_db=1.0,
     ),

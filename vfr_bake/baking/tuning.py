@@ -52,7 +52,7 @@ class Tuning:
         seconds: float,
     ) -> None:
         """`seconds`: what all rounds may take, if the number of their steps was not asked for."""
-        self.n_samples = choice.n_samples
+        self.n_fetches = choice.n_fetches
         """Lookups a ray, 0 for all."""
         self.ranges: tuple[Range, ...] | None = None
         """Of the head's activations, if it multiplies in 8 bits."""
@@ -97,14 +97,14 @@ class Tuning:
             del grid
             grid = layout.grid(stored.density, stored.features)
         before = self._choose_lookups_and_bits(stored, grid, taught)
-        if self.n_samples:
-            lessons = collect_lessons(taught, grid, self.n_samples)
+        if self.n_fetches:
+            lessons = collect_lessons(taught, grid, self.n_fetches)
             rates = head_rate * AT_K[choice.head_width > 0], code_rate / 2  # what is left to learn is little
             with self._steps("refinement at k", choice.refine_steps) as steps:
                 tuned = refine(stored, lessons, steps, *rates, ranges=self.ranges)
             played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
             head = runner(tuned.head, self.ranges)
-            after = self._held_out.measure("refined at k", grid, head, self.n_samples)
+            after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
             if self._gained("refinement at k", before, after):
                 return tuned
             stored.features[:] = played
@@ -145,9 +145,9 @@ class Tuning:
         before = self._choose_lookups(grid, stored.head)
         if self._choice.head_bits == 32:
             return before
-        lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_samples)
+        lessons = collect_lessons(taught.some(N_CALIBRATION), grid, self.n_fetches)
         ranges = activation_ranges(stored.head, lessons.composed(stored.features), lessons.dirs)
-        after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_samples)
+        after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_fetches)
         lost = after.loss_db - before.loss_db
         if lost * ROUNDING_LEFT > self._choice.target_loss_db:
             self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost:.3f} dB"
@@ -157,17 +157,17 @@ class Tuning:
         return after
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
-        """Set `n_samples` to what was asked for, or the fewest that lose no more than the preset allows; what
+        """Set `n_fetches` to what was asked for, or the fewest that lose no more than the preset allows; what
         each number loses is kept in `lookups`. Returns how it looks with them."""
-        most = self._choice.n_samples
+        most = self._choice.n_fetches
         if self._config.k == "auto":
             every = self._held_out.look("all", grid, runner(head), 0).loss_db
             for k in (*(k for k in LOOKUPS if k < most), most):
-                self.n_samples = k
+                self.n_fetches = k
                 self.lookups[str(k)] = self._held_out.look(str(k), grid, runner(head), k).loss_db - every
                 if self.lookups[str(k)] <= self._choice.sample_loss_db:
                     break
-        if not self.n_samples:
+        if not self.n_fetches:
             return self._held_out.look("all", grid, runner(head), 0)
-        self.left_out["lookups"] = f"all but {self.n_samples} of a ray; the loss that 'k' adds"
-        return self._held_out.measure("k", grid, runner(head), self.n_samples)
+        self.left_out["lookups"] = f"all but {self.n_fetches} of a ray; the loss that 'k' adds"
+        return self._held_out.measure("k", grid, runner(head), self.n_fetches)

@@ -155,7 +155,7 @@ def _where(name: str, wanted: np.ndarray, played: np.ndarray, worst: list[WorstP
             " ".join(f"{c:.2f}" for c in colour) for colour in (pixel.wanted, pixel.played)
         )
         cells = [pixel.view, f"{pixel.column}, {pixel.row}", f"{pixel.error:.2f}", wanted_rgb, played_rgb]
-        rows.append(_row([*cells, str(pixel.n_samples), f"{pixel.opacity:.3f}", weights], False))
+        rows.append(_row([*cells, str(pixel.n_density_samples), f"{pixel.opacity:.3f}", weights], False))
     return (
         f'<p>{escape(name)}<br><img alt="{escape(name)}" src="data:image/png;base64,{data}"></p>'
         f"<table>{''.join(rows)}</table>"

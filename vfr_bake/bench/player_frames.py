@@ -40,7 +40,7 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
         passed = time.perf_counter() - start
         if request["rgb"] is not None:
             np.save(request["rgb"], frame.rgb)
-        taken = frame.n_samples[frame.opacity > MIN_OPACITY]
+        taken = frame.n_density_samples[frame.opacity > MIN_OPACITY]
         fetches = np.minimum(taken, request["samples"] or taken)
         return {
             "ms": 1000 * passed,

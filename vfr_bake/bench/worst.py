@@ -29,7 +29,7 @@ class WorstPixel:
     """Largest difference of the three channels, 0..1."""
     wanted: tuple[float, ...]
     played: tuple[float, ...]
-    n_samples: int
+    n_density_samples: int
     """Density samples with weight."""
     opacity: float
     weights: tuple[tuple[float, float], ...]

@@ -84,7 +84,7 @@ def test_what_the_channels_mean(frame: Frame, camera: Camera, opened: Asset) -> 
     # the player's distances, in world units: the asset's ball has its middle at (1, 2, 3) and a radius of 2
     assert np.array_equal(channels["distance.V"][met], frame.depth[met])
     assert np.linalg.norm(position[met] - [1, 2, 3], axis=-1).max() < 2 * 1.1
-    assert np.array_equal(channels["samples.V"], frame.n_samples)
+    assert np.array_equal(channels["samples.V"], frame.n_density_samples)
 
 
 def test_header_projects_positions_onto_their_pixels(frame: Frame, camera: Camera, tmp_path: Path) -> None:
@@ -182,7 +182,9 @@ def test_what_a_full_disk_and_no_openexr_say(
     with pytest.raises(OutputError, match="cannot write"):
         write_exr(tmp_path / "no" / "a.exr", channels, header)
     with pytest.raises(ShapeError, match="over no background and with layers"):
-        exr_channels(Frame(frame.rgb, frame.opacity, frame.depth, frame.n_samples, "transparent"), camera)
+        exr_channels(
+            Frame(frame.rgb, frame.opacity, frame.depth, frame.n_density_samples, "transparent"), camera
+        )
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(MissingExtraError, match=r"needs OpenEXR: pip install 'vfr-bake\[export\]'"):
         write_exr(tmp_path / "a.exr", channels, header)

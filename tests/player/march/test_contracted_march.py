@@ -48,7 +48,7 @@ def test_march_is_that_of_a_loop_that_skips_nothing(module: ModuleType) -> None:
     hit = np.isin(np.arange(len(rays_o)), result.hits)
     for index, (o, d) in enumerate(zip(rays_o, rays_d, strict=True)):
         opacity, depth, taken, composed = naive(grid, codes, o, d)
-        assert result.n_samples[index] == taken
+        assert result.n_density_samples[index] == taken
         assert result.opacity[index] == pytest.approx(opacity, abs=2e-6)
         assert result.depth[index] == pytest.approx(depth, rel=1e-3, abs=1e-5)
         np.testing.assert_allclose(features[index], composed * hit[index], rtol=0, atol=2e-2)
@@ -74,7 +74,7 @@ def test_the_compiled_march_does_the_same(k: int) -> None:
     grid = contracted_grid(bumps, shells)
     rays = some_rays(2000)
     a, b = (module.march(grid, *rays, k) for module in MODULES)
-    np.testing.assert_array_equal(a.n_samples, b.n_samples)
+    np.testing.assert_array_equal(a.n_density_samples, b.n_density_samples)
     np.testing.assert_array_equal(a.hits, b.hits)
     np.testing.assert_allclose(a.opacity, b.opacity, rtol=0, atol=1e-6)
     np.testing.assert_allclose(a.depth, b.depth, rtol=1e-3)
@@ -134,7 +134,7 @@ def test_the_border_of_space_belongs_to_the_last_cells(module: ModuleType, dista
     result = module.march(grid, rays_o, rays_d, 3)
     for index, (o, d) in enumerate(zip(rays_o, rays_d, strict=True)):
         opacity, _, taken, _ = naive(grid, codes, o, d)
-        assert result.n_samples[index] == taken
+        assert result.n_density_samples[index] == taken
         assert result.opacity[index] == pytest.approx(opacity, abs=2e-6)
     assert (result.opacity > 0.99).sum() > 20
 

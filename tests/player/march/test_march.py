@@ -73,7 +73,7 @@ def test_march_is_the_naive_loop(
     result = module.march(asset.grid, *rays, k)
     expected = [march_ray(scene, o, d, k) for o, d in zip(*rays, strict=True)]
     assert result.opacity.dtype == result.depth.dtype == result.features.dtype == np.float32
-    assert result.n_samples.tolist() == [ray.taken for ray in expected]
+    assert result.n_density_samples.tolist() == [ray.taken for ray in expected]
     np.testing.assert_allclose(result.opacity, [ray.opacity for ray in expected], rtol=0, atol=OPACITY)
     scale = np.maximum(1, np.linalg.norm(rays[0], axis=1))
     assert (np.abs(result.depth - [ray.depth for ray in expected]) <= DEPTH * scale).all()
@@ -99,7 +99,7 @@ def test_march_through_a_box_of_three_different_edges(module: ModuleType, k: int
     result = module.march(grid, rays_o, rays_d, k)
     other = replace(scene, aabb=box)
     expected = [march_ray(other, o, d, k) for o, d in zip(rays_o, rays_d, strict=True)]
-    assert result.n_samples.tolist() == [ray.taken for ray in expected] and len(result.hits) > 30
+    assert result.n_density_samples.tolist() == [ray.taken for ray in expected] and len(result.hits) > 30
     np.testing.assert_allclose(result.opacity, [ray.opacity for ray in expected], rtol=0, atol=OPACITY)
     np.testing.assert_allclose(result.depth, [ray.depth for ray in expected], rtol=0, atol=4 * DEPTH)
     features = np.array([expected[i].features for i in result.hits])
@@ -122,7 +122,7 @@ def test_numba_is_numpy_on_many_rays(asset: Asset) -> None:
     rays = random_rays(20_000, seed=1)
     for k in (0, 5):
         a, b = march.march(asset.grid, *rays, k), march_compiled.march(asset.grid, *rays, k)
-        same = a.n_samples == b.n_samples
+        same = a.n_density_samples == b.n_density_samples
         assert (~same).sum() <= 2, "only a tau within rounding of the threshold may stop a sample later"
         np.testing.assert_allclose(a.opacity[same], b.opacity[same], rtol=0, atol=OPACITY)
         assert (a.hits == b.hits).all()
@@ -142,7 +142,7 @@ def test_opacity_does_not_depend_on_k(module: ModuleType, asset: Asset) -> None:
 def test_k_over_the_number_of_samples_is_all_samples(module: ModuleType, asset: Asset) -> None:
     rays = random_rays(3000, seed=3)
     every, many = (module.march(asset.grid, *rays, k) for k in (0, 1000))
-    assert every.n_samples.max() < 1000
+    assert every.n_density_samples.max() < 1000
     assert (every.features == many.features).all()
 
 

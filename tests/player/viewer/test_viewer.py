@@ -91,7 +91,7 @@ def test_layers_show_what_they_say(asset: Asset) -> None:
     # lightness falls with depth and rises with the number of samples
     light = {name: picture.astype(float) @ [0.2, 0.7, 0.1] for name, picture in pictures.items()}
     assert np.corrcoef(light["depth"][met], frame.depth[met])[0, 1] < -0.9
-    assert np.corrcoef(light["samples"].ravel(), frame.n_samples.ravel())[0, 1] > 0.9
+    assert np.corrcoef(light["samples"].ravel(), frame.n_density_samples.ravel())[0, 1] > 0.9
 
 
 def test_layers_of_an_empty_picture(asset: Asset) -> None:

@@ -99,7 +99,7 @@ def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Pa
     settings = BakeConfig(resolution=96, mesh_resolution=16, refine_steps=0, check_views=1)
     bake(model, tmp_path / "asset", settings, quiet)
     large = camera.resized(256, 256)
-    played = render(Asset.open(tmp_path / "asset"), large, n_samples=0)
+    played = render(Asset.open(tmp_path / "asset"), large, n_fetches=0)
     _, opacity, _ = model.occupancy.composited_features(model.field, *in_model.resized(256, 256).rays())
     solid = opacity.reshape(256, 256) > 0.95
     assert solid.mean() > 0.1
@@ -205,14 +205,14 @@ def test_a_round_takes_fewer_steps_where_there_is_no_time(monkeypatch: pytest.Mo
     assert len(list(hasty)) == N_WARM + N_TIMED
 
 
-@pytest.mark.parametrize("n_samples", [0, 1, 3, 5])
-def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path, n_samples: int) -> None:
+@pytest.mark.parametrize("n_fetches", [0, 1, 3, 5])
+def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path, n_fetches: int) -> None:
     settings = BakeConfig(resolution=48, mesh_resolution=16, refine_steps=0, check_views=1)
     bake(model, tmp_path / "asset", settings, quiet)
     grid = Asset.open(tmp_path / "asset").grid
     rays_o, rays_d = model.model_cameras()[3].rays()
-    played = march(grid, rays_o, rays_d, n_samples)
-    hits, opacity, fetches = player_fetches(grid, rays_o, rays_d, n_samples)
+    played = march(grid, rays_o, rays_d, n_fetches)
+    hits, opacity, fetches = player_fetches(grid, rays_o, rays_d, n_fetches)
     counts, points, weights, lengths = fetches
     assert np.array_equal(hits, played.hits) and len(hits) > 100
     np.testing.assert_array_equal(opacity, played.opacity[hits])
@@ -242,9 +242,9 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     assert asset.manifest.n_channels == 16 and result.n_vertices == len(asset.arrays.density)
     camera, in_model = model.cameras[5], model.model_cameras()[5]
     full = render_image(model.field, model.occupancy, in_model, model.background)
-    every = psnr(render(asset, camera, n_samples=0).rgb, full)
-    five = psnr(render(asset, camera, n_samples=5).rgb, full)
-    one = psnr(render(asset, camera, n_samples=1).rgb, full)
+    every = psnr(render(asset, camera, n_fetches=0).rgb, full)
+    five = psnr(render(asset, camera, n_fetches=5).rgb, full)
+    one = psnr(render(asset, camera, n_fetches=1).rgb, full)
     assert every > 35 and five > 32, "the grid, the codes and the choice of samples lose little"
     assert one < five <= every + 0.5
     assert result.figures["psnr_to_full_model"] > 32

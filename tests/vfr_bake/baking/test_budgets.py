@@ -38,23 +38,23 @@ def took(width: int, k: int) -> float:
 
 
 def test_the_head_gives_before_the_lookups_do() -> None:
-    balanced = replace(PRESETS["balanced"], n_samples=8)
+    balanced = replace(PRESETS["balanced"], n_fetches=8)
     assert keep_to_time(balanced, 1000, took, False, False) == balanced
     fewer = keep_to_time(balanced, 120, took, False, False)
-    assert (fewer.head_width, fewer.n_samples) == (64, 4)
+    assert (fewer.head_width, fewer.n_fetches) == (64, 4)
     narrow = keep_to_time(balanced, 70, took, False, False)
-    assert (narrow.head_width, narrow.n_samples) == (48, 1)
-    own = replace(balanced, head_width=0, n_samples=0)
+    assert (narrow.head_width, narrow.n_fetches) == (48, 1)
+    own = replace(balanced, head_width=0, n_fetches=0)
     assert keep_to_time(own, 1000, took, False, False) == own
-    assert keep_to_time(own, 400, took, False, False).n_samples == 8
+    assert keep_to_time(own, 400, took, False, False).n_fetches == 8
 
 
 def test_what_was_asked_for_by_number_stays() -> None:
-    balanced = replace(PRESETS["balanced"], n_samples=8)
+    balanced = replace(PRESETS["balanced"], n_fetches=8)
     same_k = keep_to_time(balanced, 140, took, False, True)
-    assert (same_k.head_width, same_k.n_samples) == (32, 8)
+    assert (same_k.head_width, same_k.n_fetches) == (32, 8)
     same_head = keep_to_time(balanced, 120, took, True, False)
-    assert (same_head.head_width, same_head.n_samples) == (64, 4)
+    assert (same_head.head_width, same_head.n_fetches) == (64, 4)
     with pytest.raises(TrainingError, match=r"at most 70 ms, got 74 ms .* nothing was written"):
         keep_to_time(balanced, 70, took, True, False)
 

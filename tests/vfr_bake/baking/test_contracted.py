@@ -145,7 +145,7 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
     """Before refinement, which looks at colours alone."""
     bake(model, tmp_path / "asset", replace(SETTINGS, refine_steps=0), quiet)
     asset, camera = Asset.open(tmp_path / "asset"), model.model_cameras()[2]
-    frame = render(asset, model.cameras[2], n_samples=0)
+    frame = render(asset, model.cameras[2], n_fetches=0)
     found, wanted = frame.depth.reshape(-1) / asset.scale, depth_at_the_mean_angle(model, asset, camera)
     solid = (frame.opacity.reshape(-1) > 0.99) & (wanted < 3)
     assert solid.sum() > 100

@@ -26,21 +26,21 @@ def test_rays_that_meet_nothing_teach_nothing(n_rays: int) -> None:
         collect_lessons(taught([PAST] * n_rays), fog(0.1), 0)
 
 
-@pytest.mark.parametrize("n_samples", [0, 1, 4])
+@pytest.mark.parametrize("n_fetches", [0, 1, 4])
 @pytest.mark.parametrize("at_once", [1, 2, 100])
 def test_lessons_are_those_of_the_rays_that_meet_something(
-    n_samples: int, at_once: int, monkeypatch: pytest.MonkeyPatch
+    n_fetches: int, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In their order, however many rays are looked at together; the fog's one feature composes to its own
     value times the opacity."""
     monkeypatch.setattr("vfr_bake.baking.lessons.RAYS_AT_ONCE", at_once)
     rays = taught([PAST, ALONG, PAST, PAST, ALONG, ALONG])
     grid = fog(0.1)
-    lessons = collect_lessons(rays, grid, n_samples)
+    lessons = collect_lessons(rays, grid, n_fetches)
     assert len(lessons) == 3 and np.array_equal(lessons.colours, rays.colours[[1, 4, 5]])
     counts = np.diff(lessons.starts)
-    assert (counts == n_samples).all() if n_samples else (counts > 60).all()
+    assert (counts == n_fetches).all() if n_fetches else (counts > 60).all()
     composed = lessons.composed(grid.features.astype(np.float32))
     np.testing.assert_allclose(composed[:, 0], FEATURE * lessons.opacity, rtol=1e-5)
-    one = collect_lessons(taught([ALONG]), grid, n_samples)
+    one = collect_lessons(taught([ALONG]), grid, n_fetches)
     assert len(one) == 1 and np.array_equal(one.composed(grid.features.astype(np.float32)), composed[:1])

@@ -43,7 +43,7 @@ def data(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         named = [replace(camera, name=f"./{split}/r_{i}") for i, camera in enumerate(some)]
         (folder / split).mkdir()
         for camera in named:
-            frame = render(asset, camera, n_samples=0, march="numba")
+            frame = render(asset, camera, n_fetches=0, march="numba")
             Image.fromarray(frame.to_uint8()).convert("RGBA").save(folder / f"{camera.name}.png")
         (folder / f"transforms_{split}.json").write_bytes(write_cameras(named))
     return folder
@@ -275,7 +275,7 @@ def test_worst_pixels_are_those_that_were_spoiled(shells_folder: Path) -> None:
     assert first.error == pytest.approx(0.5, abs=1e-6)
     assert (second.view, second.column, second.row) == (cameras[0].name, 2, 3)
     assert first.opacity == pytest.approx(frames[1].opacity[20, 24], abs=1e-6)
-    assert first.n_samples <= frames[1].n_samples[20, 24]
+    assert first.n_density_samples <= frames[1].n_density_samples[20, 24]
     weights = [weight for _, weight in first.weights]
     assert weights == sorted(weights, reverse=True) and sum(weights) <= first.opacity + 1e-5
     t = [t for t, _ in first.weights]
@@ -319,7 +319,7 @@ def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> 
     worst, *_ = worst_pixels(walls, [camera], [wanted], [frame.rgb])
     assert (worst.column, worst.row) == (7, 5)
     assert worst.opacity == pytest.approx(frame.opacity[5, 7], abs=1e-6) and worst.opacity > 0.9
-    assert worst.n_samples == frame.n_samples[5, 7]
+    assert worst.n_density_samples == frame.n_density_samples[5, 7]
     heaviest, _ = worst.weights[0]
     # A cell is 1/12 in contracted space, there 1/r^2 of a unit of the way: 64/12 model units at 8.
     assert heaviest == pytest.approx(2 * 8, abs=2 * 64 / 12)
