@@ -88,7 +88,7 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 
 fuzz: $(VENV)/.dev  ## a million broken inputs to every reader, a tenth of that to the viewer
 	$(BIN)/python -m tests.reliability.fuzz --inputs 1000000
-	$(BIN)/python -m tests.reliability.fuzz_viewer --inputs 100000
+	$(BIN)/python -m tests.reliability.fuzz.viewer --inputs 100000
 
 kill: $(VENV)/.dev  ## commands that are killed, that share an output, whose disk is full
 	$(BIN)/python -m tests.reliability.kill --runs 200

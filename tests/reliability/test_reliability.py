@@ -40,7 +40,7 @@ def test_broken_inputs_are_refused_or_read() -> None:
 
 
 def test_the_viewer_survives_broken_messages() -> None:
-    result = run("tests.reliability.fuzz_viewer", "--inputs", "3600", "--seed", "7")
+    result = run("tests.reliability.fuzz.viewer", "--inputs", "3600", "--seed", "7")
     assert result["failures"] == []
     assert result["messages"] == 3600 and result["connections"] > 6, "some were dropped, and came back"
 

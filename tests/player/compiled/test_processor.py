@@ -130,7 +130,7 @@ for module in (contracted_march_compiled, head_compiled, march_compiled, pixels_
     for name, function in vars(module).items():
         if hasattr(function, "inspect_llvm"):
             for number, text in enumerate(function.inspect_llvm().values()):
-                (out / f"{module.__name__}.{name}.{number}.ll").write_text(text)
+                (out / f"{module.__name__}-{name}-{number}.ll").write_text(text)
 """
 
 
@@ -155,9 +155,10 @@ def test_code_for_arm_is_its_own(shells_folder: Path, tmp_path: Path) -> None:
         text = re.sub(r"^target datalayout = .*$", "", text, flags=re.MULTILINE)
         module = binding.parse_assembly(text)
         module.data_layout = str(machine.target_data)
-        of = path.name.split(".")[1]
+        of = path.name.split("-")[0]
         found = re.findall(r"\tfmla\tv\d+\.4s", machine.emit_assembly(module))
         fused[of] = fused.get(of, 0) + len(found)
     assert all(
-        fused[name] >= 8 for name in ("contracted_march_compiled", "march_compiled", "head_compiled")
+        fused[f"player.{name}"] >= 8
+        for name in ("compiled.contracted_march", "compiled.march", "head.compiled")
     ), fused

@@ -2,11 +2,11 @@
 
     nice python -m tests.reliability.mutate --count 60 --seed 0 --results mutations.json
 
-Sites are drawn uniformly (`tests.reliability.sites`); equal seeds draw equal sites of equal code. A mutation
-is killed when a test fails or never ends; the tests of the file itself come first, then those
-that import it, then whatever reaches it. Mutations that change nothing that could be told from outside are
-listed with the reason in `tests/reliability/equivalent.json`, and others are drawn in their place. What the
-results hold already is not run again.
+Sites are drawn uniformly (`tests.reliability.mutate.sites`); equal seeds draw equal sites of equal code. A
+mutation is killed when a test fails or never ends; the tests of the file itself come first, then those that
+import it, then whatever reaches it. Mutations that change nothing that could be told from outside are listed
+with the reason in `equivalent.json`, and others are drawn in their place. What the results hold already is
+not run again.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ import numba
 import pytest
 
 import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to wait)
-from tests.reliability.sites import Site, sites_of
+from tests.reliability.mutate.sites import Site, sites_of
 
-REPOSITORY = Path(__file__).resolve().parent.parent.parent
+REPOSITORY = Path(__file__).resolve().parents[3]
 PACKAGES = ("player", "exporters", "vfr_bake", "tests")
 FOLDERS = ("player", "vfr_bake/baking", "exporters", "vfr_bake/kernels")
 """Whose sites are drawn; each meets the tests of its package, and those that concern every package."""

@@ -5,8 +5,15 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-from tests.reliability.mutate import EQUIVALENT, FOLDERS, REPOSITORY, Imports, drawn_sites, files_of_tests
-from tests.reliability.sites import sites_of
+from tests.reliability.mutate.__main__ import (
+    EQUIVALENT,
+    FOLDERS,
+    REPOSITORY,
+    Imports,
+    drawn_sites,
+    files_of_tests,
+)
+from tests.reliability.mutate.sites import sites_of
 
 SOURCE = '''"""A docstring with 7 and a < b."""
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The process that is given the inputs: it may crash, and what it was at is known.
 
-    python -m tests.reliability.fuzz_worker WORK SEED FIRST STEP N NAMES...
+    python -m tests.reliability.fuzz.worker WORK SEED FIRST STEP N NAMES...
 
 Reads the inputs FIRST, FIRST + STEP, ... below N. Writes to WORK/state where it is, and what became of the
 inputs before, and a line of JSON to stdout for each failure.
@@ -24,10 +24,10 @@ from exporters.formats.ply import ply_bytes
 from exporters.shapes.mesh import TriangleMesh
 from player.errors import VfrError
 from tests.player.conftest import cameras_bytes, head_bytes
-from tests.reliability.fuzz_assets import BrokenAsset, asset_targets, whole_asset
-from tests.reliability.fuzz_data import camera_targets, colmap_targets, model_target, picture_target
-from tests.reliability.fuzz_heads import head_targets
-from tests.reliability.fuzz_targets import Target, written
+from tests.reliability.fuzz.assets import BrokenAsset, asset_targets, whole_asset
+from tests.reliability.fuzz.data import camera_targets, colmap_targets, model_target, picture_target
+from tests.reliability.fuzz.heads import head_targets
+from tests.reliability.fuzz.targets import Target, written
 
 LIMIT_SECONDS = 20.0
 ROOM = 3 << 30
@@ -65,7 +65,7 @@ class Watch:
 
 
 INSTALLED = tuple(
-    {sys.prefix, sys.base_prefix, str(Path(np.__file__).parent.parent), str(Path(__file__).parents[2])}
+    {sys.prefix, sys.base_prefix, str(Path(np.__file__).parent.parent), str(Path(__file__).parents[3])}
 )
 SYSTEM = ("/lib", "/usr/lib", "/etc/ld.so", "/etc/localtime", "/sys/", "/proc/self/cgroup", "/proc/self/maps",
           "/proc/self/statm", "/proc/stat", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys/vm/", "/dev/urandom",

@@ -5,9 +5,9 @@
 Input i of a seed is always the same one. Each is given LIMIT_SECONDS, and all of them together ROOM bytes
 more than the process had before; files opened outside the work folder, programs started and connections are
 failures. Arrays of assets are broken unpacked and vouched for by the manifest, heads by their structure too,
-and what is read is played (`tests.reliability.fuzz_assets`, `fuzz_heads`, `fuzz_data`).
+and what is read is played (`tests.reliability.fuzz.assets`, `heads`, `data`).
 
-The inputs are read by processes of their own (`fuzz_worker`): one that crashes or hangs is a failure that
+The inputs are read by processes of their own (`worker`): one that crashes or hangs is a failure that
 names its input, and the next goes on behind it. Where `strace` is installed it shows what native code opens
 as well; without it, only what Python opens is seen, and the result says so.
 """
@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.reliability.fuzz_worker import COUNTS, INDEX, LIMIT_SECONDS, MARK, SLOWEST_US, allowed
+from tests.reliability.fuzz.worker import COUNTS, INDEX, LIMIT_SECONDS, MARK, SLOWEST_US, allowed
 
 STATE_WORDS = 256
 TRACED = "open,openat,openat2,creat,execve,execveat,connect"
@@ -85,7 +85,7 @@ class Worker:
     def _one(self, folder: Path, first: int) -> str | None:
         """Run a worker from input `first` on; how it ended, None if well."""
         arguments = [folder, self._seed, first, self._step, self._n_inputs, *self._names]
-        command = [sys.executable, "-m", "tests.reliability.fuzz_worker", *map(str, arguments)]
+        command = [sys.executable, "-m", "tests.reliability.fuzz.worker", *map(str, arguments)]
         trace = None
         if self.traced:
             os.mkfifo(folder / "trace")

@@ -30,8 +30,8 @@ from player.asset.unpacking import PLACES
 from player.compiled.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
-from tests.reliability.fuzz_targets import Target, small_view
-from tests.reliability.mutations import broken_bytes, broken_json, broken_value
+from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value
+from tests.reliability.fuzz.targets import Target, small_view
 
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19

@@ -18,8 +18,8 @@ from player.cameras.views import read_views
 from player.errors import FormatError
 from player.files.images import png_bytes, read_key, webp_bytes
 from tests.player.conftest import cameras_bytes, look_at
-from tests.reliability.fuzz_targets import Break, Target, written
-from tests.reliability.mutations import broken_bytes, broken_json, broken_value
+from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value
+from tests.reliability.fuzz.targets import Break, Target, written
 
 
 def _json(path: Path, data: bytes) -> Break:

@@ -1,6 +1,6 @@
 """Broken messages to the viewer over real WebSockets: it goes on to serve, in bounded memory.
 
-    python -m tests.reliability.fuzz_viewer --inputs 100000 --seed 0
+    python -m tests.reliability.fuzz.viewer --inputs 100000 --seed 0
 
 Message i of a seed is always the same one, but for the names of controls, which the server draws. N_CLIENTS
 send them side by side; after every batch a client of good manners wants a picture. Traces of errors on the
@@ -30,7 +30,7 @@ from websockets.typing import Origin
 
 from tests.player.conftest import write_shells
 from tests.player.viewer.viewer_client import CAMERA, SPOKEN, Server, decoded, still_serves
-from tests.reliability.mutations import broken_bytes
+from tests.reliability.fuzz.broken import broken_bytes
 
 N_CLIENTS = 6
 BATCH = 3000

@@ -15,8 +15,8 @@ from exporters.head.onnx_head import head_onnx
 from player.compiled.compiling import available
 from player.head.head import Head
 from tests.exporters.head.test_onnx_head import random_head
-from tests.reliability.fuzz_targets import Target, check_colours
-from tests.reliability.mutations import broken_bytes
+from tests.reliability.fuzz.broken import broken_bytes
+from tests.reliability.fuzz.targets import Target, check_colours
 
 N_CHANNELS = 4
 OPERATORS = (
