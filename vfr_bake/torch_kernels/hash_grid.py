@@ -14,6 +14,8 @@ from torch import Tensor
 from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z
 from vfr_bake.torch_kernels import fast
 
+_PRIME_Y, _PRIME_Z = int(PRIME_Y), int(PRIME_Z)  # torch's compiler takes a number of numpy's for a tensor
+
 
 class Levels(NamedTuple):
     """Which entries of a table belong to which level; tensors on the table's device."""
@@ -43,7 +45,7 @@ def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
     z = vertices[:, :, 2, :, None, None]
     side, hashed = levels.sides[:, None, None, None], levels.hashed[:, None, None, None]
     # In 64 bits: the products do not overflow, and the mask takes the bits that 32 would have kept.
-    shared = (x ^ (y * int(PRIME_Y)) ^ (z * int(PRIME_Z))) & levels.mask
+    shared = (x ^ (y * _PRIME_Y) ^ (z * _PRIME_Z)) & levels.mask
     rows = torch.where(hashed, shared, (z * side + y) * side + x) + levels.offsets[:, None, None, None]
     wx, wy, wz = weights[:, :, 0], weights[:, :, 1], weights[:, :, 2]
     products = wx[:, :, None, None, :] * (wy[:, :, None, :, None] * wz[:, :, :, None, None])

@@ -125,6 +125,7 @@ def quantised(
 
     def rounded(x: torch.Tensor, limits: Range) -> torch.Tensor:
         scale = (limits[1] - limits[0]) / 255
+        x = x.clamp(limits[0] - scale, limits[1] + scale)  # older versions of torch wrap levels beyond 2^63
         return torch.fake_quantize_per_tensor_affine(x, scale, round(-limits[0] / scale), 0, 255)
 
     def layer(x: torch.Tensor, weight: np.ndarray, bias: np.ndarray) -> torch.Tensor:
