@@ -23,7 +23,7 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check env format system-libraries other-programs clean \
+.PHONY: help demo test check docs env format system-libraries other-programs clean \
   test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
 
 help:  ## say what there is
@@ -41,6 +41,9 @@ check: $(VENV)/.dev  ## style and types alone
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(VENV)/.docs  ## the manual as web pages, in build/docs
+	$(BIN)/python -m mkdocs build --strict --clean
 
 # What takes too long for every change; CONTRIBUTING.md says how long each takes.
 test-all: test-pythons test-lowest test-wheel fuzz kill mutations processors  ## everything below: a day of one machine
@@ -150,6 +153,11 @@ $(VENV)/.gltf-validator: $(VENV)/.dev
 # The stamps: an extra is installed again only when what it is installed from has changed.
 $(VENV)/.dev $(VENV)/.train $(VENV)/.release: $(VENV)/.%: $(VENV)/.torch $(INPUTS)
 	$(PIP) install --quiet -c $(CONSTRAINTS) -e '.[$*]'
+	@touch $@
+
+# The manual alone needs no torch.
+$(VENV)/.docs: $(BIN)/python $(INPUTS)
+	$(PIP) install --quiet -c $(CONSTRAINTS) -e '.[docs]'
 	@touch $@
 
 # torch alone and first: with a GPU from PyPI, else from TORCH_INDEX (one retry, then pip falls back to its other indexes).
