@@ -13,7 +13,9 @@ from typing import Any
 from mkdocs.structure.files import File
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-LINK = re.compile(r"\]\((?:\.\./)+((?:player|exporters|vfr_bake|examples|tests)/[^)#\s]+|[A-Z]\w*(?:\.md)?)\)")
+LINK = re.compile(
+    r"\]\((?:\.\./)+((?:player|exporters|vfr_bake|examples|tests)/[^)#\s]+|[A-Z]\w*(?:\.md)?)\)"
+)
 
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:

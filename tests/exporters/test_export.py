@@ -227,14 +227,14 @@ def test_options_of_every_format_are_checked() -> None:
 def test_examples_run(
     source: str, shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every command of --help and of docs/exports.md, with the names that they use."""
+    """Every command of --help and of docs/export.md, with the names that they use."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(shells_asset, "out")
     Path("transforms_test.json").write_bytes((shells_asset / "cameras.json").read_bytes())
     matrix = np.eye(4)
     matrix[:3, 3] = 1.5, 2.375, 3.5
     Path("box.json").write_text(json.dumps({"matrix": matrix.tolist(), "size": [9, 9, 9]}))
-    text = cli._EPILOG if source == "help" else (REPOSITORY / "docs/exports.md").read_text(encoding="utf-8")
+    text = cli._EPILOG if source == "help" else (REPOSITORY / "docs/export.md").read_text(encoding="utf-8")
     lines = re.findall(r"^ *vfr-export (.*?)(?:   +.*|  # .*)?$", text, re.MULTILINE)
     assert len(lines) >= 10
     for line in lines:

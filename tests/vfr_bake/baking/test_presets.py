@@ -1,4 +1,4 @@
-"""The table of presets in docs/baking.md is what the presets are."""
+"""The table of presets in docs/bake.md is what the presets are."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 
 from vfr_bake.baking.presets import PRESETS
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "baking.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "bake.md"
 
 
 def rows() -> dict[str, list[str]]:
     """The cells of each preset's row."""
-    text = DOCUMENT.read_text(encoding="utf-8").split("## Presets\n")[1]
+    text = DOCUMENT.read_text(encoding="utf-8").split("## What the presets decide\n\n")[1]
     table = text.split("\n\n")[0].splitlines()[2:]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
     return {name.split(" ")[0]: rest for name, *rest in cells}
