@@ -37,6 +37,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 DOCS = REPOSITORY / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 DOCUMENTS = sorted([*(f"docs/{page}" for page in PAGES), "README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
+MANUAL = [document for document in DOCUMENTS if not document.startswith("docs/notes/")]
+"""What speaks of today. A note says how something was measured on its day, and stays as it is."""
 USER_PAGES = (
     *("index", "install", "photographing", "train", "bake", "play", "export", "python", "conventions"),
     *("format", "troubleshooting", "benchmarks"),
@@ -230,7 +232,7 @@ def shell_lines(document: str) -> list[str]:
     return lines
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@pytest.mark.parametrize("document", MANUAL)
 def test_commands_parse(document: str) -> None:
     for line in shell_lines(document):
         try:
@@ -240,7 +242,7 @@ def test_commands_parse(document: str) -> None:
 
 
 def test_commands_are_found() -> None:
-    found = [line.split()[0] for document in DOCUMENTS for line in shell_lines(document)]
+    found = [line.split()[0] for document in MANUAL for line in shell_lines(document)]
     assert set(PARSERS) <= set(found) and len(found) > 70
 
 
@@ -288,7 +290,7 @@ def test_options_in_sentences_exist() -> None:
     every = set().union(*known.values())
     others = {"--nproc-per-node", "--no-deps", "--index-url"}  # torchrun's, pip's
     wrong = []
-    for document in DOCUMENTS:
+    for document in MANUAL:
         for text in parsed(document).code:
             command = next((name for name in PARSERS if text.startswith(f"{name} ")), None)
             of_a_script = text.startswith(("python ", "pytest "))
@@ -302,7 +304,7 @@ def test_options_in_sentences_exist() -> None:
 
 
 def test_targets_and_extras_in_sentences_exist() -> None:
-    for document in DOCUMENTS:
+    for document in MANUAL:
         for text in parsed(document).code:
             if re.match(r"(make [a-z]|pip install '\.)", text) and "[NAME]" not in text:
                 check_line(re.sub(r" [A-Z]+=\S+", "", text))
@@ -326,7 +328,7 @@ RUN = {"docs/python.md", "docs/conventions.md", "docs/export.md", "docs/format.m
 
 
 def test_every_page_with_python_is_run() -> None:
-    assert {document for document in DOCUMENTS if python_blocks(document)} == RUN | {"README.md"}
+    assert {document for document in MANUAL if python_blocks(document)} == RUN | {"README.md"}
 
 
 @pytest.mark.parametrize("document", sorted(RUN))
@@ -438,7 +440,7 @@ def test_tests_that_are_named_exist() -> None:
     functions = {
         name for text in sources.values() for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)
     }
-    for document in DOCUMENTS:
+    for document in MANUAL:
         for text in parsed(document).code:
             if match := re.fullmatch(r"(?:[\w/]+/)?(test_\w+\.py)", text):
                 assert match[1] in sources, f"{document}: {text}"
@@ -448,7 +450,7 @@ def test_tests_that_are_named_exist() -> None:
 
 
 def test_paths_that_are_named_exist() -> None:
-    for document in DOCUMENTS:
+    for document in MANUAL:
         for text in parsed(document).code:
             if re.fullmatch(r"(player|exporters|vfr_bake|tests|docs|examples)(/\w[\w.-]*)+/?", text):
                 assert (REPOSITORY / text).exists(), f"{document}: {text}"
