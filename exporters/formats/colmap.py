@@ -16,10 +16,9 @@ from exporters.formats.transforms import check_cameras
 from exporters.options import COLMAP_FILES
 from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
-from player.cameras.rotations import quaternion, rotation_matrix
+from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import ParityError
 
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 TOLERANCE = 1e-9
 """Poses go through a quaternion and back, in float64."""
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from exporters.mesh.open3d_package import require_open3d
 from exporters.surface.depth_views import DepthView
+from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
 
 TRUNCATION = 3.0
@@ -54,7 +55,7 @@ def fuse_depth(
             lens = np.array(
                 [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]], np.float64
             )
-            pose = np.linalg.inv(camera.c2w @ np.diag([1.0, -1.0, -1.0, 1.0]))
+            pose = np.linalg.inv(camera.c2w @ OPENGL_FROM_OPENCV)
             picture = open3d.t.geometry.Image(tensor(depth))
             where = (tensor(lens), tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
             grid.integrate(grid.compute_unique_block_coordinates(picture, *where), picture, *where)

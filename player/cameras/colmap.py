@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.cameras.rotations import rotation_matrix
+from player.cameras.rotations import OPENGL_FROM_OPENCV, rotation_matrix
 from player.errors import DataError, FormatError
 from player.files.files import read_bytes
 
@@ -32,7 +32,6 @@ MAX_FILE_BYTES = 1 << 30
 """Bytes of each file of a model: ten thousand pictures of a thousand points each that several pictures share
 take half of it."""
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)

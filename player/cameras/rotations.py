@@ -1,8 +1,12 @@
-"""Rotations as unit quaternions (w, x, y, z), for COLMAP's files and for smooth paths."""
+"""The turn between the camera axes of OpenGL and OpenCV, and rotations as unit quaternions (w, x, y, z)."""
 
 from __future__ import annotations
 
 import numpy as np
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""[4, 4] from OpenCV's camera axes (x right, y down, looks along +z) to OpenGL's (x right, y up, looks along
+-z). It is its own inverse: `c2w @ OPENGL_FROM_OPENCV` turns a pose of either kind into the other."""
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.cameras.keyframes import smooth_path
 from player.cameras.nerfstudio import write_camera_path
+from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import VfrError
 from player.files.images import png_bytes
 from player.render import Frame, Renderer
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from player.viewer.guard import GuardedConnection
     from player.viewer.messages import Check
 
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 PATH_FPS = 30
 STRIP_PIXELS = 50_000
 """The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
@@ -177,7 +177,7 @@ class Window:
         with self._client.atomic():
             handle.position = place
             handle.look_at = place - ahead * camera.c2w[:3, 2]
-            handle.wxyz = _wxyz(camera.c2w[:3, :3] @ OPENGL_FROM_OPENCV)
+            handle.wxyz = quaternion((camera.c2w @ OPENGL_FROM_OPENCV)[:3, :3])
         self._fov.value = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
         self._set_fov()
 
@@ -228,11 +228,13 @@ class Window:
         """The camera of the window as it is now, in the world frame, with no more pixels than allowed."""
         seen = self._client.camera
         c2w = np.eye(4)
-        c2w[:3, :3] = _matrix(seen.wxyz) @ OPENGL_FROM_OPENCV
+        c2w[:3, :3] = rotation_matrix(seen.wxyz / np.linalg.norm(seen.wxyz))
         c2w[:3, 3] = seen.position
         width, height = max(int(seen.image_width), 1), max(int(seen.image_height), 1)
         focal = height / 2 / math.tan(seen.fov / 2)
-        camera = Camera("viewer", c2w, width, height, focal, focal, width / 2, height / 2)
+        camera = Camera(
+            "viewer", c2w @ OPENGL_FROM_OPENCV, width, height, focal, focal, width / 2, height / 2
+        )
         width, height = fitted(min(width, MOST_SIDE), min(height, MOST_SIDE), MOST_PIXELS)
         return camera.resized(width, height)
 
@@ -335,15 +337,3 @@ def _joined(frames: Sequence[Frame], layer: str) -> Frame:
         all_of("rgb"), all_of("opacity"), all_of("depth"), all_of("n_density_samples"), frames[0].background,
         find_normals=None if normals is None else lambda: normals,
     )  # fmt: skip
-
-
-def _wxyz(rotation: np.ndarray) -> np.ndarray:
-    from viser.transforms import SO3
-
-    return SO3.from_matrix(rotation).wxyz
-
-
-def _matrix(wxyz: np.ndarray) -> np.ndarray:
-    from viser.transforms import SO3
-
-    return SO3(np.asarray(wxyz)).as_matrix()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.cameras.colmap import OPENGL_FROM_OPENCV
+from player.cameras.rotations import OPENGL_FROM_OPENCV
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
 from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_options

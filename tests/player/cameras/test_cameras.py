@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from player.cameras.camera import Camera, focus_point, orbit
+from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.cameras.transforms import frame_names, read_cameras, write_cameras
 from player.errors import FormatError
 from player.files import json_files
@@ -46,7 +47,7 @@ def test_rays_project_back_to_their_pixels_in_opencv():
     camera = Camera("a", POSE, width=7, height=5, fx=6.0, fy=8.0, cx=3.1, cy=2.7)
     rays_o, rays_d = camera.rays()
     points = rays_o + np.linspace(0.5, 4, 35)[:, None] * rays_d
-    w2c = np.linalg.inv(POSE @ np.diag([1.0, -1, -1, 1]))  # OpenCV: y down, looks along +z
+    w2c = np.linalg.inv(POSE @ OPENGL_FROM_OPENCV)
     matrix = np.array(
         [[6.0, 0, 3.1 - 0.5], [0, 8, 2.7 - 0.5], [0, 0, 1]]
     )  # OpenCV: pixel centres at integers
@@ -56,6 +57,12 @@ def test_rays_project_back_to_their_pixels_in_opencv():
     columns, rows = np.meshgrid(np.arange(7), np.arange(5))
     expected = np.stack([columns.ravel(), rows.ravel()], axis=-1)
     np.testing.assert_allclose(pixels[:, 0], expected, atol=1e-4)  # float32 rays, 10 pixels
+
+
+def test_the_turn_between_opengl_and_opencv_goes_both_ways():
+    """Right stays right; up becomes down and behind becomes ahead."""
+    np.testing.assert_array_equal(OPENGL_FROM_OPENCV @ [1, 2, 3, 1], [1, -2, -3, 1])
+    np.testing.assert_array_equal(POSE @ OPENGL_FROM_OPENCV @ OPENGL_FROM_OPENCV, POSE)
 
 
 def test_blender_axes():

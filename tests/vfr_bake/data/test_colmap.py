@@ -12,7 +12,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from player.cameras.camera import Camera
-from player.cameras.colmap import OPENGL_FROM_OPENCV, read_cameras, read_images, read_points
+from player.cameras.colmap import read_cameras, read_images, read_points
+from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_folder, load_scene
 from vfr_bake.data.demo import demo_cameras
