@@ -12,7 +12,7 @@ import numpy as np
 
 from player import Asset, Frame
 from player.cameras.camera import orbit
-from player.cameras.transforms import read_cameras
+from player.cameras.views import asset_cameras
 from player.files.images import write_png
 from player.render import render
 
@@ -33,7 +33,7 @@ def side_by_side(frame: Frame) -> np.ndarray:
 
 def main(folder: str, target: str) -> None:
     asset = Asset.open(folder)
-    trained = read_cameras(asset.path("cameras.json"))
+    trained = asset_cameras(asset)
     camera = orbit(trained, n_frames=8, size=(400, 400))[3]  # a view that nobody has photographed
     frame = render(asset, camera)
     write_png(Path(target), side_by_side(frame))

@@ -21,6 +21,7 @@ from exporters.surface.remade import Scene
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names, read_cameras
+from player.cameras.views import asset_cameras
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
 
@@ -132,7 +133,7 @@ def _points(
 def _cameras(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
     from exporters.formats.transforms import transforms_bytes
 
-    cameras = _trained(asset)
+    cameras = asset_cameras(asset)
     data = transforms_bytes(cameras, _matrix(asset, options, "json"), str(target))
     return data, {"cameras": len(cameras), "frame": options.frame or "world"}
 
@@ -151,7 +152,7 @@ def _export_colmap(
     from exporters.formats.transforms import moved_cameras
 
     cloud, facts = _cloud(asset, options, options.points or POINTS, report)
-    cameras = moved_cameras(_trained(asset), _matrix(asset, options, "colmap"))
+    cameras = moved_cameras(asset_cameras(asset), _matrix(asset, options, "colmap"))
     files = colmap_files(cameras, _in_frame(cloud, asset, options, "colmap"))
     with new_folder(target, force) as folder:
         for file_name, data in files.items():
@@ -188,16 +189,11 @@ def _matrix(asset: Asset, options: ExportOptions, name: str) -> np.ndarray:
     return frame_matrix(options.frame or "world", asset.world_from_model, name)
 
 
-def _trained(asset: Asset) -> list[Camera]:
-    width, height = asset.manifest.view_size
-    return read_cameras(asset.path("cameras.json"), (width, height))
-
-
 def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str]]:
     """The cameras to render, and the names of their files: as `vfr-play` would call them."""
     width, height = asset.manifest.view_size
     given = options.cameras
-    cameras = _trained(asset) if given is None else read_cameras(given, (width, height))
+    cameras = asset_cameras(asset) if given is None else read_cameras(given, (width, height))
     part = options.views or slice(None)
     cameras, names = cameras[part], frame_names(cameras)[part]
     return ([c.resized(*options.size) for c in cameras] if options.size else cameras), names

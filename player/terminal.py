@@ -32,11 +32,10 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
     if not (stream.isatty() and encoding == "utf8" and os.environ.get("COLORTERM") in ("truecolor", "24bit")):
         return []
-    from player.cameras.transforms import read_cameras
+    from player.cameras.views import asset_cameras
     from player.render import render
 
-    width, height = asset.manifest.view_size
-    camera = read_cameras(asset.path("cameras.json"), (width, height))[0]
+    camera = asset_cameras(asset)[0]
     columns = min(
         round(2 * ROWS * camera.width / camera.height), os.get_terminal_size(stream.fileno()).columns
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.cameras.transforms import read_cameras
+from player.cameras.views import asset_cameras
 from player.render import Renderer
 
 MAX_VIEWS = 100
@@ -51,8 +51,7 @@ def depth_views(
 
     Raises FormatError if the asset's cameras are damaged.
     """
-    width, height = asset.manifest.view_size
-    cameras = read_cameras(asset.path("cameras.json"), (width, height))
+    cameras = asset_cameras(asset)
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).round().astype(int))
     views = []
     with Renderer(asset) as renderer:

@@ -11,7 +11,7 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.asset.manifest import Manifest
-from player.cameras.transforms import read_cameras
+from player.cameras.views import asset_cameras
 from player.head.head import read_head_file
 from player.march.contracted import MAX_SPEED
 from player.terminal import printable
@@ -46,7 +46,7 @@ def facts(asset: Asset) -> dict[str, Any]:
         "n_vertices": len(asset.arrays.density),
         "n_feature_vertices": len(asset.arrays.features),
         "head_parameters": head.n_parameters,
-        "n_cameras": len(read_cameras(asset.path("cameras.json"), (m.view_size[0], m.view_size[1]))),
+        "n_cameras": len(asset_cameras(asset)),
         "world_box": _world_box(asset),
         "world_units_per_model_unit": asset.scale,
         **{key: getattr(m, key) for key in MANIFEST_KEYS},

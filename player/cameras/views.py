@@ -1,14 +1,14 @@
-"""The views to render, out of any file that has cameras: transforms.json, nerfstudio's camera_path.json,
-COLMAP."""
+"""The cameras of any file that has some: transforms.json, nerfstudio's camera_path.json, COLMAP, an asset."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from player.asset.asset import Asset
 from player.cameras import colmap
 from player.cameras.camera import Camera
 from player.cameras.nerfstudio import is_camera_path, path_cameras, path_frame_rate
-from player.cameras.transforms import parse_transforms, transforms_cameras
+from player.cameras.transforms import parse_transforms, read_cameras, transforms_cameras
 from player.errors import FormatError
 from player.files.json_files import parse_json, read_json
 
@@ -40,6 +40,16 @@ def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Ca
         return path_cameras(document, path)
     document = parse_transforms(data, str(path))
     return transforms_cameras(document, path, [size] * len(document["frames"]))
+
+
+def asset_cameras(asset: Asset) -> list[Camera]:
+    """The training cameras that an asset holds, in the WORLD frame. Raises FormatError if they are damaged.
+
+    >>> [camera.name for camera in asset_cameras(Asset.open("out/"))][:2]
+    ['./test/r_0', './test/r_1']
+    """
+    width, height = asset.manifest.view_size
+    return read_cameras(asset.path("cameras.json"), (width, height))
 
 
 def frame_rate(path: str | Path) -> float | None:
