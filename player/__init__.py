@@ -2,11 +2,13 @@
 
 >>> from player import Asset
 >>> from player.render import render
->>> from player.cameras.views import read_views
+>>> from player.cameras.views import asset_cameras
 >>> asset = Asset.open("out/")
->>> frame = render(asset, read_views("out/cameras.json")[0])
+>>> frame = render(asset, asset_cameras(asset)[0])
 >>> frame.rgb.shape
 (40, 48, 3)
+
+`play` writes pictures and videos, `serve` opens the viewer: the functions behind the command `vfr-play`.
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from player.app.options import PlaySettings
+    from player.app.play import play
     from player.asset.asset import Asset
     from player.cameras.camera import Camera
     from player.render import Frame, Renderer
+    from player.viewer.server import ServeSettings, serve
 
 try:
     __version__ = version("vfr-bake")
@@ -30,13 +35,19 @@ except PackageNotFoundError:  # the folder alone, copied somewhere: it works the
 # first session; its own function that says so comes too late.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
-__all__ = ["Asset", "Camera", "Frame", "Renderer", "__version__"]
+__all__ = [
+    "Asset", "Camera", "Frame", "PlaySettings", "Renderer", "ServeSettings", "__version__", "play", "serve",
+]  # fmt: skip
 
 _PLACES = {
     "Asset": "player.asset.asset",
     "Camera": "player.cameras.camera",
     "Frame": "player.render",
+    "PlaySettings": "player.app.options",
     "Renderer": "player.render",
+    "ServeSettings": "player.viewer.server",
+    "play": "player.app.play",
+    "serve": "player.viewer.server",
 }
 
 

@@ -1,39 +1,95 @@
-"""A progress bar on stderr, if that is a terminal: frame i of n, ms, time left."""
+"""How far work has come, on stderr: a bar where that is a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 
+SECONDS_BETWEEN_LINES = 30.0
+"""Where stderr is no terminal, progress is a line this often instead of a bar."""
+SECONDS_BETWEEN_BARS = 0.1
+"""A bar is not drawn anew sooner, but for the last time."""
+CELLS = 24
+"""Length of a bar, characters."""
+
 
 class Bar:
-    """Shown as long as its block runs; `advance` once a frame."""
+    """One piece of work. A context manager; outside of `with`, `close` ends the bar.
 
-    def __init__(self, total: int) -> None:
-        self._total = total
-        self._shown = sys.stderr.isatty()
-        self._begin = time.perf_counter()
-        self._done = 0
+    >>> with Bar("reading pictures") as bar:
+    ...     bar.count(1, 2)
+    """
+
+    def __init__(self, title: str = "", shown: bool = True, lines: bool = True) -> None:
+        """`shown`: whether to write anything; `lines`: whether to write lines where there is no terminal."""
+        self._title = title
+        self._on_terminal = sys.stderr.isatty()
+        self._shown = shown and (self._on_terminal or lines)
+        self._begin = time.monotonic()
+        self._written = -SECONDS_BETWEEN_BARS if self._on_terminal else self._begin
+        self._length = 0
 
     def __enter__(self) -> Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._shown and self._done:
-            sys.stderr.write("\n")
+        self.close()
 
-    def advance(self, milliseconds: float) -> None:
-        """One more frame is there, which took so long to render."""
-        self._done += 1
+    def count(self, done: int, of: int) -> None:
+        """So many things are done."""
+        self.share(done / of if of else 1.0, f"{done}/{of}")
+
+    def share(self, share: float, text: str) -> None:
+        """A share 0..1 of the work is done; `text` is written beside it."""
         if not self._shown:
             return
-        left = (time.perf_counter() - self._begin) / self._done * (self._total - self._done)
-        filled = "#" * (24 * self._done // self._total)
-        sys.stderr.write(
-            f"\r[{filled:24}] frame {self._done}/{self._total}  {milliseconds:.0f} ms  "
-            f"{duration(left)} left   "
-        )
+        now = time.monotonic()
+        elapsed = now - self._begin
+        left = duration(elapsed * (1 - share) / share) if share > 0 else "?"
+        if not self._on_terminal:
+            if now - self._written > SECONDS_BETWEEN_LINES:
+                self._written = now
+                self._write(f"{self._title}: {share:.0%}, {left} left, {text}\n")
+        elif share >= 1 or now - self._written >= SECONDS_BETWEEN_BARS:
+            self._written = now
+            filled = "#" * int(CELLS * share)
+            line = f"{self._title} {share:4.0%} |{filled:{CELLS}}| {duration(elapsed)} < {left}  {text}"
+            line = line.removeprefix(" ")[: shutil.get_terminal_size().columns - 1]
+            self._write("\r" + line.ljust(self._length))  # spaces over what a longer line has left
+            self._length = len(line)
+
+    def close(self) -> None:
+        """End the line of the bar."""
+        if self._length:
+            self._write("\n")
+            self._length = 0
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(text)
         sys.stderr.flush()
+
+
+class Bars:
+    """One bar after the other, each for one kind of work. A context manager."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, Bar] = {}
+
+    def __enter__(self) -> Bars:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for bar in self._bars.values():
+            bar.close()
+
+    def count(self, what: str, done: int, of: int) -> None:
+        """So many of `of` things of the work called `what` are done."""
+        if what not in self._bars:
+            self._bars[what] = Bar(what)
+        self._bars[what].count(done, of)
+        if done >= of:
+            self._bars[what].close()
 
 
 def duration(seconds: float) -> str:

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from player.app.commands import run
-from player.app.options import parse
-from player.errors import VfrError
+from player.app.options import PlaySettings, parse, settings_of
+from player.errors import ConfigError, VfrError
+from player.progress import Bar, duration
+
+if TYPE_CHECKING:  # `--help` answers without numpy
+    from player.app.frame_files import Target
+    from player.app.play import Played
+    from player.asset.asset import Asset
+    from player.cameras.camera import Camera
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -32,23 +42,105 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from player.viewer.server import serve
+    from player.asset.asset import Asset
+    from player.render import import_ahead
+    from player.viewer.server import ServeSettings, serve
 
-    serve(arguments)
+    settings = settings_of(ServeSettings, arguments)
+    import_ahead()
+    folders = (arguments.asset, *arguments.others)
+    assets = [Asset.open(folder, max_memory=arguments.max_memory) for folder in folders]
+    with serve(assets, settings, _say) as address:
+        print(f"{arguments.asset}: look at it at {address}", flush=True)
+        _advise(arguments.asset, address)
+        forever = threading.Event()
+        while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
+            pass
     return 0
+
+
+def _advise(asset: Path, address: str) -> None:
+    """Say how the viewer is left, and what to do where no browser can open here."""
+    _say("the viewer runs until Ctrl-C")
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        port = address.rpartition(":")[2]
+        _say(f"no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this")
+        _say(f"and open that address there; or render files: vfr-play {asset} --orbit 60 --output frames/")
 
 
 def _play(arguments: argparse.Namespace) -> int:
-    from player.app.play import kept, play
+    from player.app.frame_files import Target
 
+    target = Target.of(settings_of(PlaySettings, arguments))
     try:
-        figures, sentence = play(arguments, lambda text: print(f"vfr-play: {text}", file=sys.stderr))
+        played = _play_on_a_bar(arguments, target)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(kept(arguments.output, arguments.format)) from None
-    _write_json(arguments.json, figures)
+        raise KeyboardInterrupt(
+            f"the frames that were finished are kept in {target.folder}; --resume goes on"
+        ) from None
+    _write_json(arguments.json, played.figures)
     if arguments.json != "-":
-        print(sentence)
+        print(_sentence(target.path, played))
     return 0
+
+
+def _play_on_a_bar(arguments: argparse.Namespace, target: Target) -> Played:
+    from player.app.play import play
+    from player.asset.asset import Asset
+    from player.cameras.views import frame_rate
+    from player.render import import_ahead
+
+    settings = settings_of(PlaySettings, arguments)
+    target.check(settings)  # so that nobody waits for a refusal until an asset is open
+    import_ahead(scipy=False)
+    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
+    cameras = _views(asset, arguments)
+    if target.is_video and arguments.fps is None and arguments.cameras is not None:
+        settings = replace(settings, fps=frame_rate(arguments.cameras) or settings.fps)
+    with Bar(lines=False) as bar:
+
+        def advance(n_done: int, n_frames: int, milliseconds: float) -> None:
+            bar.share(n_done / n_frames, f"frame {n_done}/{n_frames}  {milliseconds:.0f} ms")
+
+        return play(asset, cameras, settings, _say, advance)
+
+
+def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
+    """The cameras that --cameras, --orbit or --view ask for, of the size that --size asks for."""
+    from player.cameras.camera import orbit
+    from player.cameras.views import asset_cameras, read_views
+
+    width, height = asset.manifest.view_size
+    given = arguments.cameras
+    cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
+    if arguments.orbit is not None:
+        return orbit(cameras, arguments.orbit, arguments.size or (width, height))
+    if arguments.view is not None:
+        n = len(cameras)
+        if not -n <= arguments.view < n:
+            raise ConfigError(f"--view: expected 0 to {n - 1}, got {arguments.view}")
+        cameras = [cameras[arguments.view]]
+    return cameras if arguments.size is None else [camera.resized(*arguments.size) for camera in cameras]
+
+
+def _sentence(path: Path, played: Played) -> str:
+    figures, n_kept = played.figures, played.n_kept
+    n, ms = figures["frames"], figures["ms_median"]
+    kept = f" ({n_kept} were there already)" if n_kept else ""
+    what = f"{n} picture{'s' * (n != 1)}{kept} of {figures['width']}x{figures['height']}"
+    if ms is None:
+        return f"{path}: {what}, nothing left to render"
+    seconds = duration(played.seconds) if played.seconds >= 60 else f"{played.seconds:.1f} s"
+    return (
+        f"{path}: {what} in {seconds}; rendering {ms:.0f} ms a frame "
+        f"({1000 / ms:.1f} frames/s, {figures['march']}, {figures['threads']} threads)"
+    )
+
+
+def _say(text: str) -> None:
+    print(f"vfr-play: {text}", file=sys.stderr)
 
 
 def _write_json(target: str | None, document: dict[str, Any]) -> None:

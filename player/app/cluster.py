@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from player.app.play import Done, Job, PlaySettings, render_job
+from player.app.jobs import Done, Job, render_job
+from player.app.options import PlaySettings
 from player.asset.asset import Asset
 from player.asset.manifest import MAX_BYTES, NAME
 from player.errors import ConfigError, FormatError, IntegrityError, MissingExtraError, VfrError
 from player.files.files import read_bytes
-from player.render import Renderer
+from player.render import March, Renderer
 
 CONNECT_SECONDS = 10
 POLL_SECONDS = 5
 PATIENCE = 12
-"""Polls without any worker after which a cluster counts as gone: a minute, in which one may be restarted."""
+"""Polls without any worker after which the cluster counts as gone: a minute, in which one may restart."""
 
 
 def render_on_cluster(
@@ -34,10 +34,10 @@ def render_on_cluster(
     A job whose worker dies is done again by another one.
 
     Args:
-        address: of the scheduler, for example tcp://10.0.0.1:8786.
-        folder: the asset, which the workers see at the same path.
-        jobs: what to render.
-        settings: with how many threads on a worker, and over which background.
+        address: the scheduler's, for example tcp://10.0.0.1:8786.
+        folder: the asset's folder, which the workers see at the same path.
+        jobs: the frames to render.
+        settings: how they are rendered; `threads` and `max_memory` are those of one worker.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.
@@ -55,10 +55,10 @@ def render_on_cluster(
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"--dask: {address}: expected a scheduler to answer, got none: {error}") from error
     digest = _digest(folder)
+    how = settings.threads, settings.march, settings.max_memory
     with client:
         futures = {
-            client.submit(_task, str(folder.resolve()), digest, job, index, settings, pure=False): index
-            for index, job in enumerate(jobs)
+            client.submit(_task, str(folder.resolve()), digest, job, *how, pure=False): job for job in jobs
         }
         pending, alone = set(futures), 0
         while pending:
@@ -71,7 +71,7 @@ def render_on_cluster(
                 continue
             for future in ready.done:
                 pending.discard(future)
-                yield _result(future, address, jobs[futures[future]])
+                yield _result(future, address, futures[future])
 
 
 def _result(future: Any, address: str, job: Job) -> Done:
@@ -79,27 +79,31 @@ def _result(future: Any, address: str, job: Job) -> Done:
         return future.result()
     except VfrError:
         raise
-    except (
-        Exception
-    ) as error:  # whatever a worker raises, and Dask's own for workers that died again and again
+    except Exception as error:  # a worker's of any kind, or Dask's own for one that died again and again
         raise VfrError(f"--dask: {address}: {job.camera.name}: {type(error).__name__}: {error}") from error
 
 
-def _task(folder: str, digest: str, job: Job, index: int, settings: PlaySettings) -> Done:
+def _task(folder: str, digest: str, job: Job, *how: Any) -> Done:
+    """Render a frame on a worker; `how` are the last arguments of `_renderer`. A path in the settings would
+    not reach a worker of another system."""
     if _digest(Path(folder)) != digest:
         raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
-    return render_job(_renderer(folder, digest, replace(settings, samples=None, background=None)), job, index,
-                      settings)  # fmt: skip
+    return render_job(_renderer(folder, digest, *how), job)
 
 
 @lru_cache(maxsize=1)
-def _renderer(folder: str, digest: str, settings: PlaySettings) -> Renderer:
-    """The worker's renderer, kept for its next frames. What would end the worker is found out before."""
-    if settings.march != "numpy":
+def _renderer(
+    folder: str, digest: str, threads: int | None, march: March, max_memory: float | None
+) -> Renderer:
+    """The worker's renderer, kept for its next frames; the digest tells a new asset from an old one.
+
+    Compiled code that would end the worker's process is found out before it runs.
+    """
+    if march != "numpy":
         from player.proof import prove
 
-        prove(lambda _: None)
-    return Renderer(Asset.open(folder, max_memory=settings.max_memory), settings.threads, settings.march)
+        prove(lambda text: None)
+    return Renderer(Asset.open(folder, max_memory=max_memory), threads, march)
 
 
 def _digest(folder: Path) -> str:

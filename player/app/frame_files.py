@@ -1,8 +1,8 @@
 """Where frames go: a folder of pictures, one picture, or a video; and which of them are there already.
 
-A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. To
-resume is to leave away what is there with the right key, so that frames of two different runs are never
-mixed.
+A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. A run
+that is resumed leaves out the frames that are there with the right key, so that frames of two different runs
+are never mixed.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ from pathlib import Path
 
 import numpy as np
 
-from player.app.options import PICTURES, VIDEO
+from player.app.options import PICTURES, VIDEO, PlaySettings
 from player.app.video import load_av, write_video
 from player.asset.asset import Asset
 from player.asset.manifest import MAX_BYTES, NAME
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names
 from player.errors import ConfigError, OutputError
-from player.files.files import check_target, read_bytes, write_bytes
-from player.files.images import ENCODERS, open_picture, read_key
+from player.files.files import check_target, read_bytes
+from player.files.images import open_picture, read_key
 from player.files.replace import clear_up
 
 
 @dataclass(frozen=True)
 class Target:
-    """What `--output` says."""
+    """The files that frames are written to."""
 
     path: Path
+    """The folder, the picture or the video that was asked for."""
     folder: Path
-    """Where the single pictures go; for a video a folder beside it, until it is complete."""
+    """Folder of the single pictures; a video's are beside it until the video is complete."""
     suffix: str
-    """Of the pictures, with its dot."""
+    """File name ending of the pictures, with its dot."""
 
     @property
     def is_video(self) -> bool:
@@ -46,21 +47,27 @@ class Target:
         return self.path.suffix.lower() in PICTURES
 
     @classmethod
-    def of(cls, path: Path, form: str | None) -> Target:
-        """`path`: a folder, or a file whose suffix says picture or video; `form`: png or webp, for a folder.
+    def of(cls, settings: PlaySettings) -> Target:
+        """The files of `settings.output`, whose suffix says picture or video; any other is a folder.
 
-        >>> Target.of(Path("turn.mp4"), None).folder.as_posix(), Target.of(Path("out"), "webp").suffix
-        ('turn.mp4.frames', '.webp')
+        >>> Target.of(PlaySettings(Path("turn.mp4"))).folder.as_posix()
+        'turn.mp4.frames'
+        >>> Target.of(PlaySettings(Path("out"), format="webp")).suffix
+        '.webp'
         """
+        path = settings.output
         suffix = path.suffix.lower()
         if suffix == VIDEO:
             return cls(path, path.with_name(f"{path.name}.frames"), ".png")
         if suffix in PICTURES:
             return cls(path, path.parent, suffix)
-        return cls(path, path, f".{form or 'png'}")
+        return cls(path, path, f".{settings.format or 'png'}")
 
     def paths(self, views: Sequence[Camera], part: slice) -> list[Path]:
-        """The file of each view in the slice; names are those that all views together ask for."""
+        """The file of each view in the slice `part`; a file has the same name whatever the slice.
+
+        Raises ConfigError: one picture is to hold several views.
+        """
         if self.is_picture:
             if len(views[part]) != 1:
                 raise ConfigError(
@@ -70,18 +77,19 @@ class Target:
             return [self.path]
         return [self.folder / f"{name}{self.suffix}" for name in frame_names(views)[part]]
 
-    def check(self, force: bool, resume: bool) -> None:
+    def check(self, settings: PlaySettings) -> None:
         """Raise OutputError for what would be overwritten, or cannot be written; MissingExtraError for a
         video without PyAV."""
+        allowed = settings.force or settings.resume
         if self.is_picture or self.is_video:
-            check_target(self.path, force or resume)
+            check_target(self.path, allowed)
             if self.path.is_dir():
                 raise OutputError(f"{self.path}: expected a file to write, got a folder")
         if self.is_video:
             load_av()
         if not self.is_picture:
             clear_up(self.folder)
-            self._check_folder(force or resume)
+            self._check_folder(allowed)
 
     def _check_folder(self, allowed: bool) -> None:
         folder = self.folder
@@ -98,7 +106,7 @@ class Target:
             )
 
     def finish(self, paths: Sequence[Path], fps: float) -> None:
-        """Make the video out of its pictures, which are then removed; nothing to do for pictures."""
+        """Make a video of its pictures, which are then removed; where pictures were asked for, do nothing."""
         if not self.is_video:
             return
         write_video(self.path, (_pixels(path) for path in paths), fps)
@@ -108,10 +116,10 @@ class Target:
             self.folder.rmdir()
 
 
-def frame_key(asset: Asset, camera: Camera, samples: int | None, background: object) -> str:
+def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     """A digest of everything that the picture depends on."""
-    k = asset.manifest.n_samples if samples is None else samples
-    behind = asset.manifest.background if background is None else background
+    k = asset.manifest.n_samples if settings.samples is None else settings.samples
+    behind = asset.manifest.background if settings.background is None else settings.background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     facts = json.dumps([camera.c2w.tolist(), lens, k, behind])
     manifest = read_bytes(asset.folder / NAME, "a manifest", MAX_BYTES, asset.folder)
@@ -119,7 +127,7 @@ def frame_key(asset: Asset, camera: Camera, samples: int | None, background: obj
 
 
 def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Camera]) -> list[int]:
-    """Which frames are not there yet. Raises ConfigError for one that is there and shows something else."""
+    """Indices of the frames that are not there yet. Raises ConfigError for one that shows something else."""
     missing = []
     for index, (path, key, camera) in enumerate(zip(paths, keys, cameras, strict=True)):
         if not path.exists():
@@ -130,16 +138,6 @@ def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Cam
                 "got another: add --force instead to render everything anew"
             )
     return missing
-
-
-def write_frame(path: Path, pixels: np.ndarray, key: str) -> None:
-    """Write a picture in the format of its suffix."""
-    write_bytes(path, encode_frame(path.suffix.lower(), pixels, key))
-
-
-def encode_frame(suffix: str, pixels: np.ndarray, key: str) -> bytes:
-    """The bytes of a picture in the format of `suffix`."""
-    return ENCODERS[suffix](pixels, key)
 
 
 def _pixels(path: Path) -> np.ndarray:

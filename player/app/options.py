@@ -1,14 +1,22 @@
-"""The command line of `vfr-play`: its options, and which of them goes with what it is to do."""
+"""The options of `vfr-play`: the settings of `play`, the command line, and which options go together."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from player.app.option_types import background, gigabytes, number, part, positive, size, whole
+from player.errors import ConfigError
 
 PICTURES = (".png", ".webp")
 VIDEO = ".mp4"
+
+if TYPE_CHECKING:  # the command line answers `--help` without numpy
+    from player.render import Background, March
+
+Settings = TypeVar("Settings")
 
 MAX_MEMORY = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
 
@@ -28,6 +36,53 @@ EXAMPLES = """examples:
 
 exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 unread output
 """
+
+
+@dataclass(frozen=True)
+class PlaySettings:
+    """What `player.play` renders, besides the asset and the cameras, and where it writes the pictures.
+
+    Raises ConfigError for settings that contradict each other.
+
+    >>> PlaySettings(Path("turn.mp4"), background="transparent")
+    Traceback (most recent call last):
+    player.errors.ConfigError: --background: a video has no transparency
+    """
+
+    output: Path
+    """A folder of pictures, one picture (.png, .webp), or a video (.mp4)."""
+    format: Literal["png", "webp"] | None = None
+    """Format of the pictures in a folder; PNG if None."""
+    frames: slice | None = None
+    """Which of the cameras are rendered; all of them if None. Pictures are named as if all were."""
+    fps: float = 30.0
+    """Frames a second of a video."""
+    resume: bool = False
+    """Leave out frames that are there already, if they show the same."""
+    force: bool = False
+    """Replace what is there."""
+    dask: str | None = None
+    """Address of the scheduler of a Dask cluster that renders, tcp://HOST:PORT; this machine if None."""
+    samples: int | None = None
+    """Feature fetches a ray; the asset's own number if None, every sample if 0."""
+    background: Background | None = None
+    """Colour, 3 numbers 0..1, or "transparent"; the asset's own if None."""
+    threads: int | None = None
+    """Threads that render; one for each core if None."""
+    march: March = "auto"
+    """Implementation: "numba", "numpy", or numba where it is there ("auto")."""
+    max_memory: float | None = None
+    """Gigabytes that the asset may take on a worker of a cluster; half of its machine's if None."""
+
+    def __post_init__(self) -> None:
+        suffix = self.output.suffix.lower()
+        if self.resume and self.force:
+            raise ConfigError("--resume: not allowed with --force, which renders everything anew")
+        if self.format is not None and suffix in (*PICTURES, VIDEO):
+            raise ConfigError(f"--format: {self.output.name} says which format it is")
+        if self.background == "transparent" and suffix == VIDEO:
+            raise ConfigError("--background: a video has no transparency")
+
 
 MODES = {
     "viewer": "the viewer, which opens without views and --output",
@@ -71,11 +126,18 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = make_parser()
     arguments = parser.parse_args(argv)
     _check_together(parser, arguments)
-    if arguments.frames is None:
-        arguments.frames = slice(None)
-    if arguments.march is None:
-        arguments.march = "auto"
     return arguments
+
+
+def settings_of(kind: type[Settings], arguments: argparse.Namespace) -> Settings:
+    """Settings of a kind, a dataclass, from the options of the same names; those not given keep its defaults.
+
+    >>> settings_of(PlaySettings, make_parser().parse_args(["out/", "--output", "turn"])).samples is None
+    True
+    """
+    names: Any = fields(kind)  # pyright: ignore[reportArgumentType]
+    given = {field.name: getattr(arguments, field.name) for field in names}
+    return kind(**{name: value for name, value in given.items() if value is not None})
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -168,17 +230,13 @@ def _check_together(parser: argparse.ArgumentParser, a: argparse.Namespace) -> N
 
 
 def _check_files(parser: argparse.ArgumentParser, a: argparse.Namespace) -> None:
-    output: Path | None = a.output
-    if output is None:
+    if a.output is None:
         parser.error("--output: add where the pictures go: --output DIR, FILE.png, FILE.webp or FILE.mp4")
     if a.cameras is None and a.orbit is None and a.view is None:
         parser.error("--output: add the views: --cameras FILE, --orbit N or --view N")
-    if a.resume and a.force:
-        parser.error("--resume: not allowed with --force, which renders everything anew")
-    suffix = output.suffix.lower()
-    if a.format is not None and suffix in (*PICTURES, VIDEO):
-        parser.error(f"--format: {output.name} says which format it is")
-    if a.fps is not None and suffix != VIDEO:
-        parser.error(f"--fps: expected a video, got --output {output}")
-    if a.background == "transparent" and suffix == VIDEO:
-        parser.error("--background: a video has no transparency")
+    if a.fps is not None and a.output.suffix.lower() != VIDEO:
+        parser.error(f"--fps: expected a video, got --output {a.output}")
+    try:
+        settings_of(PlaySettings, a)
+    except ConfigError as error:
+        parser.error(str(error))

@@ -1,68 +1,95 @@
-"""`vfr-play out/`: the viewer at an address of this machine, until Ctrl-C."""
+"""The viewer at an address of this machine."""
 
 from __future__ import annotations
 
-import argparse
 import io
 import os
 import socket
-import sys
 import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import ExitStack, redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import focus_point, orbit, world_up
-from player.cameras.transforms import read_cameras
+from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
-from player.render import Renderer, import_ahead
+from player.render import Background, March, Renderer
 from player.terminal import printable
 from player.viewer.window import Window
 
-HOST = "127.0.0.1"
 PORT = 8080
 PORTS = 100
-"""So many ports from the first on are tried, unless one was asked for."""
+"""Number of ports, from PORT on, that are tried where none was asked for."""
 
 
-def serve(arguments: argparse.Namespace) -> None:
-    """Serve the viewer until KeyboardInterrupt; prints its address.
+@dataclass(frozen=True)
+class ServeSettings:
+    """How `player.serve` shows assets. Raises ConfigError for a transparent background."""
 
-    Raises MissingExtraError without viser, ConfigError for an address that cannot be had, and what
-    `Asset.open` and `Renderer` raise.
+    host: str = "127.0.0.1"
+    """Address to serve at; as it is, this machine alone is let in."""
+    port: int | None = None
+    """Port; the first that is free from 8080 on if None."""
+    samples: int | None = None
+    """Feature fetches a ray; the asset's own number if None, every sample if 0."""
+    background: Background | None = None
+    """Colour, 3 numbers 0..1; the asset's own if None."""
+    threads: int | None = None
+    """Threads that render; one for each core if None."""
+    march: March = "auto"
+    """Implementation: "numba", "numpy", or numba where it is there ("auto")."""
+
+    def __post_init__(self) -> None:
+        if self.background == "transparent":
+            raise ConfigError("--background: expected a colour for the viewer, got transparent")
+
+
+@contextmanager
+def serve(
+    assets: Asset | Sequence[Asset],
+    settings: ServeSettings = ServeSettings(),
+    say: Callable[[str], object] = lambda text: None,
+) -> Iterator[str]:
+    """Serve the viewer as long as a `with` block runs, which is given its address.
+
+    Args:
+        assets: one or more open assets, to switch between; the cameras are those of the first.
+        settings: where it is served, and how pictures are rendered.
+        say: called with each line that a person should know before long work begins.
+
+    Raises:
+        MissingExtraError: viser is not installed, or is one whose connections cannot be checked; or numba
+            where it is asked for and does not run.
+        ConfigError: the address cannot be had.
+
+    >>> import player
+    >>> with player.serve(player.Asset.open("out/"), player.ServeSettings(march="numpy")) as address:
+    ...     address.rpartition(":")[0]  # a program that serves for long waits here, as `input()` does
+    'http://127.0.0.1'
     """
-    files = f"vfr-play {arguments.asset} --orbit 60 --output frames/"
-    if arguments.background == "transparent":
-        raise ConfigError("--background: expected a colour for the viewer, got transparent")
-    _need_viser(files)
-    import_ahead()
-    folders = (arguments.asset, *arguments.others)
-    assets = [Asset.open(folder, max_memory=arguments.max_memory) for folder in folders]
-    host = arguments.host or HOST
-    port = free_port(host, arguments.port)
-    if arguments.march != "numpy":
+    assets = [assets] if isinstance(assets, Asset) else assets
+    _need_viser(assets[0])
+    port = free_port(settings.host, settings.port)
+    if settings.march != "numpy":
         from player.proof import prove
 
-        prove(lambda text: sys.stderr.write(f"vfr-play: {text}\n"))
+        prove(say)
     with ExitStack() as stack, warnings.catch_warnings():
         # what viser says where a client goes while something is sent to it
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         renderers = [
-            stack.enter_context(Renderer(asset, arguments.threads, arguments.march)) for asset in assets
+            stack.enter_context(Renderer(asset, settings.threads, settings.march)) for asset in assets
         ]
-        server = guarded_server(host, port, _title(assets[0]))
+        server = guarded_server(settings.host, port, _title(assets[0]))
+        windows: dict[int, Window] = {}
         try:
-            windows = open_windows(server, renderers, arguments.samples, arguments.background)
-            sys.stdout.write(f"{arguments.asset}: look at it at http://{_shown(host)}:{server.get_port()}\n")
-            sys.stdout.flush()
-            sys.stderr.write(_advice(files, server.get_port()))
-            forever = threading.Event()
-            while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
-                pass
+            windows = open_windows(server, renderers, settings.samples, settings.background)
+            yield f"http://{_shown(settings.host)}:{server.get_port()}"
         finally:
             for window in list(windows.values()):
                 window.close()
@@ -94,13 +121,13 @@ def guarded_server(host: str, port: int, title: str = "") -> Any:
 def open_windows(
     server: Any, renderers: Sequence[Renderer], samples: int | None, background: Any
 ) -> dict[int, Window]:
-    """Give every client of a guarded server a window, and end it when the client is gone; returns those that
-    are open. Cameras are those of the first asset."""
+    """Give every client of a guarded server a window, and end it when the client is gone.
+
+    Returns the open windows by the client's number. Cameras are those of the first asset.
+    """
     from player.viewer.guard import CONNECTION
 
-    asset = renderers[0].asset
-    width, height = asset.manifest.view_size
-    trained = read_cameras(asset.path("cameras.json"), (width, height))
+    trained = asset_cameras(renderers[0].asset)
     focus = focus_point(trained)
     first = orbit(trained, 1)[0]
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -130,7 +157,7 @@ def open_windows(
 def free_port(host: str, asked: int | None) -> int:
     """The port that was asked for, or the first free one from PORT on.
 
-    Tried here, because the server looks for another port without end. Raises ConfigError.
+    It is tried here, because the server would look for another port without end. Raises ConfigError.
     """
     reason = ""
     for port in [asked] if asked is not None else range(PORT, PORT + PORTS):
@@ -147,13 +174,13 @@ def free_port(host: str, asked: int | None) -> int:
     raise ConfigError(f"viewer: {what} at {host}: expected a free port, got: {reason}")
 
 
-def _need_viser(files: str) -> None:
+def _need_viser(asset: Asset) -> None:
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise MissingExtraError(
             "viewer: expected the package viser, which is not installed: pip install 'vfr-bake[viewer]'; "
-            f"or render files: {files}"
+            f"or render files: vfr-play {asset.folder} --orbit 60 --output frames/"
         ) from error
 
 
@@ -166,16 +193,3 @@ def _shown(host: str) -> str:
     if host in ("0.0.0.0", "::"):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host
-
-
-def _advice(files: str, port: int) -> str:
-    """What to do where no browser can open here."""
-    lines = ["vfr-play: the viewer runs until Ctrl-C"]
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-        lines += [
-            f"vfr-play: no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this",
-            f"vfr-play: and open that address there; or render files: {files}",
-        ]
-    return "\n".join(lines) + "\n"

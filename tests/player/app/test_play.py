@@ -9,21 +9,25 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from player.app import cli
-from player.app.play import LARGE_BYTES, _check_sizes
+from player.app.options import PlaySettings
+from player.app.play import LARGE_BYTES, _check_sizes, play
 from player.app.video import write_video
 from player.asset.asset import Asset
 from player.cameras.camera import orbit
 from player.cameras.nerfstudio import write_camera_path
 from player.cameras.transforms import read_cameras
-from player.errors import OutputError
+from player.cameras.views import asset_cameras
+from player.errors import ConfigError, OutputError
 from player.files.images import png_bytes, read_key, webp_bytes
 from player.render import FRAME_BYTES, Renderer, render
 
@@ -57,6 +61,41 @@ def test_webp_and_png_show_the_same(background: str, shells_folder: Path, tmp_pa
         png = pixels(path)
         assert webp.shape == png.shape == (40, 48, 4 if background == "transparent" else 3)
         assert (webp == png).all()
+
+
+def test_a_program_plays_as_the_command_does(
+    asset: Asset, shells_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The same files, and nothing is printed: what a person should know is handed to the caller."""
+    there, here, said, shown = tmp_path / "there", tmp_path / "here", [], []
+    options = ["--frames", "1:3", "--samples", "1000", "--background", "black", "--march", "numpy"]
+    assert cli.main([*trained(shells_folder), *options, "--output", str(there)]) == 0
+    capfd.readouterr()
+    settings = PlaySettings(here, frames=slice(1, 3), samples=1000, background=(0.0, 0.0, 0.0), march="numpy")
+    played = play(asset, asset_cameras(asset), settings, said.append, lambda *numbers: shown.append(numbers))
+    assert capfd.readouterr() == ("", "")
+    assert [path.name for path in sorted(here.iterdir())] == ["r_1.png", "r_2.png"]
+    assert all((there / path.name).read_bytes() == path.read_bytes() for path in here.iterdir())
+    (line,) = said
+    assert line.startswith("--samples 1000: a ray has ")
+    assert [numbers[:2] for numbers in shown] == [(1, 2), (2, 2)] and played.n_kept == 0
+    with pytest.raises(OutputError, match="not empty: add --force"):
+        play(asset, asset_cameras(asset), settings)
+    played = play(asset, asset_cameras(asset), replace(settings, resume=True))
+    assert (played.n_kept, played.figures["frames"]) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("output", "settings", "message"),
+    [
+        ("a", {"resume": True, "force": True}, "--resume: not allowed with --force"),
+        ("a.png", {"format": "webp"}, "--format: a.png says which format it is"),
+        ("a.MP4", {"background": "transparent"}, "--background: a video has no transparency"),
+    ],
+)
+def test_settings_that_contradict_each_other(output: str, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PlaySettings(Path(output), **settings)
 
 
 def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:

@@ -7,8 +7,10 @@ import shutil
 import socket
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from urllib.error import URLError
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from player.errors import ConfigError
 from player.render import Renderer
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.resolution import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, STILL_SECONDS, Pace, fitted
-from player.viewer.server import free_port
+from player.viewer.server import ServeSettings, free_port, serve
 from tests.player.conftest import write_shells
 from tests.player.viewer.viewer_client import SECONDS, Server
 
@@ -133,6 +135,17 @@ def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.Captu
     assert "viewer: --port 8080 at 192.0.2.1: expected a free port, got: " in capsys.readouterr().err
     assert cli.main([str(shells_folder), "--background", "transparent"]) == 1
     assert "expected a colour for the viewer" in capsys.readouterr().err
+
+
+def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.CaptureFixture[str]) -> None:
+    """One asset or several, as long as the block runs; nothing is printed."""
+    for assets in (asset, [asset, asset]):
+        with serve(assets, ServeSettings(march="numpy")) as address:
+            with urllib.request.urlopen(address) as page:
+                assert page.status == 200 and b"<html" in page.read()
+        with pytest.raises(URLError):
+            urllib.request.urlopen(address)
+    assert capfd.readouterr() == ("", "")
 
 
 # --- in a browser ---

@@ -1,0 +1,51 @@
+"""One frame to render and one frame rendered: what goes to this machine's renderer or to a cluster's worker,
+and what comes back."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from player.cameras.camera import Camera
+from player.files.images import ENCODERS
+from player.render import Background, Renderer
+
+
+@dataclass(frozen=True)
+class Job:
+    """One frame to render."""
+
+    index: int
+    """Its place among all jobs."""
+    camera: Camera
+    samples: int | None
+    """Feature fetches a ray, as in `PlaySettings`."""
+    background: Background | None
+    """What is behind, as in `PlaySettings`."""
+    key: str
+    """Digest of what the picture depends on; its file carries it."""
+    suffix: str
+    """Format of the picture's file, ".png" or ".webp"."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """One rendered frame."""
+
+    index: int
+    """The place of its job among all jobs."""
+    data: bytes
+    """The picture's file."""
+    milliseconds: float
+    """Time that rendering took; the file's encoding comes on top."""
+    march: str
+    threads: int
+
+
+def render_job(renderer: Renderer, job: Job) -> Done:
+    """Render the frame of a job and encode its file."""
+    start = time.perf_counter()
+    frame = renderer.render(job.camera, job.samples, job.background)
+    milliseconds = (time.perf_counter() - start) * 1000
+    data = ENCODERS[job.suffix](frame.to_uint8(), job.key)
+    return Done(job.index, data, milliseconds, renderer.march, renderer.n_threads)
