@@ -125,12 +125,12 @@ def test_a_child_has_the_parents_modules_and_none_of_the_current_folder(
 
 
 def test_a_bar_starts_no_process(tmp_path: Path) -> None:
-    """tqdm's lock between processes starts one, with the current folder on its path, where multiprocessing
-    does not fork: on macOS, which is played here."""
+    """A bar that other processes share would start one, with the current folder on its path, where
+    multiprocessing does not fork: on macOS, which is played here."""
     program = (
         "import io, multiprocessing, sys; multiprocessing.set_start_method('spawn'); "
         "sys.stderr = io.StringIO(); sys.stderr.isatty = lambda: True; "
-        "from vfr_bake.bars import Bar; bar = Bar('a'); bar.count(1, 2); bar.close(); "
+        "from player.progress import Bar; bar = Bar('a'); bar.count(1, 2); bar.close(); "
         "from multiprocessing.resource_tracker import _resource_tracker; "
         "print('50%' in sys.stderr.getvalue(), _resource_tracker._pid)"
     )

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from player.app.commands import run
 from player.errors import DataError, MissingExtraError
 from player.files.files import check_target, write_bytes
-from vfr_bake.bars import Bar, Bars
+from player.progress import Bar, Bars
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
@@ -56,7 +56,7 @@ def _printable(text: object) -> str:
 
 
 def _need_train_extra() -> None:
-    for package in ("torch", "numba", "tyro", "tqdm"):
+    for package in ("torch", "numba", "tyro"):
         if find_spec(package) is None:
             raise MissingExtraError(
                 f"{package} is not installed: training and baking need: pip install vfr-bake[train]"

@@ -285,8 +285,8 @@ def test_usage_is_2() -> None:
 @pytest.mark.needs("signals")
 def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
     path = tmp_path / "model.pt"
-    code = "import sys; from vfr_bake import bars, cli; bars.SECONDS_BETWEEN_LINES = 0.2"
-    code += "; sys.exit(cli.train_main())"
+    code = "import sys; from player import progress; from vfr_bake import cli"
+    code += "; progress.SECONDS_BETWEEN_LINES = 0.2; sys.exit(cli.train_main())"
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(small_data), str(path), "--steps", "1000000", *SMALL],
         stderr=subprocess.PIPE,
