@@ -25,7 +25,7 @@ from player.errors import ConfigError, DataError, MissingExtraError
 
 BLOCK = 64
 """Cells along each side of a block: 1 MB of codes."""
-_CLIP = math.log(50.0)  # log(sigma / level) beyond this counts as this: see `exporters.surface.components`
+_CLIP = math.log(50.0)  # |log(sigma / level)| counts as this at most: nothing empty pulls the surface to it
 _NUDGE = 1e-2  # codes: no corner of a cell is nearer to the level, so that no vertex of the mesh is on one
 _ROUNDS = 4  # of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
 _REACH = 0.5  # voxels that a vertex is moved by at most
