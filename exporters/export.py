@@ -16,8 +16,8 @@ from exporters.export_mesh import export_mesh, mesh_paths, world_mesh
 from exporters.options import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
 from exporters.shapes.crop import parse_crop
 from exporters.shapes.mesh import TriangleMesh
+from exporters.surface.asset_surface import Scene
 from exporters.surface.inner_region import inner_region
-from exporters.surface.remade import Scene
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names, read_cameras

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from exporters.mesh.paint import Texture
 from exporters.options import TEXTURE_FACES, ExportOptions
 from exporters.shapes.mesh import TriangleMesh
-from exporters.shapes.texture import Texture
-from exporters.surface.remade import Report, Scene
+from exporters.surface.asset_surface import Report, Scene
 from player.asset.asset import Asset
 from player.files.files import write_together
 
@@ -152,8 +152,8 @@ def _files(
 
 
 def _textured(scene: Scene, mesh: TriangleMesh, size: int, seconds: float) -> tuple[TriangleMesh, Texture]:
+    from exporters.mesh.paint import paint
     from exporters.mesh.unwrap import unwrap
-    from exporters.shapes.texture import paint
 
     report = scene.report
     cut, uvs = unwrap(mesh, size, seconds, lambda done, of: report("layout, seconds of the limit", done, of))

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from exporters.mesh.paint import Texture
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
-from exporters.shapes.texture import Texture
 from player.errors import ConfigError, FormatError
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from exporters.mesh.paint import Texture
 from exporters.shapes.mesh import TriangleMesh
-from exporters.shapes.texture import Texture
 from player.errors import ConfigError
 
 _CHUNK = 1 << 17  # rows turned into text at once: tens of megabytes of scratch memory

@@ -16,9 +16,9 @@ from exporters.formats.points import parse_points
 from exporters.formats.stl import parse_stl
 from exporters.formats.usd import parse_usd
 from exporters.formats.vdb import VdbGrid, colour_voxels, parse_vdb
+from exporters.mesh.paint import Texture
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
-from exporters.shapes.texture import Texture
 from exporters.shapes.volume import Volume
 from player.errors import ParityError
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exporters.mesh.open3d_package import require_open3d
+from exporters.extras import require_open3d
 from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exporters.mesh.open3d_package import require_open3d
+from exporters.extras import require_open3d
 from exporters.shapes.mesh import TriangleMesh
 from player.errors import ConfigError, DataError, MissingExtraError
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from exporters.mesh.open3d_package import require_open3d
+from exporters.extras import require_open3d
 from exporters.surface.depth_views import DepthView
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError

@@ -28,8 +28,8 @@ from exporters.formats.ply import read_ply
 from exporters.options import Method
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface import shaded_colours as surface_colour
+from exporters.surface.asset_surface import Scene
 from exporters.surface.marching_cubes import code_and_slope, voxel_size
-from exporters.surface.remade import Scene
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras

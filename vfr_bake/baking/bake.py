@@ -19,7 +19,7 @@ import numpy as np
 from exporters.formats.ply import ply_bytes
 from exporters.head.onnx_head import head_onnx
 from exporters.shapes.mesh import TriangleMesh
-from exporters.surface.remade import Removed
+from exporters.surface.asset_surface import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
 from player.asset.packing import pack_codes

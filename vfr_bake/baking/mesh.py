@@ -7,9 +7,9 @@ import numpy as np
 
 from exporters.mesh.simplify import simplify_mesh
 from exporters.shapes.mesh import TriangleMesh
+from exporters.surface.asset_surface import Removed, Report, Scene
 from exporters.surface.inner_region import inner_region
 from exporters.surface.marching_cubes import extract_asset_surface
-from exporters.surface.remade import Removed, Report, Scene
 from player.asset.asset import Asset
 from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from exporters.mesh import unwrap as module
+from exporters.mesh.paint import covered_texels
 from exporters.mesh.unwrap import parts_of, unwrap
-from exporters.shapes.texture import covered_texels
 from player.errors import ConfigError, DataError, MissingExtraError
 from tests.exporters.meshes import sphere
 

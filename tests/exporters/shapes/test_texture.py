@@ -16,9 +16,9 @@ from PIL import Image
 from exporters.formats.glb import glb_bytes, parse_glb
 from exporters.formats.obj import textured_obj_files
 from exporters.formats.parity import check_textured_glb, check_textured_obj
+from exporters.mesh.paint import Texture, covered_texels, padded, paint
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
-from exporters.shapes.texture import Texture, covered_texels, padded, paint
 from player.errors import ConfigError, DataError, ParityError, ShapeError
 from tests.exporters.meshes import tetrahedron
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from exporters.shapes.mesh import TriangleMesh, take_faces
+from exporters.surface.asset_surface import Removed, Scene, cleaned
 from exporters.surface.depth_views import DepthView, cosines_in_view, depth_views, seen_vertices
-from exporters.surface.remade import Removed, Scene, cleaned
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import DataError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exporters.surface.remade import _from_around
+from exporters.surface.asset_surface import _from_around
 
 
 def strip(n: int) -> np.ndarray:
