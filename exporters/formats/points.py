@@ -11,7 +11,7 @@ import numpy as np
 
 from exporters.formats.ply import HEADER as MESH_HEADER
 from exporters.formats.ply import VERTEX
-from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh, crossed_edges, interpolated
 from player.errors import ConfigError, DataError, FormatError
 
 HEADER = MESH_HEADER.split("element face")[0] + "end_header\n"
@@ -43,8 +43,7 @@ def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
     """
     if n_points < 1:
         raise ConfigError(f"--points: expected 1 or more, got {n_points}")
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    areas = np.linalg.norm(crossed_edges(mesh.vertices, mesh.faces), axis=-1)
     running = np.cumsum(areas)
     if not len(areas) or not running[-1] > 0:
         raise DataError("--points: expected a surface with some area, got none")
@@ -52,13 +51,9 @@ def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
     place = (np.arange(n_points) + random.random(n_points)) / n_points * running[-1]
     face = np.minimum(np.searchsorted(running, place, side="right"), len(areas) - 1)
     u, v = np.sqrt(random.random(n_points)), random.random(n_points)
-    shares = np.stack([1 - u, u * (1 - v), u * v], axis=-1)[:, :, None]
-    at = mesh.faces[face]
-    normals = (mesh.normals[at] * shares).sum(axis=1)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals = np.where(length > 1e-6, normals / np.where(length > 1e-6, length, 1), mesh.normals[at[:, 0]])
-    colours = np.rint((mesh.colours[at] * shares).sum(axis=1)).astype(np.uint8)
-    vertices = (corners[face] * shares).sum(axis=1)
+    shares = np.stack([1 - u, u * (1 - v), u * v], axis=-1)
+    vertices, normals = mesh.at(face, shares)
+    colours = np.rint(interpolated(mesh.colours, mesh.faces[face], shares)).astype(np.uint8)
     return TriangleMesh(vertices, np.zeros((0, 3), np.int32), normals, colours)
 
 

@@ -10,7 +10,7 @@ import struct
 
 import numpy as np
 
-from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh, crossed_edges, unit
 from player.errors import ConfigError, FormatError
 
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -30,12 +30,9 @@ def stl_bytes(mesh: TriangleMesh) -> bytes:
     """
     if not 0 < len(mesh.faces) < 1 << 32:
         raise ConfigError(f"STL: mesh: expected 1 to 2^32 - 1 faces, got {len(mesh.faces)}")
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
     triangles = np.zeros(len(mesh.faces), TRIANGLE)
-    triangles["corners"] = corners
-    triangles["normal"] = np.where(length > 0, normals / np.where(length > 0, length, 1), 0)
+    triangles["corners"] = mesh.vertices[mesh.faces]
+    triangles["normal"] = unit(crossed_edges(mesh.vertices, mesh.faces), 0.0)
     return HEADER + struct.pack("<I", len(triangles)) + triangles.tobytes()
 
 

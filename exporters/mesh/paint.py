@@ -73,13 +73,7 @@ def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: Colours) -> T
     texels, face, shares = covered_texels(uvs, mesh.faces, size)
     if not len(texels):
         raise DataError(f"--texture: expected a texel under some face at size {size}, got none")
-    corners = mesh.faces[face]
-    points = _mixed(mesh.vertices.astype(np.float64), corners, shares)
-    normals = _mixed(mesh.normals.astype(np.float64), corners, shares)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals = np.where(
-        length > 1e-6, normals / np.where(length > 1e-6, length, 1), mesh.normals[corners[:, 0]]
-    )
+    points, normals = mesh.at(face, shares)
     rgb, known = colours(points, normals)
     if not known.any():
         raise DataError(f"--texture: expected colours on the surface, got none at {len(points)} points")
@@ -162,7 +156,3 @@ def _inside(
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _mixed(values: np.ndarray, corners: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ijk->ik", shares, values[corners])

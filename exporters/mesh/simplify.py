@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from exporters.extras import require_open3d
-from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
 from player.errors import ConfigError, DataError, MissingExtraError
 
 FIRST = 12
@@ -59,8 +59,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
         )
     result = source.simplify_quadric_decimation(n_faces)
     faces = np.asarray(result.triangles, np.int32)
-    a, b, c = faces.T
-    whole = (a != b) & (b != c) & (c != a)
+    whole = has_three_corners(faces)
     if not whole.any():
         raise DataError(f"--faces: expected something left of {len(mesh.faces)} faces at {n_faces}, got none")
     used, numbers = np.unique(faces[whole], return_inverse=True)
@@ -69,7 +68,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     colours = np.empty((len(used), 4), np.uint8)
     colours[:, :3] = np.rint(np.clip(np.asarray(result.vertex_colors)[used], 0, 1) * 255)
     colours[:, 3] = _alpha(mesh, vertices)
-    normals = _unit(np.asarray(result.vertex_normals)[used], vertices, faces)
+    normals = unit_normals(np.asarray(result.vertex_normals)[used], vertices, faces, 1e-6)
     return TriangleMesh(vertices, faces, normals, colours)
 
 
@@ -82,18 +81,3 @@ def _alpha(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
     except ImportError as error:
         raise MissingExtraError("--faces: needs scipy: pip install 'vfr-bake[export]'") from error
     return alpha[KDTree(mesh.vertices).query(vertices)[1]]
-
-
-def _unit(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Averaged normals at unit length; where they cancelled, the mean of the faces around, by area."""
-    length = np.linalg.norm(normals, axis=-1)
-    lost = ~(length > 1e-6)
-    if lost.any():
-        a, b, c = (vertices[faces[:, k]] for k in range(3))
-        around = np.zeros_like(vertices)
-        for k in range(3):
-            np.add.at(around, faces[:, k], np.cross(b - a, c - a))
-        normals = np.where(lost[:, None], around, normals)
-        length = np.linalg.norm(normals, axis=-1)
-    known = length[:, None] > 0
-    return np.where(known, normals / np.where(known, length[:, None], 1), [0.0, 0.0, 1.0])

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh, crossed_edges
 from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
 
@@ -130,8 +130,7 @@ def _child(folder: str) -> None:
 
     with np.load(Path(folder) / "mesh.npz") as mesh:
         vertices, faces, normals, size = (mesh[name] for name in ("vertices", "faces", "normals", "size"))
-    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
+    area = float(np.linalg.norm(crossed_edges(vertices, faces), axis=-1).sum() / 2)
     parts = parts_of(vertices, faces, PART)
     atlas = xatlas.Atlas()
     used = []

@@ -1,4 +1,4 @@
-"""The triangle mesh that every mesh writer takes: arrays, checked once.
+"""The triangle mesh that every mesh writer takes: arrays, checked once; and the normals of meshes.
 
 Faces run counter-clockwise seen from outside; colours are sRGB, as in a picture; positions are float64 so
 that a world far from its origin survives the arithmetic and is rounded to float32 only by the writer.
@@ -98,6 +98,60 @@ class TriangleMesh:
         normals = self.normals.astype(np.float64) @ (linear.T / scale)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         return replace(self, vertices=vertices, normals=normals)
+
+    def at(self, faces: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points on the mesh [n, 3] and its unit normals there [n, 3], interpolated in float64.
+
+        Args:
+            faces: [n] face numbers.
+            shares: [n, 3] what each corner of the face counts, of sum 1.
+        """
+        corners = self.faces[faces]
+        normals = interpolated(self.normals, corners, shares)
+        otherwise = self.normals[corners[:, 0]]
+        return interpolated(self.vertices, corners, shares), unit(normals, otherwise, 1e-6)
+
+
+def interpolated(values: np.ndarray, corners: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """[n, m] float64 mixtures of the rows of `values` [n_vertices, m] named by `corners` [n, 3], which count
+    `shares` [n, 3]."""
+    return np.einsum("ij,ijk->ik", shares, values[corners].astype(np.float64))
+
+
+def crossed_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[n_faces, 3] float64 cross product of two edges of each face: its normal, as long as twice its area."""
+    corners = vertices.astype(np.float64)[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def unit(vectors: np.ndarray, otherwise: np.ndarray | list[float] | float, least: float = 0.0) -> np.ndarray:
+    """Vectors [n, 3] at unit length; `otherwise`, which broadcasts, where one is not longer than `least`.
+
+    >>> unit(np.array([[0.0, 3, 4], [0, 0, 0]]), [0.0, 0, 1]).tolist()
+    [[0.0, 0.6, 0.8], [0.0, 0.0, 1.0]]
+    """
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    known = length > least
+    return np.where(known, vectors / np.where(known, length, 1), otherwise)
+
+
+def unit_normals(
+    normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray, least: float = 0.0
+) -> np.ndarray:
+    """Normals [n_vertices, 3] at unit length; where one is not longer than `least`, the mean of the faces
+    around its vertex, by their area, and (0, 0, 1) where these cancel."""
+    lost = ~(np.linalg.norm(normals, axis=-1) > least)
+    if lost.any():
+        around = np.zeros((len(vertices), 3))
+        np.add.at(around, faces.T, crossed_edges(vertices, faces))
+        normals = np.where(lost[:, None], around, normals)
+    return unit(normals, [0.0, 0.0, 1.0])
+
+
+def has_three_corners(faces: np.ndarray) -> np.ndarray:
+    """[n_faces] bool: whether the corners of each face [n_faces, 3] are three different vertices."""
+    a, b, c = faces.T
+    return (a != b) & (b != c) & (c != a)
 
 
 def take_faces(mesh: TriangleMesh, keep: np.ndarray) -> TriangleMesh:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from exporters.shapes.crop import CropBox
+from exporters.shapes.mesh import unit
 from player.asset.asset import Asset
 from player.asset.bricks import unpack_vertices
 from player.asset.density import decode_density
@@ -151,9 +152,7 @@ def _slope(grid: SparseGrid, rows: VertexRows, codes: np.ndarray, index: np.ndar
         step[axis] = 1
         rise = _codes_at(rows, codes, index + step) - _codes_at(rows, codes, index - step)
         slope[:, axis] = rise * grid.cells_per_unit[axis]
-    length = np.linalg.norm(slope, axis=-1, keepdims=True)
-    down = np.array([0.0, 0.0, -1.0])
-    return np.where(length > 0, slope / np.where(length > 0, length, 1), down).astype(np.float32)
+    return unit(slope, [0.0, 0.0, -1.0]).astype(np.float32)
 
 
 def _codes_at(rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:

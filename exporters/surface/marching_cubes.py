@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from exporters.shapes.mesh import has_three_corners, unit_normals
 from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError
 
@@ -225,9 +226,7 @@ def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     name[~on_edge] = -1 - np.arange(int((~on_edge).sum()))
     _, first, number = np.unique(name, return_index=True, return_inverse=True)
     triangles = number.reshape(-1)[faces]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    return g[first], triangles.astype(np.int32)
+    return g[first], triangles[has_three_corners(triangles)].astype(np.int32)
 
 
 def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: float) -> np.ndarray:
@@ -251,12 +250,4 @@ def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: flo
             counted = np.isfinite(both)
             total = np.where(counted, both, 0).sum(axis=0)
             normals[rows, axis] = -total / np.maximum(counted.sum(axis=0), 1)
-    flat = np.linalg.norm(normals, axis=-1) < 0.1
-    if flat.any():
-        a, b, c = (g[faces[:, k]] for k in range(3))
-        around = np.zeros_like(g)
-        for k in range(3):
-            np.add.at(around, faces[:, k], np.cross(b - a, c - a))
-        normals[flat] = around[flat]
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    return unit_normals(normals, g, faces, 0.1)

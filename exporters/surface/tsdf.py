@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from exporters.extras import require_open3d
+from exporters.shapes.mesh import has_three_corners, unit_normals
 from exporters.surface.depth_views import DepthView
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
@@ -94,19 +95,10 @@ def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
     by area."""
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     corners = number.reshape(-1)[faces]
-    corners = corners[
-        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    ]
+    corners = corners[has_three_corners(corners)]
     first = np.argmin(corners, axis=1)
     turned = np.stack(
         [np.take_along_axis(corners, (first[:, None] + k) % 3, 1)[:, 0] for k in range(3)], axis=-1
     )
     triangles = np.unique(turned, axis=0)
-    a, b, c = (places[triangles[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.zeros_like(places)
-    for k in range(3):
-        np.add.at(normals, triangles[:, k], across)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals = np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    return places, triangles.astype(np.int32), normals
+    return places, triangles.astype(np.int32), unit_normals(np.zeros_like(places), places, triangles)
