@@ -27,9 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.shapes.colour import linear_from_srgb
 from player.cameras.camera import Camera
-from player.errors import MissingExtraError, OutputError, ParityError, ShapeError
+from player.errors import OutputError, ParityError, ShapeError
 from player.march.march import MIN_OPACITY
 from player.render import Frame
 
@@ -144,10 +145,8 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], header: dict[str, Any
 
 def load_openexr() -> Any:
     """The package OpenEXR, or MissingExtraError that says how to get it; called before long work."""
-    try:
+    with needs("EXR", "OpenEXR"):
         import OpenEXR
-    except ImportError as error:
-        raise MissingExtraError("EXR: needs OpenEXR: pip install 'vfr-bake[export]'") from error
     return OpenEXR
 
 

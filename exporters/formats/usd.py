@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
-from player.errors import ConfigError, FormatError, MissingExtraError
+from player.errors import ConfigError, FormatError
 
 
 def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
@@ -91,8 +92,6 @@ def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
 
 
 def _pxr() -> tuple[Any, Any, Any]:
-    try:
+    with needs("USD", "usd-core"):
         from pxr import Usd, UsdGeom, Vt
-    except ImportError as error:
-        raise MissingExtraError("USD: needs usd-core: pip install 'vfr-bake[export]'") from error
     return Usd, UsdGeom, Vt

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from exporters.extras import needs
 from player.asset.asset import Asset
-from player.errors import FormatError, MissingExtraError, ParityError
+from player.errors import FormatError, ParityError
 from player.head.head import Head, read_head_file
 
 TOLERANCE = 1e-6
@@ -48,10 +49,8 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
         ParityError: colours differ from the asset's own head.
         MissingExtraError: the package `onnx` is not installed.
     """
-    try:
+    with needs("ONNX", "the package onnx"):
         import onnx
-    except ImportError as error:
-        raise MissingExtraError("ONNX: needs the package onnx: pip install 'vfr-bake[export]'") from error
     data, arrays = read_head_file(asset.path("head.onnx"), asset.manifest.n_channels)
     model = onnx.load_from_string(data)
     if arrays.may_saturate:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.head.spherical_harmonics import sh_monomials
-from player.errors import FormatError, MissingExtraError, ShapeError
+from player.errors import FormatError, ShapeError
 from player.head.graph import (
     IR_VERSION,
     OPSET,
@@ -111,13 +112,9 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
         FormatError: a head that no player would take, such as one of too many layers.
         MissingExtraError: the package `onnx` is not installed.
     """
-    try:
+    with needs("the ONNX head", "the package onnx"):
         import onnx
         from onnx import helper, numpy_helper
-    except ImportError as error:
-        raise MissingExtraError(
-            "the ONNX head: needs the package onnx: pip install vfr-bake[export]"
-        ) from error
     if ranges is not None and len(ranges) != 1 + len(weights.directional):
         raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
     form = HeadForm(len(weights.spatial), len(weights.directional), weights.sh_degree, ranges is not None)

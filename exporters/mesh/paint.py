@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.shapes.mesh import TriangleMesh
-from player.errors import DataError, MissingExtraError, ShapeError
+from player.errors import DataError, ShapeError
 
 _AT_ONCE = 1 << 22  # candidate texels looked at together
 
@@ -127,10 +128,8 @@ def covered_texels(
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """The picture [h, w, 3] with every texel that is not `covered` [h, w] coloured as the nearest that is."""
-    try:
+    with needs("--texture", "scipy"):
         from scipy.ndimage import distance_transform_edt
-    except ImportError as error:
-        raise MissingExtraError("--texture: needs scipy: pip install 'vfr-bake[export]'") from error
     nearest = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
     return np.ascontiguousarray(image[nearest[0], nearest[1]])
 

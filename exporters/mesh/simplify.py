@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from exporters.extras import require_open3d
+from exporters.extras import needs, require_open3d
 from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
-from player.errors import ConfigError, DataError, MissingExtraError
+from player.errors import ConfigError, DataError
 
 FIRST = 12
 """Faces for each that is asked for, from which edges are collapsed."""
@@ -76,8 +76,6 @@ def _alpha(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:
     alpha = mesh.colours[:, 3]
     if (alpha == alpha[0]).all():
         return np.full(len(vertices), alpha[0])
-    try:
+    with needs("--faces", "scipy"):
         from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("--faces: needs scipy: pip install 'vfr-bake[export]'") from error
     return alpha[KDTree(mesh.vertices).query(vertices)[1]]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.shapes.mesh import TriangleMesh, take_faces
-from player.errors import ConfigError, MissingExtraError
+from player.errors import ConfigError
 
 
 def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[TriangleMesh, int]:
@@ -23,11 +24,9 @@ def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[Tr
         raise ConfigError(f"surface: min_fraction: expected 0 to 1, got {min_fraction}")
     if not len(mesh.faces):
         return mesh, 0
-    try:
+    with needs("the mesh", "scipy"):
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
-    except ImportError as error:
-        raise MissingExtraError("the mesh: needs scipy: pip install vfr-bake[export]") from error
     n_vertices = len(mesh.vertices)
     start, end = mesh.faces[:, [0, 1]].T.ravel(), mesh.faces[:, [1, 2]].T.ravel()
     edges = coo_matrix((np.ones(len(start), bool), (start, end)), (n_vertices, n_vertices))

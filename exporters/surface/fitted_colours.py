@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.mesh.rays import MeshRays
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.depth_views import DepthView
-from player.errors import MissingExtraError
 
 SMOOTH = 0.03
 """What an edge counts, in pixels."""
@@ -47,10 +47,8 @@ def fit_colours(
     Raises MissingExtraError: Open3D or scipy is not installed.
     """
     rays = MeshRays(mesh)
-    try:
+    with needs("the mesh", "scipy"):
         from scipy.sparse import csr_matrix
-    except ImportError as error:
-        raise MissingExtraError("the mesh: needs scipy: pip install 'vfr-bake[export]'") from error
     n = len(mesh.vertices)
     square, right, count = _smoothness(mesh.faces, n) * SMOOTH, np.zeros((n, 3)), np.zeros(n)
     for done, view in enumerate(views):

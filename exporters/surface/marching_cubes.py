@@ -20,9 +20,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from exporters.extras import needs
 from exporters.shapes.mesh import has_three_corners, unit_normals
 from player.asset.grid import SparseGrid
-from player.errors import ConfigError, DataError, MissingExtraError
+from player.errors import ConfigError, DataError
 
 BLOCK = 64
 """Cells along each side of a block: 1 MB of codes."""
@@ -59,10 +60,6 @@ def extract_asset_surface(
         DataError: no live cell.
         MissingExtraError: scikit-image is not installed.
     """
-    try:
-        import skimage.measure  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("the mesh: needs scikit-image: pip install 'vfr-bake[export]'") from error
     code_level = _code_level(grid, level)
     corners, faces = [], []
     n_corners = 0
@@ -173,7 +170,8 @@ def _blocks(
 ) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray] | None]]:
     """Number of the block, how many there are, and its corners (grid coordinates over `stride`) and faces, or
     None."""
-    from skimage.measure import marching_cubes
+    with needs("the mesh", "scikit-image"):
+        from skimage.measure import marching_cubes
 
     wide = BLOCK // 8
     owner = grid.slot_coords // wide
