@@ -1,22 +1,31 @@
 """From an asset to the file or folder that was asked for: reads, changes, writes, compares.
 
-Meshes are the matter of `exporters.export_mesh`. Everything is made and read back in
-memory, or in a folder beside the target, before the target's name appears.
+Meshes are the matter of `exporters.export_mesh`, pictures that of `exporters.pictures`. Everything is made
+and read back in memory, or in a folder beside the target, before the target's name appears.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from exporters.export_mesh import export_mesh, mesh_paths, world_mesh
-from exporters.options import COLMAP_FILES, FOLDERS, MESHES, POINTS, ExportOptions, check_options
+from exporters.export_mesh import bounds_of, export_mesh, mesh_paths, world_mesh
+from exporters.formats import npz, points, vdb
+from exporters.formats.axes import coordinates_from_world
+from exporters.formats.colmap import COLMAP_FILES, colmap_files
+from exporters.formats.parity import check_points_bytes, check_volume_bytes
+from exporters.formats.transforms import moved_cameras, transforms_bytes
+from exporters.head.asset_head import head_bytes
+from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
+from exporters.pictures import export_pictures
+from exporters.progress import Report, silent
 from exporters.shapes.crop import parse_crop
 from exporters.shapes.mesh import TriangleMesh
-from exporters.surface.asset_surface import Scene
+from exporters.shapes.volume import asset_volume
+from exporters.surface.asset_surface import AssetSurface
 from exporters.surface.inner_region import inner_region
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
@@ -25,8 +34,8 @@ from player.cameras.views import asset_cameras
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
 
-Report = Callable[[str, int, int], object]
-"""Called with (stage, done, of)."""
+Facts = dict[str, Any]
+"""What is said of an export: JSON values."""
 
 
 def export_asset(
@@ -34,13 +43,14 @@ def export_asset(
     target: Path,
     options: ExportOptions | None = None,
     report: Report | None = None,
-) -> dict[str, Any]:
+) -> Facts:
     """Write one file or folder out of the asset in `asset_path` and describe it.
 
     Args:
         asset_path: the folder of an asset; every checksum is compared.
         target: what to write.
-        options: what to write there, and how; by default the mesh, in the world's frame, as the suffix says.
+        options: what to write there, and how; by default the mesh, in the world's coordinates, as the suffix
+            says.
         report: called with (stage, done, of) while something takes its time.
 
     Returns:
@@ -60,133 +70,100 @@ def export_asset(
         MissingExtraError: the format needs a package that is not installed.
     """
     options = options or ExportOptions()
-    report = report or (lambda stage, done, of: None)
+    report = report or silent
     name = check_options(target, options)
     is_mesh = name in MESHES and options.points is None
-    for path in [path for level in mesh_paths(target, options, name) for path in level] if is_mesh else []:
-        _check_target(asset_path, path, name, options.force)
+    for paths in mesh_paths(target, options, name) if is_mesh else []:
+        for path in paths:
+            _check_target(asset_path, path, name, options.force)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
     if name not in ("exr", "json", "onnx"):
         asset = inner_region(asset)
+    matrix = coordinates_from_world(options.coordinates, asset.world_from_model, name)
     if is_mesh:
-        facts = export_mesh(asset, target, options, name, _matrix(asset, options, name), report)
-        return {"file": str(target), "format": name, **facts}
-    if name == "exr":
-        from exporters.pictures import export_pictures
-
+        facts = export_mesh(asset, target, options, name, matrix, report)
+    elif name == "exr":
         cameras, names = _views(asset, options)
-        return export_pictures(
-            asset, target, cameras, names, options.half, force, lambda done, of: report("picture", done, of)
+        facts = export_pictures(
+            asset, target, cameras, names, options.half, force, partial(report, "picture")
         )
-    if name == "colmap":
-        return _export_colmap(asset, target, options, force, report)
-    if name == "json":
-        data, facts = _cameras(asset, target, options)
-    elif name == "onnx":
-        data, facts = _head(asset, target, options)
-    elif name in ("vdb", "npz"):
-        data, facts = _volume(asset, target, options, name)
+    elif name == "colmap":
+        facts = _export_colmap(asset, target, options, matrix, force, report)
     else:
-        data, facts = _points(asset, target, options, report)
-    write_bytes(target, data)
-    return {"file": str(target), "format": name, **facts, "bytes": len(data)}
+        if name == "json":
+            data, facts = _cameras(asset, target, options, matrix)
+        elif name == "onnx":
+            data, facts = _head(asset, target, options)
+        elif name in ("vdb", "npz"):
+            data, facts = _volume(asset, target, options, name, matrix)
+        else:
+            data, facts = _points(asset, target, options, matrix, report)
+        write_bytes(target, data)
+        facts["bytes"] = len(data)
+    return {"file": str(target), "format": name, **facts}
 
 
-def _volume(asset: Asset, target: Path, options: ExportOptions, name: str) -> tuple[bytes, dict[str, Any]]:
-    from exporters.formats.npz import npz_bytes
-    from exporters.formats.parity import check_volume_bytes
-    from exporters.formats.vdb import vdb_bytes
-    from exporters.shapes.volume import asset_volume
-
-    frame = options.frame or "world"
+def _volume(
+    asset: Asset, target: Path, options: ExportOptions, name: str, matrix: np.ndarray
+) -> tuple[bytes, Facts]:
     box = None if options.crop is None else parse_crop(options.crop)
-    frame_from_world = _matrix(asset, options, name)
-    volume, removed = asset_volume(asset, frame_from_world, box, options.colour)
-    written = volume.for_blender() if (name, frame) == ("vdb", "blender") else volume
-    data = npz_bytes(volume, frame) if name == "npz" else vdb_bytes(written)
+    volume, removed = asset_volume(asset, matrix, box, options.colour)
+    written = volume.for_blender() if (name, options.frame) == ("vdb", "blender") else volume
+    data = npz.npz_bytes(volume, options.coordinates) if name == "npz" else vdb.vdb_bytes(written)
     check_volume_bytes(f".{name}", data, written, str(target))
-    places = np.c_[volume.points(), np.ones(len(volume.index))] @ np.linalg.inv(frame_from_world).T
+    places = np.c_[volume.points(), np.ones(len(volume.index))] @ np.linalg.inv(matrix).T
     facts = {
         "voxels": len(volume.index),
         "level": volume.level,
         "densities": [float(volume.density.min()), float(volume.density.max())],
         "bounds": [places[:, :3].min(axis=0).tolist(), places[:, :3].max(axis=0).tolist()],
-        "frame": frame,
+        "frame": options.coordinates,
     }
-    return data, facts | ({"removed": removed} if options.crop is not None else {})
+    return data, facts | ({"removed": removed} if box is not None else {})
 
 
 def _points(
-    asset: Asset, target: Path, options: ExportOptions, report: Report
-) -> tuple[bytes, dict[str, Any]]:
-    from exporters.formats.parity import check_points_bytes
-    from exporters.formats.points import points_bytes
-
-    cloud, facts = _cloud(asset, options, options.points or POINTS, report)
-    moved = _in_frame(cloud, asset, options, "ply")
-    data = points_bytes(moved)
+    asset: Asset, target: Path, options: ExportOptions, matrix: np.ndarray, report: Report
+) -> tuple[bytes, Facts]:
+    cloud, facts = _cloud(asset, options, report)
+    moved = cloud.transformed(matrix)
+    data = points.points_bytes(moved)
     check_points_bytes(data, moved, str(target))
-    return data, {"points": len(cloud.vertices), "bounds": _bounds(cloud), **facts}
+    return data, facts
 
 
-def _cameras(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
-    from exporters.formats.transforms import transforms_bytes
-
+def _cameras(asset: Asset, target: Path, options: ExportOptions, matrix: np.ndarray) -> tuple[bytes, Facts]:
     cameras = asset_cameras(asset)
-    data = transforms_bytes(cameras, _matrix(asset, options, "json"), str(target))
-    return data, {"cameras": len(cameras), "frame": options.frame or "world"}
+    data = transforms_bytes(cameras, matrix, str(target))
+    return data, {"cameras": len(cameras), "frame": options.coordinates}
 
 
-def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, dict[str, Any]]:
-    from exporters.head.asset_head import head_bytes
-
+def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, Facts]:
     inputs = ["codes", "weights", "dirs"] if options.decode else ["features", "dirs"]
     return head_bytes(asset, options.decode, str(target)), {"inputs": inputs, "outputs": ["rgb"]}
 
 
 def _export_colmap(
-    asset: Asset, target: Path, options: ExportOptions, force: bool, report: Report
-) -> dict[str, Any]:
-    from exporters.formats.colmap import colmap_files
-    from exporters.formats.transforms import moved_cameras
-
-    cloud, facts = _cloud(asset, options, options.points or POINTS, report)
-    cameras = moved_cameras(asset_cameras(asset), _matrix(asset, options, "colmap"))
-    files = colmap_files(cameras, _in_frame(cloud, asset, options, "colmap"))
+    asset: Asset, target: Path, options: ExportOptions, matrix: np.ndarray, force: bool, report: Report
+) -> Facts:
+    cloud, facts = _cloud(asset, options, report)
+    cameras = moved_cameras(asset_cameras(asset), matrix)
+    files = colmap_files(cameras, cloud.transformed(matrix))
     with new_folder(target, force) as folder:
         for file_name, data in files.items():
             (folder / file_name).write_bytes(data)
-    return {
-        "file": str(target),
-        "format": "colmap",
-        "cameras": len(cameras),
-        "points": len(cloud.vertices),
-        "bounds": _bounds(cloud),
-        **facts,
-        "bytes": sum(map(len, files.values())),
-    }
+    return {"cameras": len(cameras), **facts, "bytes": sum(map(len, files.values()))}
 
 
-def _cloud(
-    asset: Asset, options: ExportOptions, n_points: int, report: Report
-) -> tuple[TriangleMesh, dict[str, Any]]:
-    from exporters.formats.points import sample_points
-
-    scene = Scene(asset, report)
-    mesh, facts = world_mesh(scene, options)
-    return sample_points(scene.painted(mesh) if "method" in facts else mesh, n_points), facts
-
-
-def _in_frame(mesh: TriangleMesh, asset: Asset, options: ExportOptions, name: str) -> TriangleMesh:
-    matrix = _matrix(asset, options, name)
-    return mesh if np.array_equal(matrix, np.eye(4)) else mesh.transformed(matrix)
-
-
-def _matrix(asset: Asset, options: ExportOptions, name: str) -> np.ndarray:
-    from exporters.formats.axes import frame_matrix
-
-    return frame_matrix(options.frame or "world", asset.world_from_model, name)
+def _cloud(asset: Asset, options: ExportOptions, report: Report) -> tuple[TriangleMesh, Facts]:
+    """Points on the surface in the world's coordinates, and what to say about them."""
+    surface = AssetSurface(asset, report)
+    mesh, facts = world_mesh(surface, options)
+    cloud = points.sample_points(
+        surface.painted(mesh) if "method" in facts else mesh, options.points or POINTS
+    )
+    return cloud, {"points": len(cloud.vertices), "bounds": bounds_of(cloud), **facts}
 
 
 def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str]]:
@@ -221,7 +198,3 @@ def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> boo
         raise OutputError(f"{target}: is part of the asset: expected a place outside {asset_path}")
     check_target(target, force)
     return force
-
-
-def _bounds(mesh: TriangleMesh) -> list[list[float]]:
-    return mesh.bounds.tolist() if len(mesh.vertices) else [[0.0] * 3] * 2

@@ -8,7 +8,7 @@ from typing import Literal
 
 from player.errors import ConfigError
 
-Frame = Literal["world", "model", "gltf", "blender"]
+Coordinates = Literal["world", "model", "gltf", "blender"]
 Method = Literal["density", "tsdf"]
 
 FORMATS = {
@@ -33,8 +33,6 @@ FOLDERS = {
 
 MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
 """The files that hold a mesh."""
-
-COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 POINTS = 100_000
 """Points of a COLMAP model, unless asked for another number."""
@@ -61,35 +59,46 @@ class ExportOptions:
     """The settings of an export; what is None or False has not been asked for."""
 
     format: str | None = None
-    """Of FOLDERS, or a suffix without its dot; None reads it off the target."""
-    frame: Frame | None = None
-    """None is the world; `exporters.formats.axes` describes them."""
+    """A name in FOLDERS, or a suffix without its dot; None reads it off the target."""
+    frame: Coordinates | None = None
+    """The coordinates of what is written, described in `exporters.formats.axes`; None is the world's."""
     crop: str | None = None
-    """`exporters.shapes.crop` reads it."""
+    """The box to keep, as `exporters.shapes.crop` reads it; None keeps all."""
     method: Method | None = None
     """Makes the surface again, by marching cubes on the density or from fused depth; None is as baked."""
     level: float | None = None
     """Density of the surface, 1/model unit; given, the surface is made again."""
     faces: int | None = None
+    """Faces of the mesh, or as few as can be reached; None keeps them."""
     lods: int | None = None
-    """Files of half the faces each, the first included."""
+    """Levels of detail, each a file with half the faces of the one before; None is one."""
     texture: int | None = None
     """Texels along each side of a picture, in place of vertex colours."""
     time_limit: float | None = None
     """Seconds that laying out a texture may take."""
     points: int | None = None
+    """Points of a cloud."""
     cameras: Path | None = None
-    """A transforms.json; None is the training cameras."""
+    """A transforms.json with the views of the pictures; None is the training cameras."""
     views: slice | None = None
+    """The views to take; None is all."""
     size: tuple[int, int] | None = None
-    """Width and height of pictures."""
+    """Width and height of pictures; None is each camera's own."""
     half: bool = False
+    """16 bits for the colours, normals and features of pictures."""
     colour: bool = False
     """Colours in a volume."""
     decode: bool = False
+    """The head takes codes and weights instead of features."""
     force: bool = False
+    """Replace what is there."""
     max_memory: float | None = None
     """Gigabytes that the asset may take when it is opened; a share of the machine's if None."""
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The coordinates of what is written, the world's unless others are asked for."""
+        return self.frame or "world"
 
 
 def check_options(target: Path, options: ExportOptions) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from exporters.formats.exr import exr_channels, exr_header, load_openexr, write_exr
+from exporters.progress import Progress, silent
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
@@ -21,7 +22,7 @@ def export_pictures(
     names: Sequence[str],
     half: bool = False,
     force: bool = False,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Render each camera, with the asset's own number of fetches, and write `target/NAME.exr`.
 
@@ -35,7 +36,7 @@ def export_pictures(
         progress: called with the number done and the total after each picture.
 
     Returns:
-        `file`, `format`, `pictures`, `channels`, `bytes`.
+        `pictures`, `channels`, `bytes`, for `exporters.export.export_asset`.
 
     Raises:
         ConfigError: no camera, or a picture that is too large.
@@ -49,18 +50,11 @@ def export_pictures(
     check_target(target, force)
     n_bytes, written = 0, []
     with new_folder(target, force) as folder, Renderer(asset) as renderer:
-        for index, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+        for done, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
             frame = renderer.render(camera, background="transparent", layers=True)
             channels = exr_channels(frame, camera, half)
             path = folder / f"{name}.exr"
             write_exr(path, channels, exr_header(camera))
             n_bytes, written = n_bytes + path.stat().st_size, list(channels)
-            if progress is not None:
-                progress(index + 1, len(cameras))
-    return {
-        "file": str(target),
-        "format": "exr",
-        "pictures": len(cameras),
-        "channels": written,
-        "bytes": n_bytes,
-    }
+            progress(done, len(cameras))
+    return {"pictures": len(cameras), "channels": written, "bytes": n_bytes}

@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from exporters.formats.transforms import check_cameras
-from exporters.options import COLMAP_FILES
 from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
 from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import ParityError
 
+COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+"""The names of a model's files."""
 TOLERANCE = 1e-9
 """Poses go through a quaternion and back, in float64."""
 

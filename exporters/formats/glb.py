@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from exporters.mesh.paint import Texture
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
-from player.errors import ConfigError, FormatError
+from exporters.shapes.texture import Texture
+from player.errors import ConfigError, FormatError, ParityError
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -128,3 +128,42 @@ def parse_glb(data: bytes, where: str) -> tuple[dict, bytes]:
             f"{where}: chunks: expected JSON and BIN that fill the file, got {kind!r}, {buffer_kind!r}"
         )
     return json.loads(data[20 : 20 + n_text]), data[28 + n_text :]
+
+
+def glb_content(data: bytes, where: str) -> dict[str, Any]:
+    """What a file that `glb_bytes` wrote holds, Y up.
+
+    Returns:
+        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 4] linear, 0..1, or, of a mesh with a
+        texture, `uvs` [n, 2], origin at the upper left, and `picture`, the bytes of a PNG file.
+
+    Raises:
+        FormatError: as `parse_glb`.
+        ParityError: the smallest and largest coordinate that the file names are not those of its vertices.
+    """
+    document, buffer = parse_glb(data, where)
+    primitive = document["meshes"][0]["primitives"][0]
+    names = primitive["attributes"]
+
+    def array(index: int, kind: str, width: int) -> np.ndarray:
+        accessor = document["accessors"][index]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        count = accessor["count"] * (1 if accessor["type"] == "SCALAR" else width)
+        return np.frombuffer(buffer, kind, count, start).reshape(-1, width)
+
+    found: dict[str, Any] = {
+        "vertices": array(names["POSITION"], "<f4", 3),
+        "normals": array(names["NORMAL"], "<f4", 3),
+        "faces": array(primitive["indices"], "<u4", 3),
+    }
+    if "COLOR_0" in names:
+        found["colours"] = array(names["COLOR_0"], "<u2", 4) / 65535
+    if "TEXCOORD_0" in names:
+        found["uvs"] = array(names["TEXCOORD_0"], "<f4", 2)
+        view = document["bufferViews"][document["images"][0]["bufferView"]]
+        found["picture"] = buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    position = document["accessors"][names["POSITION"]]
+    bounds = [found["vertices"].min(0).tolist(), found["vertices"].max(0).tolist()]
+    if bounds != [position["min"], position["max"]]:
+        raise ParityError(f"{where}: POSITION: min and max: expected those of its numbers, got {position}")
+    return found

@@ -14,10 +14,11 @@ import math
 
 import numpy as np
 
-from exporters.mesh.paint import Texture
 from exporters.shapes.mesh import TriangleMesh
-from player.errors import ConfigError
+from exporters.shapes.texture import Texture
+from player.errors import ConfigError, ParityError
 
+_TEXTURED = b"# vfr-bake: v, vt, vn, f\n"
 _CHUNK = 1 << 17  # rows turned into text at once: tens of megabytes of scratch memory
 
 
@@ -60,10 +61,10 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
             f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"
         )
     flipped = np.stack([texture.uvs[:, 0], 1 - texture.uvs[:, 1].astype(np.float64)], axis=-1)
-    head = f"# vfr-bake: v, vt, vn, f\nmtllib {stem}.mtl\nusemtl surface\n".encode()
     obj = b"".join(
         [
-            head,
+            _TEXTURED,
+            f"mtllib {stem}.mtl\nusemtl surface\n".encode(),
             *_rows("v ", mesh.vertices, _decimals(mesh)),
             *_rows("vt ", flipped, 7),
             *_rows("vn ", mesh.normals, 6),
@@ -72,6 +73,34 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     )
     mtl = f"newmtl surface\nillum 0\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd {stem}.png\n".encode()
     return {".png": texture.png(), ".mtl": mtl, ".obj": obj}
+
+
+def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:
+    """What a file that `obj_bytes` or `textured_obj_files` wrote holds.
+
+    Returns:
+        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 3] sRGB, 0..1, or, of a mesh with a
+        texture, `uvs` [n, 2], origin at the upper left.
+
+    Raises ParityError: a corner of a face has another normal or place in the picture than its vertex.
+    """
+    textured = data.startswith(_TEXTURED)
+    widths = {"v": 3, "vt": 2, "vn": 3, "f": 9} if textured else {"v": 6, "vn": 3, "f": 6}
+    rows, stop = {}, len(data)
+    for word in reversed(widths):
+        start = data.find(f"\n{word} ".encode())
+        start = start if start >= 0 else stop
+        text = data[start:stop].replace(word.encode(), b" ").replace(b"/", b" ")
+        rows[word] = np.fromstring(text.decode(), sep=" ").reshape(-1, widths[word])
+        stop = start
+    corners = rows["f"].reshape(-1, 3, widths["f"] // 3)
+    if (corners != corners[:, :, :1]).any():
+        raise ParityError(f"{where}: faces: expected the normals and places of their vertices, got others")
+    faces = corners[:, :, 0].astype(np.int64) - 1
+    found = {"vertices": rows["v"][:, :3], "normals": rows["vn"], "faces": faces}
+    if textured:
+        return {**found, "uvs": rows["vt"] * [1, -1] + [0, 1]}
+    return {**found, "colours": rows["v"][:, 3:]}
 
 
 def _decimals(mesh: TriangleMesh) -> int:

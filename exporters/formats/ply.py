@@ -1,8 +1,7 @@
 """PLY, binary little endian: the mesh inside an asset, and the format that every mesh program reads.
 
 Vertex: x y z nx ny nz float, red green blue alpha uchar (sRGB; the names are what makes Blender and MeshLab
-    show the
-colour). Face: a list of three int. `read_ply` reads this layout alone, and accounts for every byte.
+show the colour). Face: a list of three int. `read_ply` reads this layout alone, and accounts for every byte.
 """
 
 from __future__ import annotations
@@ -50,12 +49,18 @@ def ply_bytes(mesh: TriangleMesh) -> bytes:
     >>> ply_bytes(mesh).startswith(b"ply")
     True
     """
-    vertices = np.empty(len(mesh.vertices), VERTEX)
-    vertices["position"], vertices["normal"], vertices["colour"] = mesh.vertices, mesh.normals, mesh.colours
+    vertices = vertex_rows(mesh)
     faces = np.empty(len(mesh.faces), FACE)
     faces["n"], faces["corners"] = 3, mesh.faces
     header = HEADER.format(n_vertices=len(vertices), n_faces=len(faces)).encode()
     return header + vertices.tobytes() + faces.tobytes()
+
+
+def vertex_rows(mesh: TriangleMesh) -> np.ndarray:
+    """The vertices of a mesh as they are in a file, [n_vertices] of VERTEX."""
+    rows = np.empty(len(mesh.vertices), VERTEX)
+    rows["position"], rows["normal"], rows["colour"] = mesh.vertices, mesh.normals, mesh.colours
+    return rows
 
 
 def read_ply(path: Path) -> TriangleMesh:

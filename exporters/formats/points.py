@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from exporters.formats.ply import HEADER as MESH_HEADER
-from exporters.formats.ply import VERTEX
+from exporters.formats.ply import VERTEX, vertex_rows
 from exporters.shapes.mesh import TriangleMesh, crossed_edges, interpolated
 from player.errors import ConfigError, DataError, FormatError
 
@@ -65,9 +65,7 @@ def points_bytes(cloud: TriangleMesh) -> bytes:
     >>> points_bytes(empty).splitlines()[2]
     b'element vertex 0'
     """
-    points = np.empty(len(cloud.vertices), VERTEX)
-    points["position"], points["normal"], points["colour"] = cloud.vertices, cloud.normals, cloud.colours
-    return HEADER.format(n_vertices=len(points)).encode() + points.tobytes()
+    return HEADER.format(n_vertices=len(cloud.vertices)).encode() + vertex_rows(cloud).tobytes()
 
 
 def parse_points(data: bytes, where: str) -> np.ndarray:

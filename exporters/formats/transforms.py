@@ -21,7 +21,7 @@ def transforms_bytes(cameras: Sequence[Camera], matrix: np.ndarray, where: str) 
 
     Args:
         cameras: at least one, world frame.
-        matrix: [4, 4] similarity, as `exporters.formats.axes.frame_matrix` makes it.
+        matrix: [4, 4] similarity, as `exporters.formats.axes.coordinates_from_world` makes it.
         where: the file's name in an error message.
 
     Raises:

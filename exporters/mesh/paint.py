@@ -1,64 +1,41 @@
-"""A picture on a mesh: which texel lies where on the surface, its colour, and the padding around the charts.
+"""The texture of a mesh that has been laid out: which texel lies where on it, its colour, and the padding.
 
-Letters: (u, v) in 0..1 with the origin at the upper left corner of the picture, as in glTF; the texel in
-row r and column c has its centre at u = (c + 1/2) / size, v = (r + 1/2) / size. A texel belongs to the face
-whose triangle holds its centre; all others take the colour of the nearest one that has a face, so that
-neither linear filtering nor smaller copies of the picture show what is between the charts.
+Letters as in `exporters.shapes.texture`. A texel belongs to the face whose triangle holds its centre; all
+others take the colour of the nearest one that has a face, so that neither linear filtering nor smaller copies
+of the picture show what is between the charts.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from exporters.extras import needs
+from exporters.shapes.colour import KnownColours, to_bytes
 from exporters.shapes.mesh import TriangleMesh
-from player.errors import DataError, ShapeError
+from exporters.shapes.texture import Texture
+from player.errors import DataError
 
 _AT_ONCE = 1 << 22  # candidate texels looked at together
 
-
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """A square picture and where a mesh's vertices are in it.
-
-    Raises ShapeError: an array has another shape or type.
-
-    >>> Texture(np.zeros((3, 2), np.float32), np.zeros((4, 4, 3), np.uint8)).image.shape
-    (4, 4, 3)
-    """
-
-    uvs: np.ndarray
-    """[n_vertices, 2] float32, 0..1, origin at the upper left."""
-    image: np.ndarray
-    """[size, size, 3] uint8, sRGB."""
-
-    def __post_init__(self) -> None:
-        if self.uvs.shape != (len(self.uvs), 2) or self.uvs.dtype != np.float32:
-            raise ShapeError(f"texture: uvs: expected [n, 2] float32, got {self.uvs.shape} {self.uvs.dtype}")
-        size = len(self.image)
-        if self.image.shape != (size, size, 3) or self.image.dtype != np.uint8:
-            raise ShapeError(
-                f"texture: image: expected [size, size, 3] uint8, got {self.image.shape} {self.image.dtype}"
-            )
-
-    def png(self) -> bytes:
-        """The picture as a PNG file; the same picture gives the same bytes."""
-        from PIL import Image
-
-        data = io.BytesIO()
-        Image.fromarray(self.image).save(data, "PNG")
-        return data.getvalue()
+ColourPoints = Callable[[np.ndarray, np.ndarray], KnownColours]
+"""The colours of points [n, 3] with unit normals [n, 3]."""
 
 
-Colours = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(points [n, 3], normals [n, 3]) -> rgb [n, 3] in 0..1, and which points have one [n] bool."""
+class CoveredTexels(NamedTuple):
+    """Texels whose centre a face holds."""
+
+    texels: np.ndarray
+    """[n] int64, row * size + column."""
+    faces: np.ndarray
+    """[n] int64, the face that holds the centre."""
+    shares: np.ndarray
+    """[n, 3] float64, what each corner of the face counts there, of sum 1."""
 
 
-def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: Colours) -> Texture:
+def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints) -> Texture:
     """The texture of a mesh that has been laid out.
 
     Args:
@@ -71,59 +48,47 @@ def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: Colours) -> T
         DataError: no texel is covered, or none has a colour.
         MissingExtraError: scipy is not installed.
     """
-    texels, face, shares = covered_texels(uvs, mesh.faces, size)
+    texels, faces, shares = covered_texels(uvs, mesh.faces, size)
     if not len(texels):
         raise DataError(f"--texture: expected a texel under some face at size {size}, got none")
-    points, normals = mesh.at(face, shares)
-    rgb, known = colours(points, normals)
+    rgb, known = colours(*mesh.at(faces, shares))
     if not known.any():
-        raise DataError(f"--texture: expected colours on the surface, got none at {len(points)} points")
-    texels, rgb = texels[known], rgb[known]
-    image = np.zeros((size * size, 3), np.uint8)
-    image[texels] = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    covered = np.zeros(size * size, bool)
-    covered[texels] = True
-    return Texture(uvs.astype(np.float32), padded(image.reshape(size, size, 3), covered.reshape(size, size)))
+        raise DataError(f"--texture: expected colours on the surface, got none at {len(texels)} points")
+    image = np.zeros((size, size, 3), np.uint8)
+    image.reshape(-1, 3)[texels[known]] = to_bytes(rgb[known])
+    covered = np.zeros((size, size), bool)
+    covered.reshape(-1)[texels[known]] = True
+    return Texture(uvs.astype(np.float32), padded(image, covered))
 
 
-def covered_texels(
-    uvs: np.ndarray, faces: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Texels whose centre a face holds.
+def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> CoveredTexels:
+    """The texels that the faces of a mesh cover, ascending, each once, with the first face that holds it.
 
     Args:
         uvs: [n_vertices, 2], 0..1.
         faces: [n_faces, 3] integers.
         size: texels along each side.
 
-    Returns:
-        texels [n] int64, row * size + column, ascending, each once; face [n] int64, the first that holds its
-        centre; shares [n, 3] float64 of the face's corners, of sum 1.
-
     >>> square = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
-    >>> texels, face, shares = covered_texels(square, np.array([[0, 1, 2], [1, 3, 2]]), 2)
-    >>> texels.tolist(), face.tolist()
+    >>> covered = covered_texels(square, np.array([[0, 1, 2], [1, 3, 2]]), 2)
+    >>> covered.texels.tolist(), covered.faces.tolist()
     ([0, 1, 2, 3], [0, 0, 0, 1])
     """
     corners = np.asarray(uvs, np.float64)[faces] * size - 0.5  # texel centres are at whole numbers
     low = np.clip(np.ceil(corners.min(axis=1) - 1e-9), 0, size).astype(np.int64)
     high = np.clip(np.floor(corners.max(axis=1) + 1e-9), -1, size - 1).astype(np.int64)
     extent = np.maximum(high - low + 1, 0)
-    n_candidates = extent[:, 0] * extent[:, 1]
-    ends = np.cumsum(n_candidates)
-    found = []
+    ends = np.cumsum(extent[:, 0] * extent[:, 1])
+    found = [CoveredTexels(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     start = 0
     while start < len(faces):
         base = ends[start - 1] if start else 0
         stop = max(int(np.searchsorted(ends, base + _AT_ONCE, side="right")), start + 1)
         found.append(_inside(corners, low, extent, np.arange(start, stop), size))
         start = stop
-    if not found:
-        none = np.zeros(0, np.int64)
-        return none, none, np.zeros((0, 3))
     texels, face, shares = (np.concatenate(column) for column in zip(*found, strict=True))
     unique, first = np.unique(texels, return_index=True)
-    return unique, face[first], shares[first]
+    return CoveredTexels(unique, face[first], shares[first])
 
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
@@ -135,10 +100,14 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 
 def _inside(
-    corners: np.ndarray, low: np.ndarray, extent: np.ndarray, rows: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    counts = extent[rows, 0] * extent[rows, 1]
-    face = np.repeat(rows, counts)
+    corners: np.ndarray, low: np.ndarray, extent: np.ndarray, faces: np.ndarray, size: int
+) -> CoveredTexels:
+    """The texels that the faces numbered `faces` hold, out of all in the boxes around them.
+
+    `corners` [n_faces, 3, 2], in texels; the boxes begin at `low` [n_faces, 2] and are `extent` wide.
+    """
+    counts = extent[faces, 0] * extent[faces, 1]
+    face = np.repeat(faces, counts)
     place = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts)
     y, x = np.divmod(place, np.maximum(extent[face, 0], 1))
     column, row = low[face, 0] + x, low[face, 1] + y
@@ -146,11 +115,10 @@ def _inside(
     area = _cross(b - a, c - a)
     p = np.stack([column, row], axis=-1).astype(np.float64)
     flat = np.abs(area) < 1e-12
-    safe = np.where(flat, 1, area)
     shares = np.stack([_cross(c - b, p - b), _cross(a - c, p - c), _cross(b - a, p - a)], axis=-1)
-    shares /= safe[:, None]
+    shares /= np.where(flat, 1, area)[:, None]
     kept = (shares >= -1e-9).all(axis=-1) & ~flat
-    return (row * size + column)[kept], face[kept], shares[kept]
+    return CoveredTexels((row * size + column)[kept], face[kept], shares[kept])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -13,11 +13,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from exporters.progress import Progress, silent
 from exporters.shapes.mesh import TriangleMesh, crossed_edges
 from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
@@ -31,7 +31,7 @@ _POLL = 0.1  # seconds
 
 
 def unwrap(
-    mesh: TriangleMesh, size: int, seconds: float, progress: Callable[[int, int], object] | None = None
+    mesh: TriangleMesh, size: int, seconds: float, progress: Progress = silent
 ) -> tuple[TriangleMesh, np.ndarray]:
     """A mesh cut along seams, and where its vertices are in a square picture.
 
@@ -73,7 +73,8 @@ def unwrap(
     return cut, np.clip(uvs, 0, 1).astype(np.float32)
 
 
-def _run(folder: Path, seconds: float, n_faces: int, progress: Callable[[int, int], object] | None) -> None:
+def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None:
+    """Start the other process and wait until it has written atlas.npz into `folder`."""
     begin = time.monotonic()
     command = python_command("exporters.mesh.unwrap", str(folder))
     with (folder / "errors").open("wb") as errors:
@@ -87,7 +88,7 @@ def _run(folder: Path, seconds: float, n_faces: int, progress: Callable[[int, in
                         f"--texture: laying out {n_faces} faces: expected an end within {seconds:g} seconds, "
                         "got none: ask for fewer with --faces, or more time with --time-limit"
                     )
-                if progress is not None and int(passed) > shown:
+                if int(passed) > shown:
                     shown = int(passed)
                     progress(shown, max(int(seconds), shown + 1))
                 time.sleep(_POLL)

@@ -1,12 +1,24 @@
-"""sRGB and linear light: the two curves of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear).
+"""Colours: sRGB and linear light, bytes, and colours that not every point has.
 
+The two curves are those of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear).
 Pictures, PLY and OBJ hold sRGB; glTF vertex colours (COLOR_0) and EXR hold linear light.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
+
+
+class KnownColours(NamedTuple):
+    """Colours of n points, as far as they are known."""
+
+    rgb: np.ndarray
+    """[n, 3] float32 or float64 sRGB, 0..1."""
+    known: np.ndarray
+    """[n] bool: whether the point has a colour."""
 
 
 def linear_from_srgb(srgb: ArrayLike) -> np.ndarray:
@@ -27,3 +39,12 @@ def srgb_from_linear(linear: ArrayLike) -> np.ndarray:
     """
     value = np.asarray(linear, np.float64)
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0) ** (1 / 2.4) - 0.055)
+
+
+def to_bytes(srgb: np.ndarray) -> np.ndarray:
+    """uint8 values nearest to numbers in [0, 1], any shape; what lies outside is clipped, halves go to even.
+
+    >>> to_bytes(np.array([-0.1, 0.5, 1.0])).tolist()
+    [0, 128, 255]
+    """
+    return np.rint(np.clip(srgb, 0, 1) * 255).astype(np.uint8)

@@ -7,10 +7,22 @@ that a world far from its origin survives the arithmetic and is rounded to float
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from player.errors import ConfigError, FormatError, ShapeError
+
+
+class Surface(NamedTuple):
+    """A mesh that has no colours yet."""
+
+    vertices: np.ndarray
+    """[n_vertices, 3] float64."""
+    faces: np.ndarray
+    """[n_faces, 3] int32, counter-clockwise seen from outside, where the density is lower."""
+    normals: np.ndarray
+    """[n_vertices, 3] float64, unit, outwards."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +87,8 @@ class TriangleMesh:
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     def transformed(self, matrix: np.ndarray) -> TriangleMesh:
-        """The mesh in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale > 0,
-        translation).
+        """The mesh in other coordinates; `matrix` [4, 4] is a similarity (rotation, uniform scale > 0,
+        translation). The identity gives the mesh itself.
 
         Raises ConfigError for any other matrix: a shear or a mirror would need other normals and another
         winding.
@@ -84,6 +96,8 @@ class TriangleMesh:
         matrix = np.asarray(matrix, np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise ConfigError(f"mesh: matrix: expected [4, 4] finite numbers, got shape {matrix.shape}")
+        if np.array_equal(matrix, np.eye(4)):
+            return self
         linear = matrix[:3, :3]
         scale = np.cbrt(np.linalg.det(linear))
         if (

@@ -89,7 +89,7 @@ def asset_volume(
 
     Args:
         asset: an open asset.
-        frame_from_world: [4, 4] similarity, as `exporters.formats.axes.frame_matrix` makes it.
+        frame_from_world: [4, 4] similarity, as `exporters.formats.axes.coordinates_from_world` makes it.
         box: keep the vertices in it (world units); None keeps all.
         colour: ask the head for colours too.
 

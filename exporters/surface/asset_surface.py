@@ -4,16 +4,17 @@ training camera sees is taken away.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
 from exporters.mesh.rays import MeshRays
-from exporters.options import Method
-from exporters.shapes.mesh import TriangleMesh, take_faces
+from exporters.progress import Report
+from exporters.shapes.colour import KnownColours, to_bytes
+from exporters.shapes.mesh import Surface, TriangleMesh, take_faces
 from exporters.surface.components import remove_small_components
 from exporters.surface.depth_views import (
     FULL_PIXELS,
@@ -26,6 +27,7 @@ from exporters.surface.depth_views import (
 from exporters.surface.fitted_colours import fit_colours
 from exporters.surface.marching_cubes import extract_asset_surface, voxel_size
 from exporters.surface.shaded_colours import surface_colours
+from exporters.surface.tsdf import fuse_depth
 from player.asset.asset import Asset
 from player.errors import DataError, MissingExtraError
 
@@ -35,96 +37,95 @@ FLOATER_FRACTION = 1e-4
 FIT_TOLERANCE = 3.0
 """Voxels between a pixel's depth and the mesh at which the pixel's colour still counts for it."""
 
-Report = Callable[[str, int, int], object]
-"""Called with (stage, done, of)."""
 
-
-@dataclass(frozen=True)
-class Removed:
+class Removed(NamedTuple):
     """What cleaning took away."""
 
-    unseen: int
+    unseen_faces: int
     """Faces that no training camera sees."""
     floaters: int
     """Parts that were too small."""
     floater_faces: int
+    """Their faces."""
 
 
-class Scene:
-    """An asset whose training cameras are played once, when somebody first asks what they see."""
+class AssetSurface:
+    """Meshes of an asset's surface, in the world. The training cameras are played once, when somebody first
+    asks what they see."""
 
     def __init__(self, asset: Asset, report: Report, max_pixels: int = SMALL_PIXELS) -> None:
         self.asset = asset
         self.report = report
         self.max_pixels = max_pixels
-        """Of each view."""
+        """Pixels of each view that is played, at most."""
 
     @cached_property
     def views(self) -> list[DepthView]:
         """What the training cameras see."""
-        return depth_views(self.asset, self.max_pixels, lambda done, of: self.report("views", done, of))
+        return self._played(self.max_pixels)
 
     @property
     def voxel(self) -> float:
         """Edge of the asset's voxels, world units."""
         return voxel_size(self.asset.grid) * self.asset.scale
 
-    def coloured(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`exporters.surface.shaded_colours.surface_colours` of this asset."""
-        return surface_colours(
-            self.asset, points, normals, self.views, lambda done, of: self.report("colours", done, of)
-        )
-
-    def surface(self, method: Method, level: float | None, stride: int = 1) -> tuple[TriangleMesh, Removed]:
-        """The surface made again, white, and what was removed of it.
+    def from_density(self, level: float | None = None, stride: int = 1) -> tuple[TriangleMesh, Removed]:
+        """The surface by marching cubes on the asset's density, white, and what was removed of it.
 
         Args:
-            method: "density", marching cubes on the asset's density; "tsdf", depth pictures fused.
-            level: density of the surface in 1/model unit, for "density".
-            stride: of `exporters.surface.marching_cubes.extract_asset_surface`, for "density".
+            level: density of the surface, 1/model unit.
+            stride: see `exporters.surface.marching_cubes.extract_asset_surface`, which has the defaults.
 
         Raises:
             ConfigError: a level outside the data.
             DataError: there is no surface, or nothing of it is seen.
-            MissingExtraError: a package is not installed.
+            MissingExtraError: scikit-image or scipy is not installed.
         """
+        surface = extract_asset_surface(
+            self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100), stride
+        )
         matrix = self.asset.world_from_model
-        if method == "tsdf":
-            from exporters.surface.tsdf import fuse_depth
+        vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        normals = surface.normals @ matrix[:3, :3].T / self.asset.scale
+        return self._cleaned(Surface(vertices, surface.faces, normals))
 
-            full = depth_views(self.asset, FULL_PIXELS, lambda done, of: self.report("views", done, of))
-            vertices, faces, normals = fuse_depth(
-                full, self.voxel, lambda done, of: self.report("fusion", done, of)
-            )
-        else:
-            vertices, faces, normals = extract_asset_surface(
-                self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100), stride
-            )
-            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            normals = normals @ matrix[:3, :3].T / self.asset.scale
-        mesh = TriangleMesh(vertices, faces, normals, np.full((len(vertices), 4), 255, np.uint8))
-        return cleaned(mesh, self.views, TOLERANCE * self.voxel)
+    def from_depth(self) -> tuple[TriangleMesh, Removed]:
+        """The surface that the training cameras' pictures of depth agree on, white, and what was removed of
+        it.
+
+        Raises:
+            DataError: there is no surface, or nothing of it is seen.
+            MissingExtraError: Open3D or scipy is not installed.
+        """
+        views = self._played(FULL_PIXELS)
+        return self._cleaned(fuse_depth(views, self.voxel, partial(self.report, "fusion")))
+
+    def shaded(self, points: np.ndarray, normals: np.ndarray) -> KnownColours:
+        """What the asset's head says of points [n, 3] on the surface with unit normals [n, 3]
+        (`exporters.surface.shaded_colours`)."""
+        return surface_colours(self.asset, points, normals, self.views, partial(self.report, "colours"))
 
     def painted(self, mesh: TriangleMesh) -> TriangleMesh:
         """A mesh on the surface with the colours that fit the training views best
         (`exporters.surface.fitted_colours`); where they see nothing, and where Open3D is not to be had, the
         head's own."""
         try:
-            rgb, known = fit_colours(
-                mesh,
-                self.views,
-                FIT_TOLERANCE * self.voxel,
-                lambda done, of: self.report("colours", done, of),
-            )
+            tolerance = FIT_TOLERANCE * self.voxel
+            rgb, known = fit_colours(mesh, self.views, tolerance, partial(self.report, "colours"))
         except MissingExtraError:
             rgb, known = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices), bool)
         rest = np.flatnonzero(~known)
-        rgb[rest], known[rest] = self.coloured(mesh.vertices[rest], mesh.normals[rest])
+        rgb[rest], known[rest] = self.shaded(mesh.vertices[rest], mesh.normals[rest])
         colours = mesh.colours.copy()
-        colours[:, :3] = np.rint(np.clip(rgb, 0, 1) * 255)
-        if not known.all():  # beside the volume: what the corners around it are
-            colours = _from_around(colours, known, mesh.faces)
-        return replace(mesh, colours=colours)
+        colours[:, :3] = to_bytes(rgb)
+        return replace(mesh, colours=_from_around(colours, known, mesh.faces))
+
+    def _played(self, max_pixels: int) -> list[DepthView]:
+        return depth_views(self.asset, max_pixels, partial(self.report, "views"))
+
+    def _cleaned(self, surface: Surface) -> tuple[TriangleMesh, Removed]:
+        white = np.full((len(surface.vertices), 4), 255, np.uint8)
+        return cleaned(TriangleMesh(*surface, white), self.views, TOLERANCE * self.voxel)
 
 
 def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tuple[TriangleMesh, Removed]:
@@ -151,16 +152,18 @@ def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tup
 def _hit_vertices(mesh: TriangleMesh, views: list[DepthView]) -> np.ndarray:
     """[n_vertices] bool: corners of the faces that pixels of the views hit."""
     rays = MeshRays(mesh)
-    hit = np.zeros(len(mesh.faces), bool)
-    for view in views:
-        hit[rays.seen_by(view.camera).faces] = True
     seen = np.zeros(len(mesh.vertices), bool)
-    seen[mesh.faces[hit]] = True
+    for view in views:
+        seen[mesh.faces[rays.seen_by(view.camera).faces]] = True
     return seen
 
 
 def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Colours [n, 4], those not known taken from the known corners of their faces, then of theirs."""
+    """Colours [n, 4] with those that are not `known` [n] taken from the known corners around them.
+
+    Ring after ring, a face has the mean of its known corners and an unknown corner the mean of its faces. A
+    corner that no faces connect with a known one keeps its colour; alpha stays.
+    """
     colours, known = colours.copy(), known.copy()
     while not known.all():
         open_ = faces[(~known)[faces].any(axis=1) & known[faces].any(axis=1)]
@@ -169,9 +172,8 @@ def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> n
         weight = known[open_].sum(axis=1)
         mean = (colours[open_, :3] * known[open_][..., None]).sum(axis=1) / weight[:, None]
         total, count = np.zeros((len(colours), 3)), np.zeros(len(colours))
-        for k in range(3):
-            np.add.at(total, open_[:, k], mean)
-            np.add.at(count, open_[:, k], 1)
+        np.add.at(total, open_.T, mean)
+        np.add.at(count, open_.T, 1)
         fresh = ~known & (count > 0)
         colours[fresh, :3] = np.rint(total[fresh] / count[fresh, None])
         known |= fresh

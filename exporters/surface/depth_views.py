@@ -7,11 +7,11 @@ plus a tolerance; where the picture is less than half opaque nothing is in the w
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from exporters.progress import Progress, silent
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
@@ -28,9 +28,6 @@ SOLID = 0.5
 TOLERANCE = 2.0
 """Voxels behind the depth of a pixel at which a point still counts as seen: that depth is a mean."""
 
-Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
-
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
@@ -44,9 +41,7 @@ class DepthView:
     """[height, width, 3] uint8 sRGB, straight: not mixed with what is behind."""
 
 
-def depth_views(
-    asset: Asset, max_pixels: int = SMALL_PIXELS, progress: Progress | None = None
-) -> list[DepthView]:
+def depth_views(asset: Asset, max_pixels: int = SMALL_PIXELS, progress: Progress = silent) -> list[DepthView]:
     """The training cameras' pictures, at most MAX_VIEWS of `max_pixels` each.
 
     Raises FormatError if the asset's cameras are damaged.
@@ -55,13 +50,12 @@ def depth_views(
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).round().astype(int))
     views = []
     with Renderer(asset) as renderer:
-        for done, index in enumerate(chosen):
+        for index in chosen:
             camera = _small(cameras[index], max_pixels)
             frame = renderer.render(camera, background="transparent")
             distance = np.where(frame.opacity >= SOLID, frame.depth, np.float32(np.inf))
             views.append(DepthView(camera, distance.astype(np.float32), frame.to_uint8()[..., :3].copy()))
-            if progress is not None:
-                progress(done + 1, len(chosen))
+            progress(len(views), len(chosen))
     return views
 
 
@@ -97,7 +91,7 @@ def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, to
 def seen_vertices(
     views: list[DepthView], points: np.ndarray, normals: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """[n] bool: whether any view sees each point; arguments as `cosines_in_view`."""
+    """[n] bool: whether any view sees each point; the arguments are those of `cosines_in_view`."""
     seen = np.zeros(len(points), bool)
     for view in views:
         rest = np.flatnonzero(~seen)
@@ -106,8 +100,8 @@ def seen_vertices(
 
 
 def _farthest_around(distance: np.ndarray) -> np.ndarray:
-    """[height + 1, width + 1] the largest of the up to four pixels around each corner of a picture, of those
-    that hit something: nothing inside a solid is seen past its outline."""
+    """[height + 1, width + 1] distances at the corners of pixels: the largest of the up to four pixels around
+    that hit something, so that nothing inside a solid is seen past its outline; else infinite."""
     padded = np.pad(np.where(np.isfinite(distance), distance, np.float32(-1)), 1, constant_values=-1)
     farthest = np.maximum(
         np.maximum(padded[:-1, :-1], padded[1:, :-1]), np.maximum(padded[:-1, 1:], padded[1:, 1:])
@@ -116,6 +110,7 @@ def _farthest_around(distance: np.ndarray) -> np.ndarray:
 
 
 def _small(camera: Camera, max_pixels: int) -> Camera:
+    """The camera with at most so many pixels."""
     share = (max_pixels / (camera.width * camera.height)) ** 0.5
     if share >= 1:
         return camera

@@ -11,13 +11,14 @@ as the mesh: there, the mesh misses something thin or has something too much.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from exporters.extras import needs
 from exporters.mesh.rays import MeshRays
+from exporters.progress import Progress, silent
+from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.depth_views import DepthView
 
@@ -25,13 +26,10 @@ SMOOTH = 0.03
 """What an edge counts, in pixels."""
 _ROUNDS = 40  # of conjugate gradients; the bytes of the colours settle in about twenty
 
-Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
-
 
 def fit_colours(
-    mesh: TriangleMesh, views: list[DepthView], tolerance: float, progress: Progress | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+    mesh: TriangleMesh, views: list[DepthView], tolerance: float, progress: Progress = silent
+) -> KnownColours:
     """Colours of a mesh's vertices, fitted to views.
 
     Args:
@@ -41,8 +39,8 @@ def fit_colours(
         progress: called with (done, of) after each view.
 
     Returns:
-        rgb [n_vertices, 3] float64 sRGB, 0..1; known [n_vertices] bool: False where no pixel counts for the
-        vertex, nor for one that faces connect it with.
+        rgb [n_vertices, 3] float64; a vertex is known if a pixel counts for it, or for one that faces connect
+        it with.
 
     Raises MissingExtraError: Open3D or scipy is not installed.
     """
@@ -51,7 +49,7 @@ def fit_colours(
         from scipy.sparse import csr_matrix
     n = len(mesh.vertices)
     square, right, count = _smoothness(mesh.faces, n) * SMOOTH, np.zeros((n, 3)), np.zeros(n)
-    for done, view in enumerate(views):
+    for done, view in enumerate(views, start=1):
         hits = rays.seen_by(view.camera)
         expected = view.distance.reshape(-1)[hits.pixels]
         counted = np.isfinite(expected)
@@ -62,8 +60,7 @@ def fit_colours(
         square = square + rows.T @ rows
         right += rows.T @ (view.rgb.reshape(-1, 3)[hits.pixels[counted]] / 255.0)
         count += rows.T @ np.ones(len(shares))
-        if progress is not None:
-            progress(done + 1, len(views))
+        progress(done, len(views))
     return _solved(square, right, count)
 
 
@@ -78,8 +75,9 @@ def _smoothness(faces: np.ndarray, n: int) -> Any:
     return (diags(np.asarray(edges.sum(axis=1)).reshape(-1)) - edges).tocsr()
 
 
-def _solved(square: Any, right: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The colours for which `square` times them is `right`, and for which vertices anything decides."""
+def _solved(square: Any, right: np.ndarray, count: np.ndarray) -> KnownColours:
+    """The rgb for which `square` [n, n] @ rgb is `right` [n, 3]; known is what a pixel decides, there being
+    `count` [n] of them at each vertex, or edges that lead to such a vertex."""
     from scipy.sparse.csgraph import connected_components
 
     part = connected_components(square, directed=False)[1]
@@ -100,4 +98,4 @@ def _solved(square: Any, right: np.ndarray, count: np.ndarray) -> tuple[np.ndarr
         now = (left * towards).sum(axis=0)
         direction = towards + now / np.maximum(reached, 1e-30) * direction
         reached = now
-    return np.clip(colours, 0, 1), known
+    return KnownColours(np.clip(colours, 0, 1), known)

@@ -16,12 +16,13 @@ between blocks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
 from exporters.extras import needs
-from exporters.shapes.mesh import has_three_corners, unit_normals
+from exporters.progress import silent
+from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
 from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError
 
@@ -37,9 +38,9 @@ _AT_ONCE = 1 << 18
 def extract_asset_surface(
     grid: SparseGrid,
     level: float | None = None,
-    progress: Callable[[float], object] | None = None,
+    progress: Callable[[float], object] = silent,
     stride: int = 1,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Surface:
     """The surface where a grid's density equals `level`.
 
     Args:
@@ -51,9 +52,8 @@ def extract_asset_surface(
             of two up to BLOCK. Vertices are on the level all the same.
 
     Returns:
-        vertices [n_vertices, 3] float64, model frame, on the level to a hundredth of a voxel where the
-        density has a slope there; faces [n_faces, 3] int32, counter-clockwise seen from the side of lower
-        density; normals [n_vertices, 3] float64, unit, along the falling density.
+        The surface in the model frame, its vertices on the level to a hundredth of a voxel where the density
+        has a slope there, its normals along the falling density.
 
     Raises:
         ConfigError: a level outside the stored densities; the message has their range.
@@ -63,20 +63,20 @@ def extract_asset_surface(
     code_level = _code_level(grid, level)
     corners, faces = [], []
     n_corners = 0
-    for block, n_blocks, part in _blocks(grid, code_level, stride):
+    blocks = _blocks(grid)
+    for done, (block, slots) in enumerate(blocks, start=1):
+        part = _cut(grid, block, slots, code_level, stride)
         if part is not None:
             corners.append(part[0])
             faces.append(part[1] + n_corners)
             n_corners += len(part[0])
-        if progress is not None:
-            progress((block + 1) / n_blocks)
+        progress(done / len(blocks))
     if not n_corners:
         raise DataError("surface: expected a surface at this level, got none")
     g, triangles = _joined(np.concatenate(corners), np.concatenate(faces))
     g = onto_level(grid, g * stride, code_level, stride)
-    normals = _normals(grid, g, triangles, code_level)
     vertices = grid.aabb_min.astype(np.float64) + g / grid.cells_per_unit.astype(np.float64)
-    return vertices, triangles, normals
+    return Surface(vertices, triangles, _normals(grid, g, triangles, code_level))
 
 
 def voxel_size(grid: SparseGrid) -> float:
@@ -145,7 +145,7 @@ def _code_level(grid: SparseGrid, level: float | None) -> float:
     if not grid.live.any():
         raise DataError("surface: expected an asset with live cells, got none")
     low, slope = float(grid.density_low), float(grid.density_slope)
-    lowest, highest = _stored_range(grid)
+    lowest, highest = int(grid.codes.min()), int(grid.codes.max())
     least, most = math.exp(low + slope * lowest), math.exp(low + slope * highest)
     if level is None:
         level = half_opaque(grid)
@@ -159,55 +159,46 @@ def _code_level(grid: SparseGrid, level: float | None) -> float:
     return (math.log(level) - low) / slope
 
 
-def _stored_range(grid: SparseGrid) -> tuple[int, int]:
-    """Smallest and largest code at the corners of live cells, up to what their bricks hold besides."""
-    held = grid.codes
-    return int(held.min()), int(held.max())
+def _blocks(grid: SparseGrid) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The blocks that hold something: their places [3], counted in blocks, and the slots of their bricks."""
+    owners, which = np.unique(grid.slot_coords // (BLOCK // 8), axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(owners)))
+    return list(zip(owners, np.split(order, ends[:-1]), strict=True))
 
 
-def _blocks(
-    grid: SparseGrid, code_level: float, stride: int
-) -> Iterator[tuple[int, int, tuple[np.ndarray, np.ndarray] | None]]:
-    """Number of the block, how many there are, and its corners (grid coordinates over `stride`) and faces, or
-    None."""
+def _cut(
+    grid: SparseGrid, block: np.ndarray, slots: np.ndarray, code_level: float, stride: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The corners (grid coordinates over `stride`) and faces of the surface in a block, or None."""
     with needs("the mesh", "scikit-image"):
         from skimage.measure import marching_cubes
 
-    wide = BLOCK // 8
-    owner = grid.slot_coords // wide
-    names, which = np.unique(owner, axis=0, return_inverse=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(names)))
     limit = _CLIP / float(grid.density_slope)
-    for number, name in enumerate(names):
-        slots = order[ends[number - 1] if number else 0 : ends[number]]
-        volume = np.full((BLOCK + 1,) * 3, -limit, np.float32)
-        live = np.zeros((BLOCK + 1,) * 3, bool)
-        for slot in slots:
-            x, y, z = (grid.slot_coords[slot] - name * wide) * 8
-            codes = grid.codes[slot].reshape(9, 9, 9)
-            values = np.clip(codes - code_level, -limit, limit)
-            near = np.abs(values) < _NUDGE
-            values[near] = np.where(values[near] < 0, -_NUDGE, _NUDGE)
-            volume[x : x + 9, y : y + 9, z : z + 9] = values
-            bits = grid.live[slot * 64 : (slot + 1) * 64].reshape(8, 8, 1)
-            # marching_cubes asks at a cell's last corner whether the cell is to be cut
-            live[x + 1 : x + 9, y + 1 : y + 9, z + 1 : z + 9] = np.unpackbits(
-                bits, axis=2, bitorder="little"
-            ).astype(bool)
-        if stride > 1:  # a cell of the coarser grid is live if one in it is; what is not stored is empty
-            volume = np.ascontiguousarray(volume[::stride, ::stride, ::stride])
-            n = BLOCK // stride
-            cells = live[1:, 1:, 1:].reshape(n, stride, n, stride, n, stride).any(axis=(1, 3, 5))
-            live = np.pad(cells, ((1, 0),) * 3)
-        part = None
-        if volume.min() < 0 < volume.max():
-            try:
-                corners, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="ascent", mask=live)
-                part = corners.astype(np.float64) + name * (BLOCK // stride), faces.astype(np.int64)
-            except RuntimeError:  # the level is crossed, but in no live cell
-                part = None
-        yield number, len(names), part
+    volume = np.full((BLOCK + 1,) * 3, -limit, np.float32)
+    live = np.zeros((BLOCK + 1,) * 3, bool)
+    for slot in slots:
+        x, y, z = grid.slot_coords[slot] * 8 - block * BLOCK
+        values = np.clip(grid.codes[slot].reshape(9, 9, 9) - code_level, -limit, limit)
+        near = np.abs(values) < _NUDGE
+        values[near] = np.where(values[near] < 0, -_NUDGE, _NUDGE)
+        volume[x : x + 9, y : y + 9, z : z + 9] = values
+        bits = grid.live[slot * 64 : (slot + 1) * 64].reshape(8, 8, 1)
+        # marching_cubes asks at a cell's last corner whether the cell is to be cut
+        cells = np.unpackbits(bits, axis=2, bitorder="little")
+        live[x + 1 : x + 9, y + 1 : y + 9, z + 1 : z + 9] = cells.astype(bool)
+    if stride > 1:  # a cell of the coarser grid is live if one in it is; what is not stored is empty
+        volume = np.ascontiguousarray(volume[::stride, ::stride, ::stride])
+        n = BLOCK // stride
+        cells = live[1:, 1:, 1:].reshape(n, stride, n, stride, n, stride).any(axis=(1, 3, 5))
+        live = np.pad(cells, ((1, 0),) * 3)
+    if not volume.min() < 0 < volume.max():
+        return None
+    try:
+        corners, faces, _, _ = marching_cubes(volume, 0.0, gradient_direction="ascent", mask=live)
+    except RuntimeError:  # the level is crossed, but in no live cell
+        return None
+    return corners.astype(np.float64) + block * (BLOCK // stride), faces.astype(np.int64)
 
 
 def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

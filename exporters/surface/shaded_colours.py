@@ -8,11 +8,13 @@ the normal. docs/exports.md has the measurement that chose between them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from exporters.progress import Progress, silent
+from exporters.shapes.colour import KnownColours
+from exporters.shapes.mesh import unit
 from exporters.surface.depth_views import TOLERANCE, DepthView, cosines_in_view
 from exporters.surface.marching_cubes import voxel_size
 from player.asset.asset import Asset
@@ -26,18 +28,15 @@ MAX_DIRECTIONS = 4
 _RAYS = 1 << 14
 _LEAST = 0.1  # opacity below which a ray has met too little to have a colour
 
-Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
-
 
 def surface_colours(
     asset: Asset,
     points: np.ndarray,
     normals: np.ndarray,
     views: list[DepthView],
-    progress: Progress | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """sRGB colours of points on a surface, and which points have one.
+    progress: Progress = silent,
+) -> KnownColours:
+    """Colours of points on a surface.
 
     Args:
         asset: its grid and its head are asked.
@@ -47,59 +46,51 @@ def surface_colours(
         progress: called with (done, of) after each view and at the end.
 
     Returns:
-        rgb [n, 3] float32, 0..1; known [n] bool: False where no ray met anything.
+        rgb [n, 3] float32; a point is known if a ray met something there.
     """
-    with _Shader(asset) as shade:
+    with ThreadPoolExecutor(default_threads(), thread_name_prefix="vfr-export") as pool:
+        shade = _Shader(asset, pool)
         total = np.zeros((len(points), 3), np.float32)
         weight = np.zeros(len(points), np.float32)
         n_used = np.zeros(len(points), np.int32)
         tolerance = TOLERANCE * voxel_size(asset.grid) * asset.scale
-        for done, index in enumerate(_spread(len(views))):
+        for done, index in enumerate(_spread(len(views)), start=1):
             open_ = np.flatnonzero(n_used < MAX_DIRECTIONS)
             cosines = cosines_in_view(views[index], points[open_], normals[open_], tolerance)
             rows = open_[cosines > 0]
             rays = points[rows] - views[index].camera.c2w[:3, 3]
-            rgb, opacity = shade(points[rows], rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+            rgb, opacity = shade(points[rows], unit(rays, 0.0))
             counted = np.where(opacity > _LEAST, cosines[cosines > 0], 0).astype(np.float32)
             total[rows] += rgb * counted[:, None]
             weight[rows] += counted
             n_used[rows] += counted > 0
-            if progress is not None:
-                progress(done + 1, len(views) + 1)
+            progress(done, len(views) + 1)
         rest = np.flatnonzero(n_used == 0)
         rgb, opacity = shade(points[rest], -normals[rest])
         total[rest], weight[rest] = rgb, opacity > _LEAST
-        if progress is not None:
-            progress(len(views) + 1, len(views) + 1)
+        progress(len(views) + 1, len(views) + 1)
     known = weight > 0
-    return np.where(known[:, None], total / np.where(known, weight, 1)[:, None], 0), known
+    return KnownColours(np.where(known[:, None], total / np.where(known, weight, 1)[:, None], 0), known)
 
 
 class _Shader:
-    """Colours of rays, in tasks of a few threads; a context manager."""
+    """Colours of rays, as tasks of a pool of threads."""
 
-    def __init__(self, asset: Asset) -> None:
+    def __init__(self, asset: Asset, pool: ThreadPoolExecutor) -> None:
         self._asset = asset
         self._march = choose_march("auto")[1].march
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         self._model_from_world = np.linalg.inv(asset.world_from_model)
-        self._pool = ThreadPoolExecutor(default_threads(), thread_name_prefix="vfr-export")
-
-    def __enter__(self) -> _Shader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool = pool
 
     def __call__(self, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """rgb [n, 3] float32 and opacity [n] float32 seen along `dirs` [n, 3] (world) at `points` [n, 3]."""
-        rgb, opacity = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
         parts = [slice(start, start + _RAYS) for start in range(0, len(points), _RAYS)]
-        for part, (colours, solid) in zip(
-            parts, self._pool.map(lambda p: self._task(points[p], dirs[p]), parts), strict=True
-        ):
-            rgb[part], opacity[part] = colours, solid
-        return rgb, opacity
+        found = list(self._pool.map(lambda part: self._task(points[part], dirs[part]), parts))
+        if not found:
+            return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+        rgb, opacity = zip(*found, strict=True)
+        return np.concatenate(rgb), np.concatenate(opacity)
 
     def _task(self, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         matrix = self._model_from_world

@@ -7,12 +7,11 @@ out, and so are those beside a jump in depth, whose mean lies between two surfac
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from exporters.extras import require_open3d
-from exporters.shapes.mesh import has_three_corners, unit_normals
+from exporters.progress import Progress, silent
+from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
 from exporters.surface.depth_views import DepthView
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
@@ -25,9 +24,7 @@ _BLOCKS = 50_000  # of 8^3 voxels, made room for at once; it grows
 _LEAST_WEIGHT = 1.0  # views that must have seen a voxel
 
 
-def fuse_depth(
-    views: list[DepthView], voxel: float, progress: Callable[[int, int], object] | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent) -> Surface:
     """The surface that depth pictures agree on.
 
     Args:
@@ -36,8 +33,7 @@ def fuse_depth(
         progress: called with (done, of) after each view.
 
     Returns:
-        vertices [n_vertices, 3] float64, world frame; faces [n_faces, 3] int32, counter-clockwise seen from
-        the cameras; normals [n_vertices, 3] float64, unit, towards the cameras.
+        The surface in the world frame; its outside is where the cameras are.
 
     Raises:
         DataError: no view sees anything.
@@ -48,7 +44,7 @@ def fuse_depth(
     grid = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
     )
-    for done, view in enumerate(views):
+    for done, view in enumerate(views, start=1):
         camera = view.camera
         depth = reliable_depth(view, JUMP * voxel)
         if depth.any():
@@ -60,8 +56,7 @@ def fuse_depth(
             picture = open3d.t.geometry.Image(tensor(depth))
             where = (tensor(lens), tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
             grid.integrate(grid.compute_unique_block_coordinates(picture, *where), picture, *where)
-        if progress is not None:
-            progress(done + 1, len(views))
+        progress(done, len(views))
     try:
         mesh = grid.extract_triangle_mesh(weight_threshold=_LEAST_WEIGHT).to_legacy()
     except RuntimeError:  # a grid without a block
@@ -90,9 +85,9 @@ def reliable_depth(view: DepthView, jump: float) -> np.ndarray:
     return np.where(good, z, 0).astype(np.float32)
 
 
-def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices sorted by place and faces by number, whatever order they came in; normals of the faces around,
-    by area."""
+def _in_order(vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    """The surface with its vertices sorted by place and its faces by number, whatever order they came in, and
+    the mean of the faces around, by area, for normals."""
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     corners = number.reshape(-1)[faces]
     corners = corners[has_three_corners(corners)]
@@ -101,4 +96,5 @@ def _in_order(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
         [np.take_along_axis(corners, (first[:, None] + k) % 3, 1)[:, 0] for k in range(3)], axis=-1
     )
     triangles = np.unique(turned, axis=0)
-    return places, triangles.astype(np.int32), unit_normals(np.zeros_like(places), places, triangles)
+    normals = unit_normals(np.zeros_like(places), places, triangles)
+    return Surface(places, triangles.astype(np.int32), normals)

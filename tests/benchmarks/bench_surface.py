@@ -25,10 +25,10 @@ import open3d
 from PIL import Image
 
 from exporters.formats.ply import read_ply
-from exporters.options import Method
+from exporters.progress import silent
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface import shaded_colours as surface_colour
-from exporters.surface.asset_surface import Scene
+from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.marching_cubes import code_and_slope, voxel_size
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
@@ -42,21 +42,21 @@ LEVELS = (10.0, 20.0, 30.0, 40.0, 60.0, 100.0)
 
 def meshes(asset: Asset, methods: list[str]) -> Iterator[tuple[str, TriangleMesh, float]]:
     """Name, mesh, seconds of the processor."""
-    scene = Scene(asset, lambda stage, done, of: None)
+    surface = AssetSurface(asset, silent)
     for method in methods:
         start = time.process_time()
         if method == "baked":
             mesh = read_ply(asset.path("mesh.ply"))
         else:
-            mesh, removed = scene.surface(again(method), None)
-            mesh = scene.painted(mesh)
+            mesh, removed = made_again(surface, method)
+            mesh = surface.painted(mesh)
             print(f"{method}: {removed}")
         yield method, mesh, time.process_time() - start
 
 
-def again(method: str) -> Method:
-    """The way to make a surface that has this name."""
-    return "tsdf" if method == "tsdf" else "density"
+def made_again(surface: AssetSurface, method: str) -> tuple[TriangleMesh, Removed]:
+    """The surface by the method of this name, as `vfr-export --method` knows it."""
+    return surface.from_depth() if method == "tsdf" else surface.from_density()
 
 
 def cameras_of(asset: Asset, path: Path | None) -> list[Camera]:
@@ -194,8 +194,8 @@ def pictured(mesh: TriangleMesh, camera: Camera, background: np.ndarray) -> tupl
 
 def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
     """Colours at what test cameras see, by how many directions are averaged, against the volume's picture."""
-    scene = Scene(asset, lambda stage, done, of: None)
-    mesh, _ = scene.surface(again(method), None)
+    surface = AssetSurface(asset, silent)
+    mesh, _ = made_again(surface, method)
     places, normals, truth = [], [], []
     with Renderer(asset) as renderer:
         for camera in cameras:
@@ -210,7 +210,7 @@ def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
     at, normal, expected = map(np.concatenate, (places, normals, truth))
     for count in (0, 1, 2, 4, 8, 16):
         surface_colour.MAX_DIRECTIONS = count
-        rgb, _ = surface_colour.surface_colours(asset, at, normal, scene.views if count else [])
+        rgb, _ = surface_colour.surface_colours(asset, at, normal, surface.views if count else [])
         name = f"mean of {count} directions" if count else "along the normal"
         print(f"{name}: {psnr(rgb, expected):.2f} dB at {len(at):,} places", flush=True)
 

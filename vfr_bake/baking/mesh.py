@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from exporters.mesh.simplify import simplify_mesh
+from exporters.progress import Report
 from exporters.shapes.mesh import TriangleMesh
-from exporters.surface.asset_surface import Removed, Report, Scene
+from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.inner_region import inner_region
 from exporters.surface.marching_cubes import extract_asset_surface
 from player.asset.asset import Asset
@@ -32,8 +33,8 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
         report: called with (stage, done, of).
     """
     try:
-        scene = Scene(inner_region(asset), report, PIXELS)
-        mesh, removed = scene.surface("density", None, _stride(asset.grid, resolution))
+        surface = AssetSurface(inner_region(asset), report, PIXELS)
+        mesh, removed = surface.from_density(stride=_stride(asset.grid, resolution))
     except (ConfigError, DataError):  # nowhere as dense as a level, everywhere, or seen by nobody
         none = np.zeros((0, 3))
         return TriangleMesh(none, none.astype(np.int32), none, np.zeros((0, 4), np.uint8)), Removed(0, 0, 0)
@@ -42,7 +43,7 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
         mesh = simplify_mesh(mesh, n_faces)
     except MissingExtraError:
         report("fewer faces", 1, 1)
-    return scene.painted(mesh), removed
+    return surface.painted(mesh), removed
 
 
 def mesh_size(grid: SparseGrid, resolution: int) -> int:

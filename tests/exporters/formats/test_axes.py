@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from exporters import cli
-from exporters.formats.axes import FRAMES, frame_matrix
+from exporters.formats.axes import COORDINATES, coordinates_from_world
 from player.errors import ConfigError
 from tests.exporters.conftest import BOX
 from tests.player.conftest import WORLD_FROM_MODEL
@@ -34,7 +34,7 @@ def expected_bounds(frame: str, suffix: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", COORDINATES)
 def test_the_box_is_at_its_place(frame: str, suffix: str, shells_asset: Path, tmp_path: Path) -> None:
     path = tmp_path / f"box.{suffix}"
     assert cli.main([str(shells_asset), str(path), "--frame", frame]) == 0
@@ -48,7 +48,7 @@ def test_the_box_is_at_its_place(frame: str, suffix: str, shells_asset: Path, tm
 
 @pytest.mark.needs("open3d")
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb", "stl"])
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", COORDINATES)
 def test_open3d_finds_the_box_at_its_place(
     frame: str, suffix: str, shells_asset: Path, tmp_path: Path
 ) -> None:
@@ -73,9 +73,10 @@ def test_normals_turn_with_the_frame(suffix: str, shells_asset: Path, tmp_path: 
 def test_what_each_frame_is() -> None:
     world = np.array(WORLD_FROM_MODEL)
     corner = world @ [1, 1, 1, 1]
-    np.testing.assert_allclose(frame_matrix("model", world, "ply") @ corner, [1, 1, 1, 1], atol=1e-12)
-    assert np.array_equal(frame_matrix("world", world), np.eye(4))
-    assert np.array_equal(frame_matrix("blender", world, "stl"), np.eye(4))
-    assert (frame_matrix("blender", world, "obj") @ [1, 2, 3, 1]).tolist() == [1, 3, -2, 1]
+    in_model = coordinates_from_world("model", world, "ply")
+    np.testing.assert_allclose(in_model @ corner, [1, 1, 1, 1], atol=1e-12)
+    assert np.array_equal(coordinates_from_world("world", world), np.eye(4))
+    assert np.array_equal(coordinates_from_world("blender", world, "stl"), np.eye(4))
+    assert (coordinates_from_world("blender", world, "obj") @ [1, 2, 3, 1]).tolist() == [1, 3, -2, 1]
     with pytest.raises(ConfigError, match="expected one of world, model, gltf, blender, got unity"):
-        frame_matrix("unity", world)
+        coordinates_from_world("unity", world)

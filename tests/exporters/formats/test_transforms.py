@@ -11,7 +11,7 @@ import pytest
 
 from exporters import cli
 from exporters.formats import colmap
-from exporters.formats.axes import FRAMES, frame_matrix
+from exporters.formats.axes import COORDINATES, coordinates_from_world
 from exporters.formats.colmap import colmap_files
 from exporters.formats.points import sample_points
 from exporters.formats.transforms import check_cameras, moved_cameras, transforms_bytes
@@ -36,14 +36,14 @@ def trained(asset: Asset) -> list[Camera]:
     return read_cameras(asset.path("cameras.json"), (48, 40))
 
 
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", COORDINATES)
 def test_cameras_see_the_moved_mesh_where_it_was(
     frame: str, opened: Asset, shells_asset: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "cameras.json"
     assert cli.main([str(shells_asset), str(path), "--frame", frame]) == 0
     corners = box(*BOX).vertices
-    matrix = frame_matrix(frame, opened.world_from_model)
+    matrix = coordinates_from_world(frame, opened.world_from_model)
     moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
     for before, after in zip(trained(opened), read_cameras(path), strict=True):
         assert before.name == after.name

@@ -11,7 +11,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom
 
 from exporters import cli
-from exporters.formats.axes import FRAMES
+from exporters.formats.axes import COORDINATES
 from exporters.formats.parity import check_mesh_bytes
 from exporters.formats.usd import parse_usd, usd_bytes
 from exporters.shapes.colour import linear_from_srgb
@@ -40,7 +40,7 @@ def test_every_number(suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["usdc", "usda"])
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", COORDINATES)
 def test_the_box_is_at_its_place(frame: str, suffix: str, shells_asset: Path, tmp_path: Path) -> None:
     """By the library's own bounds, and the stage says which way is up in them."""
     path = tmp_path / f"box.{suffix}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exporters.shapes.mesh import TriangleMesh, take_faces
-from exporters.surface.asset_surface import Removed, Scene, cleaned
+from exporters.surface.asset_surface import AssetSurface, Removed, cleaned
 from exporters.surface.depth_views import DepthView, cosines_in_view, depth_views, seen_vertices
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
@@ -99,7 +99,7 @@ def test_what_fills_a_hole_stays() -> None:
     assert np.array_equal(kept.vertices[: len(outer.vertices)], outer.vertices)
     filling = kept.vertices[len(outer.vertices) :]
     assert 20 < len(filling) < 200 and filling[:, 0].min() > 0.7
-    assert removed.unseen > 0.9 * len(inner.faces)
+    assert removed.unseen_faces > 0.9 * len(inner.faces)
 
 
 def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
@@ -116,9 +116,9 @@ def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
 
 def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:
     stages = []
-    scene = Scene(ball_asset, lambda stage, done, of: stages.append(stage))
+    surface = AssetSurface(ball_asset, lambda stage, done, of: stages.append(stage))
     for method in ("density", "tsdf"):
-        mesh, removed = scene.surface(method, None)
+        mesh, removed = surface.from_depth() if method == "tsdf" else surface.from_density()
         centre = np.array(WORLD_FROM_MODEL)[:3] @ [*BALL_CENTRE, 1]
         outward = mesh.vertices - centre
         radius = np.linalg.norm(outward, axis=-1)
@@ -126,7 +126,7 @@ def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:
         cosines = (mesh.normals * outward).sum(-1) / radius
         # depth comes from the nearest pixel, as wide as a voxel here: steps, and thin faces at their edges
         assert cosines.min() > 0.99 if method == "density" else cosines.mean() > 0.9
-        assert removed.unseen < 0.02 * len(mesh.faces)
+        assert removed.unseen_faces < 0.02 * len(mesh.faces)
         assert (mesh.colours == 255).all()
-        assert scene.painted(mesh).colours[:, :3].std(axis=0).min() > 5
+        assert surface.painted(mesh).colours[:, :3].std(axis=0).min() > 5
     assert set(stages) == {"views", "surface", "colours", "fusion"}
