@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -88,26 +89,7 @@ def _export(argv: list[str]) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> ExportOptions:
-    return ExportOptions(
-        format=arguments.format,
-        frame=arguments.frame,
-        crop=arguments.crop,
-        method=arguments.method,
-        level=arguments.level,
-        faces=arguments.faces,
-        lods=arguments.lods,
-        texture=arguments.texture,
-        time_limit=arguments.time_limit,
-        points=arguments.points,
-        cameras=arguments.cameras,
-        views=arguments.views,
-        size=arguments.size,
-        half=arguments.half,
-        colour=arguments.colour,
-        decode=arguments.decode,
-        force=arguments.force,
-        max_memory=arguments.max_memory,
-    )
+    return ExportOptions(**{field.name: getattr(arguments, field.name) for field in fields(ExportOptions)})
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -121,58 +103,33 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
+
+    def value(name: str, metavar: str, text: str, **kind: Any) -> None:
+        add(name, metavar=metavar, help=text, **kind)
+
     add("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
     add("file", type=Path, metavar="FILE", help="file or folder to write: " + ", ".join(FORMATS) + ", DIR/")
-    add("--format", metavar="NAME", help="exr or colmap for a folder; or a suffix without its dot")
+    value("--format", "NAME", "exr or colmap for a folder; or a suffix without its dot")
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
-    add("--crop", metavar="X,Y,Z,W,D,H[,YAW]", help="only what is in this box of the world; or a .json file")
-    add(
-        "--faces",
-        type=whole(example=100000),
-        metavar="N",
-        help="simplify the mesh to N faces, or as few as can be reached",
-    )
-    add(
-        "--lods",
-        type=whole(example=3),
-        metavar="N",
-        help="levels of detail: N files, each of half the faces of the last",
-    )
-    add(
-        "--method", choices=("density", "tsdf"), help="make the surface again: marching cubes, or fused depth"
-    )
-    add(
-        "--level",
-        type=number("a density", "12.5"),
-        metavar="X",
-        help="density of the surface, 1/model unit (half opaque: two steps)",
-    )
-    add(
-        "--texture",
-        type=whole(example=2048),
-        metavar="N",
-        help="obj, glb: colours in a picture of N x N (needs xatlas)",
-    )
-    add(
-        "--time-limit",
-        type=number("seconds", "300"),
-        metavar="S",
-        help="seconds that laying out a texture may take (300)",
-    )
-    add(
-        "--points",
-        type=whole(example=200000),
-        metavar="N",
-        help=f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})",
-    )
-    add("--cameras", type=Path, metavar="FILE", help="views of a transforms.json (the training cameras)")
-    add("--views", type=part, metavar="A:B", help="a slice of the views, as in Python")
-    add("--size", type=size, metavar="WxH", help="size of the pictures (the cameras' own)")
+    value("--crop", "X,Y,Z,W,D,H[,YAW]", "only what is in this box of the world; or a .json file")
+    faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
+    value("--faces", "N", "simplify the mesh to N faces, or as few as can be reached", type=faces)
+    value("--lods", "N", "levels of detail: N files, each of half the faces of the last", type=lods)
+    methods = ("density", "tsdf")
+    add("--method", choices=methods, help="make the surface again: marching cubes, or fused depth")
+    density, seconds = number("a density", "12.5"), number("seconds", "300")
+    value("--level", "X", "density of the surface, 1/model unit (half opaque: two steps)", type=density)
+    value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
+    value("--time-limit", "S", "seconds that laying out a texture may take (300)", type=seconds)
+    value("--points", "N", f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})", type=cloud)
+    value("--cameras", "FILE", "views of a transforms.json (the training cameras)", type=Path)
+    value("--views", "A:B", "a slice of the views, as in Python", type=part)
+    value("--size", "WxH", "size of the pictures (the cameras' own)", type=size)
     add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
     add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
     add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
     add("--force", action="store_true", help="replace FILE if it exists")
-    add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
+    value("--max-memory", "GB", MAX_MEMORY, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
     return parser
 
