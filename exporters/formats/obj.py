@@ -18,6 +18,7 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from player.errors import ConfigError, ParityError
 
+_PLAIN = b"# vfr-bake: v x y z r g b (sRGB), vn, f\n"
 _TEXTURED = b"# vfr-bake: v, vt, vn, f\n"
 _CHUNK = 1 << 17  # rows turned into text at once: tens of megabytes of scratch memory
 
@@ -33,14 +34,8 @@ def obj_bytes(mesh: TriangleMesh) -> bytes:
     >>> print(obj_bytes(mesh).decode().splitlines()[-1])
     f 1//1 2//2 3//3
     """
-    decimals = _decimals(mesh)
-    parts = [b"# vfr-bake: v x y z r g b (sRGB), vn, f\n"]
-    for start in range(0, len(mesh.vertices), _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        position = _fixed(mesh.vertices[rows], decimals)
-        colour = _fixed(mesh.colours[rows, :3] / 255, 4)
-        parts.append(_lines(["v ", *_joined([*position, *colour], " "), "\n"]))
-    return b"".join([*parts, *_rows("vn ", mesh.normals, 6), *_faces(mesh.faces, "//", 2)])
+    vertices = _rows("v ", (mesh.vertices, _decimals(mesh)), (mesh.colours[:, :3] / 255, 4))
+    return b"".join([_PLAIN, *vertices, *_rows("vn ", (mesh.normals, 6)), *_faces(mesh.faces, "//", 2)])
 
 
 def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[str, bytes]:
@@ -65,9 +60,9 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
         [
             _TEXTURED,
             f"mtllib {stem}.mtl\nusemtl surface\n".encode(),
-            *_rows("v ", mesh.vertices, _decimals(mesh)),
-            *_rows("vt ", flipped, 7),
-            *_rows("vn ", mesh.normals, 6),
+            *_rows("v ", (mesh.vertices, _decimals(mesh))),
+            *_rows("vt ", (flipped, 7)),
+            *_rows("vn ", (mesh.normals, 6)),
             *_faces(mesh.faces, "/", 3),
         ]
     )
@@ -110,12 +105,14 @@ def _decimals(mesh: TriangleMesh) -> int:
     return min(max(8 - math.floor(math.log10(largest)), 0), 15) if largest else 1
 
 
-def _rows(word: str, values: np.ndarray, decimals: int) -> list[bytes]:
-    """`values` [n, m], a line each."""
-    return [
-        _lines([word, *_joined(_fixed(values[start : start + _CHUNK], decimals), " "), "\n"])
-        for start in range(0, len(values), _CHUNK)
-    ]
+def _rows(word: str, *columns: tuple[np.ndarray, int]) -> list[bytes]:
+    """Lines that begin with `word`: a row each of arrays [n, m], side by side, and how many decimals each
+    has."""
+    lines = []
+    for start in range(0, len(columns[0][0]), _CHUNK):
+        rows = [_fixed(values[start : start + _CHUNK], decimals) for values, decimals in columns]
+        lines.append(_lines([word, *_joined([number for row in rows for number in row], " "), "\n"]))
+    return lines
 
 
 def _faces(faces: np.ndarray, separator: str, n_times: int) -> list[bytes]:

@@ -199,70 +199,81 @@ def _parse(data: bytes) -> dict[str, VdbGrid]:
     magic, version, *_ = struct.unpack_from("<qIII?", data)
     if (magic, version) != (_MAGIC, _VERSION):
         raise ValueError(f"magic {magic:#x}, version {version}")
-    at = _skip_metadata(data, 57)
-    (n_grids,) = struct.unpack_from("<i", data, at)
-    at += 4
+    file = _Reader(data, 57)
+    file.skip_metadata()
+    (n_grids,) = file.take("<i")
+    widths = {kind: width for width, kind in _TYPES.items()}
     grids = {}
     for _ in range(n_grids):
-        name, at = _read_text(data, at)
-        kind, at = _read_text(data, at)
-        _, at = _read_text(data, at)
-        start, _, end = struct.unpack_from("<qqq", data, at)
-        if start != at + 24:
+        name, kind, _ = file.text(), file.text(), file.text()
+        start, _, end = file.take("<qqq")
+        if start != file.at:
             raise ValueError(f"grid {name} at byte {start}")
-        width = {text: width for width, text in _TYPES.items()}.get(kind, 0)
-        grids[name] = _read_grid(data, start, end, width)
-        at = end
-    if at != len(data):
-        raise ValueError(f"{len(data) - at} bytes after the last grid")
+        grids[name] = _read_grid(file, widths.get(kind, 0))
+        if file.at != end:
+            raise ValueError(f"a grid that ends at byte {file.at}, not {end}")
+    if file.at != len(data):
+        raise ValueError(f"{len(data) - file.at} bytes after the last grid")
     return grids
 
 
-def _read_grid(data: bytes, at: int, end: int, width: int) -> VdbGrid:
-    at = _skip_metadata(data, at + 4)
-    kind, at = _read_text(data, at)
+def _read_grid(file: _Reader, width: int) -> VdbGrid:
+    file.take("<I")
+    file.skip_metadata()
+    kind = file.text()
     if kind != "AffineMap" or not width:
         raise ValueError(f"map {kind}")
-    matrix = np.frombuffer(data, "<f8", 16, at).reshape(4, 4).T.copy()
-    at += 128 + 4 + 4 * width + 8 + 12
-    nodes, at = _read_inner(data, at, 32)
+    matrix = file.array("<f8", 16).reshape(4, 4).T.copy()
+    file.at += 4 + 4 * width + 8 + 12
     origins, masks = [], []
-    for node in nodes:
-        within, at = _read_inner(data, at, 16)
+    for node in file.children(32):
+        within = file.children(16)
         place = np.stack([within >> 8, (within >> 4) & 15, within & 15], axis=-1)
         origins.append(place + np.array([node >> 10, (node >> 5) & 31, node & 31]) * 16)
-        masks.append(np.frombuffer(data, "<u8", 8 * len(within), at).reshape(-1, 8))
-        at += 64 * len(within)
-    leaves, stored = np.concatenate(origins), np.concatenate(masks)
+        masks.append(file.array("<u8", 8 * len(within)).reshape(-1, 8))
+    stored = np.concatenate(masks)
     values = []
     for mask in stored:
-        if data[at : at + 65] != mask.tobytes() + _REST_IS_BACKGROUND:
-            raise ValueError(f"a leaf at byte {at} with another mask")
-        count = int(np.bitwise_count(mask).sum()) * width
-        values.append(np.frombuffer(data, "<f4", count, at + 65))
-        at += 65 + 4 * count
-    if at != end:
-        raise ValueError(f"a grid that ends at byte {at}, not {end}")
+        head = mask.tobytes() + _REST_IS_BACKGROUND
+        if file.data[file.at : file.at + len(head)] != head:
+            raise ValueError(f"a leaf at byte {file.at} with another mask")
+        file.at += len(head)
+        values.append(file.array("<f4", int(np.bitwise_count(mask).sum()) * width))
     leaf, bit = np.nonzero(stored_bits(stored))
-    index = leaves[leaf] * 8 + np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
+    index = np.concatenate(origins)[leaf] * 8 + np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
     return VdbGrid(index, np.concatenate(values).reshape(-1, width), matrix)
 
 
-def _read_inner(data: bytes, at: int, edge: int) -> tuple[np.ndarray, int]:
-    size = edge**3 // 8
-    has = np.unpackbits(np.frombuffer(data, np.uint8, size, at), bitorder="little")
-    return np.flatnonzero(has), at + 2 * size + 1
+class _Reader:
+    """A file's bytes, taken one after another."""
 
+    def __init__(self, data: bytes, at: int) -> None:
+        self.data = data
+        self.at = at
 
-def _read_text(data: bytes, at: int) -> tuple[str, int]:
-    (size,) = struct.unpack_from("<I", data, at)
-    return data[at + 4 : at + 4 + size].decode(), at + 4 + size
+    def take(self, form: str) -> tuple:
+        values = struct.unpack_from(form, self.data, self.at)
+        self.at += struct.calcsize(form)
+        return values
 
+    def array(self, kind: str, count: int) -> np.ndarray:
+        values = np.frombuffer(self.data, kind, count, self.at)
+        self.at += values.nbytes
+        return values
 
-def _skip_metadata(data: bytes, at: int) -> int:
-    (count,) = struct.unpack_from("<I", data, at)
-    at += 4
-    for _ in range(3 * count):  # name, type and value, each with its size in front
-        (size,) = struct.unpack_from("<I", data, at)
-        at += 4 + size
-    return at
+    def text(self) -> str:
+        (size,) = self.take("<I")
+        self.at += size
+        return self.data[self.at - size : self.at].decode()
+
+    def skip_metadata(self) -> None:
+        (count,) = self.take("<I")
+        for _ in range(3 * count):  # name, type and value, each with its size in front
+            (size,) = self.take("<I")
+            self.at += size
+
+    def children(self, edge: int) -> np.ndarray:
+        """The numbers of the children of a node of `edge`^3 entries, as `_inner` writes it."""
+        has = np.unpackbits(self.array("u1", edge**3 // 8), bitorder="little")
+        self.at += edge**3 // 8 + len(_REST_IS_BACKGROUND)
+        return np.flatnonzero(has)

@@ -16,7 +16,7 @@ The file's metadata records the opset, the names, and what was compared and how 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,22 @@ TOLERANCE = 1e-6
 float32, so that only another order of float32 additions is allowed for."""
 
 N_FETCHES = 5
-"""k of the comparison."""
+"""Fetches a pixel, k, in the comparisons."""
+
+
+class Comparison(NamedTuple):
+    """Inputs of a head."""
+
+    label: str
+    """What an error message calls them."""
+    features: np.ndarray
+    """[n, n_channels] float32."""
+    codes: np.ndarray | None
+    """[n, k, n_channels] int8, which with `weights` make the features; None if no codes do."""
+    weights: np.ndarray | None
+    """[n, k] float32."""
+    dirs: np.ndarray
+    """[n, 3] float32, unit."""
 
 
 def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> bytes:
@@ -147,10 +162,6 @@ def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
     return worst
 
 
-Comparison = tuple[str, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]
-"""Label, features [n, c], codes [n, k, c] and weights [n, k] that make them (or None), dirs [n, 3]."""
-
-
 def comparisons(n_channels: int) -> list[Comparison]:
     """Random and extreme inputs. Weights are multiples of 1/64 and codes integers, so that every order of
     addition gives the same float32 features: an 8-bit layer would turn a last bit into a whole level."""
@@ -163,10 +174,12 @@ def comparisons(n_channels: int) -> list[Comparison]:
 
     def coded(label: str, codes: np.ndarray, weights: np.ndarray) -> Comparison:
         features = np.einsum("nk,nkc->nc", weights, codes.astype(np.float64)).astype(np.float32)
-        return label, features, codes.astype(np.int8), weights.astype(np.float32), unit(len(codes))
+        return Comparison(
+            label, features, codes.astype(np.int8), weights.astype(np.float32), unit(len(codes))
+        )
 
     def plain(label: str, features: np.ndarray) -> Comparison:
-        return label, features.astype(np.float32), None, None, unit(len(features))
+        return Comparison(label, features.astype(np.float32), None, None, unit(len(features)))
 
     n = 300
     shape = (n, N_FETCHES, n_channels)

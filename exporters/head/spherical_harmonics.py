@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.polynomial import Legendre
+from numpy.polynomial import Polynomial as PowerSeries
 
 from player.errors import ConfigError
 
@@ -58,24 +60,15 @@ def _harmonic(order: int, m: int) -> Polynomial:
     )
     if m:
         k *= math.sqrt(2)
-    result: Polynomial = {}
-    for power_z, legendre in enumerate(_legendre(order, abs(m))):
-        for (power_x, power_y), circular in _circular(m).items():
-            if legendre * circular:
-                result[power_x, power_y, power_z] = k * legendre * circular
-    return result
-
-
-def _legendre(order: int, m: int) -> list[float]:
-    """Coefficients by power of z of Q_order^m: (l - m) Q_l = (2l - 1) z Q_{l-1} - (l + m - 1) Q_{l-2}."""
-    before: list[float] = []
-    current = [float((-1) ** m * math.prod(range(1, 2 * m, 2)))]
-    for band in range(m + 1, order + 1):
-        after = [0.0, *((2 * band - 1) * value for value in current)]
-        for power, value in enumerate(before):
-            after[power] -= (band + m - 1) * value
-        before, current = current, [value / (band - m) for value in after]
-    return current
+    # Q_l^m is the m-th derivative of the Legendre polynomial P_l, whose coefficients are whole sixteenths
+    p = Legendre.basis(order).convert(kind=PowerSeries).coef
+    q = (-1) ** m * PowerSeries(np.rint(16 * p) / 16).deriv(abs(m)).coef
+    return {
+        (power_x, power_y, power_z): k * float(legendre) * circular
+        for power_z, legendre in enumerate(q)
+        for (power_x, power_y), circular in _circular(m).items()
+        if legendre
+    }
 
 
 def _circular(m: int) -> dict[tuple[int, int], int]:

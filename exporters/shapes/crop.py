@@ -74,12 +74,17 @@ def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
     inside = box.holds(mesh.vertices.astype(np.float64))
     keep = np.all(inside[mesh.faces], axis=-1)
     if not keep.any():
-        low, high = mesh.bounds.tolist()
-        raise ConfigError(
-            f"--crop: expected a box with some of the mesh in it, got none of its {len(mesh.faces)} faces; "
-            f"the mesh is from {_point(low)} to {_point(high)}"
-        )
+        raise nothing_inside("mesh", f"{len(mesh.faces)} faces", mesh.bounds)
     return (mesh if keep.all() else take_faces(mesh, keep)), 1 - float(keep.mean())
+
+
+def nothing_inside(what: str, parts: str, bounds: np.ndarray) -> ConfigError:
+    """The error that none of the `parts` of a mesh or volume are in the box, but between `bounds` [2, 3]."""
+    low, high = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in bounds)
+    return ConfigError(
+        f"--crop: expected a box with some of the {what} in it, got none of its {parts}; "
+        f"they are from {low} to {high}"
+    )
 
 
 def _read_box(path: Path) -> CropBox:
@@ -122,7 +127,3 @@ def _box(where: str, matrix: np.ndarray, size: list[float]) -> CropBox:
     if not all(edge > 0 for edge in size):
         raise ConfigError(f"{where}: size: expected three lengths > 0, got {size}")
     return CropBox(matrix, np.array(size))
-
-
-def _point(point: list[float]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"

@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from exporters.shapes.crop import CropBox
+from exporters.shapes.crop import CropBox, nothing_inside
 from exporters.shapes.mesh import unit
 from player.asset.asset import Asset
 from player.asset.bricks import unpack_vertices
 from player.asset.density import decode_density
 from player.asset.grid import SparseGrid
 from player.asset.vertex_rows import VertexRows, vertex_rows
-from player.errors import ConfigError, ShapeError
+from player.errors import ShapeError
 from player.head.head import Head
 from player.march.fetches import MIN_TOTAL, stored_features
 from player.render import default_threads
@@ -108,11 +108,8 @@ def asset_volume(
         points = index @ world_from_index[:3, :3].T + world_from_index[:3, 3]
         keep = np.flatnonzero(box.holds(points))
         if not len(keep):
-            corners = [", ".join(f"{x:.4g}" for x in p) for p in (points.min(axis=0), points.max(axis=0))]
-            raise ConfigError(
-                f"--crop: expected a box with some of the volume in it, got none of its {len(index)} "
-                f"vertices; they are from ({corners[0]}) to ({corners[1]})"
-            )
+            bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+            raise nothing_inside("volume", f"{len(index)} vertices", bounds)
     scale = np.cbrt(np.linalg.det((frame_from_world @ asset.world_from_model)[:3, :3]))
     densities = decode_density(arrays.density[keep], (manifest.density_range[0], manifest.density_range[1]))
     volume = Volume(

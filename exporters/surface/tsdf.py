@@ -91,10 +91,7 @@ def _in_order(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     corners = number.reshape(-1)[faces]
     corners = corners[has_three_corners(corners)]
-    first = np.argmin(corners, axis=1)
-    turned = np.stack(
-        [np.take_along_axis(corners, (first[:, None] + k) % 3, 1)[:, 0] for k in range(3)], axis=-1
-    )
-    triangles = np.unique(turned, axis=0)
+    order = (np.argmin(corners, axis=1)[:, None] + np.arange(3)) % 3  # the smallest number of a face first
+    triangles = np.unique(np.take_along_axis(corners, order, axis=1), axis=0)
     normals = unit_normals(np.zeros_like(places), places, triangles)
     return Surface(places, triangles.astype(np.int32), normals)
