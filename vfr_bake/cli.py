@@ -225,7 +225,7 @@ def _bake(options: Any) -> int:
     check_target(options.asset, options.force)
     from player.proof import prove
     from vfr_bake.baking.bake import bake, check_bakeable
-    from vfr_bake.baking.estimate import expected_seconds, make_plan
+    from vfr_bake.baking.plan import expected_seconds, make_plan
     from vfr_bake.training.model_file import load_model
 
     model = load_model(options.model, options.config.max_memory)

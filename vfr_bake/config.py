@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from player.errors import ConfigError
 from player.files.json_files import brief
-from vfr_bake.baking.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
+from vfr_bake.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
 Compositing = Literal["features", "colour"]

@@ -26,7 +26,7 @@ from player.march.contracted import MAX_SPEED
 from player.march.fetches import MIN_TOTAL, stored_features
 from tests.player.march.test_contracted_march import some_rays
 from tests.player.march.test_march import random_rays
-from vfr_bake.baking.lessons import corners
+from vfr_bake.baking.distillation import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.stored_features import compose, descend, descend_density
 

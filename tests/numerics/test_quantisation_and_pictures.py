@@ -22,7 +22,7 @@ from player.march import march
 from player.render import Frame, Renderer, render
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
-from vfr_bake.baking.projection import code_step, encode_features
+from vfr_bake.baking.grids import code_step, encode_features
 
 MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
 BOX = np.array([[-1.0] * 3, [1.0] * 3])

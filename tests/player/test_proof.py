@@ -109,15 +109,15 @@ def test_a_bake_asks_before_it_begins(
     from types import SimpleNamespace
 
     from vfr_bake import cli
-    from vfr_bake.baking import bake, estimate
+    from vfr_bake.baking import bake, plan
     from vfr_bake.training import model_file
 
-    plan = SimpleNamespace(n_bytes=1, resolution=1, feature_resolution=1, n_cells=1, n_rays=lambda n: n)
+    made = SimpleNamespace(n_bytes=1, resolution=1, feature_resolution=1, n_cells=1, n_rays=lambda n: n)
     child_runs(monkeypatch, DIES)
     monkeypatch.setattr(model_file, "load_model", lambda *_: None)
     monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)
-    monkeypatch.setattr(estimate, "make_plan", lambda *_: plan)
-    monkeypatch.setattr(estimate, "expected_seconds", lambda *_: 1.0)
+    monkeypatch.setattr(plan, "make_plan", lambda *_: made)
+    monkeypatch.setattr(plan, "expected_seconds", lambda *_: 1.0)
     monkeypatch.setattr(bake, "bake", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     options = SimpleNamespace(
         asset=tmp_path / "asset", model=None, config=SimpleNamespace(max_memory=None), force=False
@@ -130,7 +130,7 @@ def test_a_bake_asks_before_it_begins(
 def test_a_bake_measures_with_numpy_where_compiled_code_is_wrong(
     monkeypatch: pytest.MonkeyPatch, shells_folder: Path
 ) -> None:
-    from vfr_bake.baking.loss import HeldOut
+    from vfr_bake.baking.held_out import HeldOut
 
     child_runs(monkeypatch, WRONG)
     assert len(lines()) == 1

@@ -1,6 +1,6 @@
 """The bake, step by step: what is seen, what of it is stored, the head, the mesh, and what each step loses.
 
-Everything is measured on views that nothing else looks at (`vfr_bake.baking.loss`), the end result by
+Everything is measured on views that nothing else looks at (`vfr_bake.baking.held_out`), the end result by
 playing the written files.
 """
 
@@ -28,25 +28,36 @@ from player.errors import ConfigError, TrainingError
 from player.files.files import check_target
 from player.head.head import Head
 from vfr_bake import __version__
-from vfr_bake.baking.budget import bytes_beside_features, channels_that_fit, check_budget, file_sizes
 from vfr_bake.baking.cells import find_cells
-from vfr_bake.baking.estimate import REFINED_BY, make_plan
-from vfr_bake.baking.field_features import with_field_features
-from vfr_bake.baking.folded_head import runner
-from vfr_bake.baking.grids import Layout, evaluate_densities, evaluate_features, make_layout
-from vfr_bake.baking.head_weights import fold_head, small_head
-from vfr_bake.baking.lessons import Taught, teach
-from vfr_bake.baking.loss import HeldOut, Stage
+from vfr_bake.baking.distillation import Taught, teach, with_field_features
+from vfr_bake.baking.grids import (
+    Layout,
+    Projection,
+    code_step,
+    evaluate_densities,
+    evaluate_features,
+    head_sensitivity,
+    make_layout,
+    project,
+)
+from vfr_bake.baking.head import fold_head, runner, small_head
+from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
+from vfr_bake.baking.limits import (
+    bytes_beside_features,
+    channels_that_fit,
+    check_budget,
+    file_sizes,
+    frame_ms,
+    keep_to_time,
+    measured_in_memory,
+    unwritten_asset,
+)
 from vfr_bake.baking.mesh import bake_mesh, mesh_size
-from vfr_bake.baking.pace import frame_ms, keep_to_time, measured_in_memory
-from vfr_bake.baking.presets import BakeChoice
-from vfr_bake.baking.projection import Projection, code_step, head_sensitivity, project
-from vfr_bake.baking.refinement import Stored
+from vfr_bake.baking.plan import REFINED_BY, make_plan
+from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
-from vfr_bake.baking.tuning import Tuning
-from vfr_bake.baking.unwritten import unwritten_asset
-from vfr_bake.baking.views import BETWEEN, views_between
 from vfr_bake.config import BakeConfig
+from vfr_bake.presets import BakeChoice
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.training.model_file import Model
 
@@ -157,7 +168,9 @@ class _Bake:
         model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = self._progress("visibility")
-            visible, step, left_out = find_cells(model, self.config, plan, self.held_out, progress)
+            visible, step, left_out = find_cells(
+                model, self.config, plan.resolutions, self.held_out, progress
+            )
         if left_out is not None:
             self.left_out["cells"] = left_out
         n_cells = int(np.count_nonzero(visible)) * (plan.feature_resolution // len(visible)) ** 3

@@ -1,17 +1,37 @@
-"""Which cells a bake stores, and how long the player's steps through them are."""
+"""Which cells a bake stores, and how long the player's steps through them are.
+
+Which cells are stored: those that matter, by what leaving the others out loses.
+
+A sample's own weight says little: in a fog every sample of a ray weighs next to nothing, and all of them
+together are the picture. What counts is the sum along a ray, so that a floor on the weights is taken only
+where the pictures without the cells below it, on views that nothing else looks at, lose next to nothing.
+
+Which cells of the grid any training view sees: only those are stored.
+
+What the bake of an unbounded scene does in its own way: the cells come from the model's own samples.
+
+There is no occupancy grid: where no view has ever put a sample, the field holds what nobody has taught it. So
+a cell is stored only if the intervals that the proposals chose on some ray weigh something in it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
-from vfr_bake.baking.contracted import WEIGHT_FLOOR, lattice_step, weighty_cells
-from vfr_bake.baking.culling import cull, whole
-from vfr_bake.baking.estimate import Plan
-from vfr_bake.baking.loss import HeldOut
-from vfr_bake.baking.visibility import Progress
+from player.errors import TrainingError
+from player.march.contracted import MAX_SPEED
+from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, views_between, widened
 from vfr_bake.config import BakeConfig
+from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
+from vfr_bake.kernels.march import chebyshev_distance, mark_visible_cells, render_features
+from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
 
@@ -27,13 +47,13 @@ class StoredCells(NamedTuple):
 
 
 def find_cells(
-    model: Model, config: BakeConfig, plan: Plan, held_out: HeldOut, progress: Progress
+    model: Model, config: BakeConfig, resolutions: tuple[int, int], held_out: HeldOut, progress: Progress
 ) -> StoredCells:
     """The cells of an object's box, or of contracted space, that matter in some view.
 
     Raises TrainingError when nothing is seen.
     """
-    resolution = plan.feature_resolution
+    resolution = resolutions[1]
     if model.field.config.unbounded:
         floor = config.weight_floor or WEIGHT_FLOOR
         visible = weighty_cells(model, resolution, floor, progress)
@@ -41,10 +61,292 @@ def find_cells(
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
             f"{floor:g}; part of the loss after 'grid'"
         )
-        return StoredCells(visible, lattice_step(plan.resolution), left_out)
+        return StoredCells(visible, lattice_step(resolutions[0]), left_out)
     step = float(model.occupancy.step)
     if config.no_cull:
         return StoredCells(whole(model, resolution).visible, step, None)
     most_db = config.choice().culled_loss_db
     cells = cull(model, resolution, held_out, config.weight_floor, most_db, progress)
     return StoredCells(cells.visible, step, cells.report())
+
+
+FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
+"""Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
+is taken, and where none does, nothing is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """What is stored of a box."""
+
+    visible: np.ndarray
+    """[n, n, n] bool."""
+    floor: float
+    """The weight that decided; 0 where every cell that may hold matter is stored."""
+    lost: dict[float, float]
+    """Expected loss in dB of each floor that was tried, on its own."""
+    removed: float
+    """Share of the cells that may hold matter which are not stored."""
+
+    def report(self) -> str:
+        """What was left out and what that changed, in words."""
+        tried = ", ".join(f"{loss:.3f} dB at {floor:g}" for floor, loss in self.lost.items())
+        if not self.floor:
+            return f"none: leaving out what weighs little loses too much ({tried or 'nothing weighs enough'})"
+        return (
+            f"{self.removed:.0%} of the cells that the model may hold matter in: no view gives them a weight "
+            f"of {self.floor:g}; expected loss by the floor of weight, part of that after 'grid': {tried}"
+        )
+
+
+def whole(model: Model, resolution: int) -> Cells:
+    """Every cell that the model holds matter in."""
+    return Cells(occupied_cells(model, resolution), 0.0, {}, 0.0)
+
+
+def cull(
+    model: Model, resolution: int, held_out: HeldOut, floor: float | None, most_db: float, progress: Progress
+) -> Cells:
+    """The cells of a grid of `resolution` that weigh something in some view, gaps of one cell between them
+    closed.
+
+    `floor` is the weight that they must have, or None for the highest of FLOORS that is expected to lose no
+    more than `most_db`. Raises TrainingError when no cell weighs a `floor` that was asked for.
+    """
+    held = occupied_cells(model, resolution)
+    floors = FLOORS if floor is None else (floor,)
+    marks = marked_cells(model, resolution, floors, progress)
+    least = _loss(model, held_out, held)
+    lost: dict[float, float] = {}
+    for level, tried in enumerate(floors):
+        visible = close_gaps(np.ascontiguousarray(marks[..., level]).view(bool))
+        if not visible.any():
+            continue
+        lost[tried] = max(_loss(model, held_out, visible) - least, 0.0)
+        if lost[tried] <= most_db or floor is not None:
+            removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)
+            return Cells(visible, tried, lost, max(removed, 0.0))
+    if floor is not None:
+        raise TrainingError(
+            f"no cell weighs {floor} in any training view: the model is empty or a thin fog: "
+            "train longer, or lower --weight-floor"
+        )
+    return Cells(held, 0.0, lost, 0.0)
+
+
+def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
+    """Expected loss in dB of the model where only `cells` [n, n, n] bool hold matter."""
+    distance = np.empty(cells.shape, np.uint8)
+    chebyshev_distance(cells, distance)
+    features = np.zeros((len(held_out.rays_o), model.field.config.n_channels), np.float32)
+    opacity, depth = np.zeros((2, len(features)), np.float32)
+    render_features(
+        held_out.rays_o, held_out.rays_d, np.float32(model.occupancy.step), distance,
+        *model.field.kernel_arguments(), LIMITS, features, opacity, depth,
+    )  # fmt: skip
+    return held_out.loss_of(features, opacity)
+
+
+HITS = 8
+"""Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
+closed."""
+VIEWS_OF_A_CELL = 0.4
+"""Share of the training views that see a given piece of surface, roughly."""
+
+Progress = Callable[[int, int], object]
+"""Called with (done, of)."""
+
+
+def marked_cells(
+    model: Model, resolution: int, weight_floors: tuple[float, ...], progress: Progress
+) -> np.ndarray:
+    """[resolution, resolution, resolution, n_floors] uint8, 1 for cells in which a sample of some view's ray
+    weighs at least each floor. Views are the training cameras and as many between them.
+
+    Rays leave each camera as densely as it takes for every surface cell to be met HITS times over
+    all views, whatever the pictures' size.
+    """
+    marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
+    cameras = model.model_cameras()
+    cameras += views_between(model, len(cameras), seed=0)
+    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
+    # No cell between two samples may be missed: other rays than these will be played.
+    step = min(model.occupancy.step, 2 / resolution)
+    for index, camera in enumerate(cameras):
+        size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
+        rays_o, rays_d = camera.resized(*size).rays()
+        mark_visible_cells(
+            rays_o, rays_d, np.float32(step), model.occupancy.distance,
+            *model.field.kernel_arguments(), LIMITS, np.array(weight_floors, np.float32), marks,
+        )  # fmt: skip
+        progress(index + 1, len(cameras))
+    return marks
+
+
+def occupied_cells(model: Model, resolution: int) -> np.ndarray:
+    """[resolution]^3 bool: cells in some part of which the training's occupancy grid allows matter."""
+    cells = model.occupancy.occupied
+    n = len(cells)
+    first = np.arange(resolution) * n // resolution
+    last = (np.arange(1, resolution + 1) * n - 1) // resolution
+    for axis in range(3):
+        parts = [cells.take(np.minimum(first + i, last), axis) for i in range(max(last - first) + 1)]
+        cells = np.logical_or.reduce(parts)
+    return cells
+
+
+def pixel_footprints(model: Model) -> np.ndarray:
+    """[n_views] size of each training camera's pixels at the middle of the box, model units."""
+    cameras = model.model_cameras()
+    return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), 1e-6) / c.fx for c in cameras])
+
+
+def rays_of_views(model: Model, resolution: int) -> float:
+    """Rays that `marked_cells` sends out."""
+    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
+    return 2 * density**2 * sum(camera.width * camera.height for camera in model.cameras)
+
+
+def _ray_density(footprints: np.ndarray, cell: float) -> float:
+    """Rays per pixel along each axis that let HITS rays meet each surface cell at the middle of the box."""
+    hits = VIEWS_OF_A_CELL * float(np.sum((cell / footprints) ** 2))
+    return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
+
+
+def close_gaps(cells: np.ndarray) -> np.ndarray:
+    """Morphological closing of [n, n, n] bool with a cube of 3 cells: holes and cracks of one cell are
+    filled.
+
+    >>> row = np.zeros((5, 5, 5), bool)
+    >>> row[1:4, 1:4, 1:4] = True
+    >>> row[2, 2, 2] = False
+    >>> bool(close_gaps(row)[2, 2, 2]), int(close_gaps(row).sum())
+    (True, 27)
+    """
+    padded = np.pad(cells, 1)
+    for axis in range(3):
+        padded = _any_of_three(padded, axis)
+    for axis in range(3):
+        padded = ~_any_of_three(~padded, axis)
+    # Outside the box nothing is known to be empty or full: what was marked stays.
+    return padded[1:-1, 1:-1, 1:-1] | cells
+
+
+def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
+    """Each cell or either neighbour along an axis."""
+    out = cells.copy()
+    lower, upper = [slice(None)] * 3, [slice(None)] * 3
+    lower[axis], upper[axis] = slice(None, -1), slice(1, None)
+    out[tuple(lower)] |= cells[tuple(upper)]
+    out[tuple(upper)] |= cells[tuple(lower)]
+    return out
+
+
+def corners_of(cells: np.ndarray) -> np.ndarray:
+    """[n + 1, n + 1, n + 1] bool: the corners of the marked cells [n, n, n] bool.
+
+    >>> int(corners_of(np.ones((1, 1, 1), bool)).sum())
+    8
+    """
+    corners = cells
+    for axis in range(3):
+        shape = list(corners.shape)
+        shape[axis] += 1
+        grown = np.zeros(shape, bool)
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        grown[tuple(low)] |= corners
+        grown[tuple(high)] |= corners
+        corners = grown
+    return corners
+
+
+def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) -> np.ndarray:
+    """[n_planes, resolution, resolution] bool: cells of a grid of `resolution` over the same box whose middle
+    is in one of `cells` [n, n, n] bool, in some of its planes along x.
+
+    >>> subdivided(np.array([True, False]).reshape(2, 1, 1).repeat(2, 1).repeat(2, 2), 5)[:, 0, 0].tolist()
+    [True, True, False, False, False]
+    """
+    which = (2 * np.arange(resolution) + 1) * len(cells) // (2 * resolution)
+    return cells[np.ix_(which[planes], which, which)]
+
+
+CONTRACTED_HITS = 24
+"""Rays that meet a block of cells at the unit sphere over all views, on average."""
+BLOCK = 2
+"""Cells along each edge of a block. Blocks are found whole: the model's proposals take their time, 4,000 rays
+a second of one core, and so a quarter of the rays is enough. Surfaces are some cells thick anyway."""
+FASTEST_CELLS = 2.0
+"""Cells between two samples of a ray where it is fastest in contracted space; where it is slowest two fifths
+of it."""
+CONTRACTED_RAYS_AT_ONCE = 1 << 14
+WEIGHT_FLOOR = 0.01
+"""Weight that a cell must have on some ray where none is asked for. Fox at 1088 cells loses nothing to it; it
+would have half again as many vertices with 0.003."""
+CELL_SHARE = 0.008
+"""Cells that are stored, of all, before anything is known of a scene."""
+
+
+def lattice_step(resolution: int) -> float:
+    """dphi of `player.march.contracted` for densities on a grid of `resolution` cells.
+
+    >>> round(lattice_step(512), 5)
+    0.00699
+    """
+    return FASTEST_CELLS * 4 / (resolution * float(MAX_SPEED))
+
+
+def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
+    """[resolution / BLOCK]^3 bool: blocks of cells of contracted space in which some ray of a view has at
+    least the weight `weight_floor`, and the gaps of one block between them. Views are the training cameras
+    and BETWEEN times as many between them.
+
+    `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met
+    CONTRACTED_HITS times over all views. Pictures are taken a little wider than they are: another camera of
+    the scene sees beyond their border, where the model goes on. Raises TrainingError when nothing is seen.
+    """
+    assert isinstance(model.sampler, ProposalSampler)
+    n_blocks = resolution // BLOCK
+    visible = np.zeros((n_blocks,) * 3, np.uint8)
+    cameras = [widened(camera) for camera in model.model_cameras()]
+    cameras += views_between(model, BETWEEN * len(cameras), seed=0, wide=True)
+    random = np.random.default_rng(0)
+    share = _share_of_pixels(model, resolution)
+    for index, camera in enumerate(cameras):
+        rays_o, rays_d = camera.rays()
+        some = random.choice(len(rays_o), max(round(share * len(rays_o)), 1), replace=False)
+        for first in range(0, len(some), CONTRACTED_RAYS_AT_ONCE):
+            rows = some[first : first + CONTRACTED_RAYS_AT_ONCE]
+            _mark(model, rays_o[rows], rays_d[rows], weight_floor, visible)
+        progress(index + 1, len(cameras))
+    if not visible.any():
+        raise TrainingError(
+            f"no cell weighs {weight_floor} in any training view: the model is empty or a thin fog: "
+            "train longer, or lower --weight-floor"
+        )
+    return close_gaps(visible.view(bool))
+
+
+def rays_of_contracted_views(model: Model, resolution: int) -> float:
+    """Rays that `weighty_cells` sends out."""
+    n_pixels = (1 + 2 * MARGIN) ** 2 * sum(camera.width * camera.height for camera in model.cameras)
+    return (1 + BETWEEN) * _share_of_pixels(model, resolution) * n_pixels
+
+
+def _share_of_pixels(model: Model, resolution: int) -> float:
+    footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
+    return min(
+        CONTRACTED_HITS / (VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))), 1.0
+    )
+
+
+@torch.no_grad()
+def _mark(model: Model, rays_o: np.ndarray, rays_d: np.ndarray, floor: float, visible: np.ndarray) -> None:
+    samples = model.sampler.sample_all(model.field, rays_o, rays_d)
+    sigmas = model.field.density(samples.features)
+    _, _, weights = composite(sigmas, samples.features, samples.deltas, samples.starts, samples.counts)
+    mark_weighty_cells(
+        rays_o, rays_d, samples.t_mid.numpy(), samples.deltas.numpy(), weights.numpy(),
+        samples.starts.numpy(), samples.counts.numpy(), np.float32(floor), visible,
+    )  # fmt: skip

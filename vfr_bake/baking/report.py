@@ -17,7 +17,7 @@ import numpy as np
 from player.asset.asset import Asset
 from player.files.images import png_bytes
 from player.render import Renderer
-from vfr_bake.baking.views import views_between
+from vfr_bake.baking.held_out import views_between
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.comparison import BRIGHTEST_ERROR, comparison
 from vfr_bake.training.model_file import Model
@@ -47,7 +47,7 @@ class BakeReport:
     asked: dict[str, Any]
     """Preset and settings as resolved, and the limits that were asked for."""
     stages: list[dict[str, Any]]
-    """`vfr_bake.baking.loss.Stage` after each step, in order."""
+    """`vfr_bake.baking.held_out.Stage` after each step, in order."""
     n_bytes: dict[str, int]
     """Bytes of each file."""
     seconds: dict[str, float]

@@ -6,8 +6,8 @@ import shlex
 from typing import Any
 
 from player.asset.asset import Asset
-from vfr_bake.baking.presets import PRESETS
 from vfr_bake.config import BakeConfig
+from vfr_bake.presets import PRESETS
 
 GIVEN = ("resolution", "max_mb", "max_loss_db")
 """Settings of `vfr-bake` that no preset decides, and that change the asset."""

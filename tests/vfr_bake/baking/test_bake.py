@@ -24,18 +24,17 @@ from player.errors import ConfigError, OutputError, TrainingError
 from player.march.march import march
 from player.render import render
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.budget import SMALL_FILES
-from vfr_bake.baking.folded_head import FoldedHead
-from vfr_bake.baking.head_weights import fold_head
-from vfr_bake.baking.lessons import Lessons, player_fetches
-from vfr_bake.baking.presets import PRESETS
-from vfr_bake.baking.projection import code_step, encode_features, head_sensitivity, project
+from vfr_bake.baking.cells import corners_of, pixel_footprints
+from vfr_bake.baking.distillation import Lessons, player_fetches
+from vfr_bake.baking.grids import code_step, encode_features, head_sensitivity, project
+from vfr_bake.baking.head import FoldedHead, fold_head
+from vfr_bake.baking.held_out import views_between
+from vfr_bake.baking.limits import SMALL_FILES
 from vfr_bake.baking.refinement import BATCH, HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, learn_head, refine
-from vfr_bake.baking.views import views_between
-from vfr_bake.baking.visibility import corners_of, pixel_footprints
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
+from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
@@ -181,7 +180,7 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
         "k": 4,
     }
     bake(model, tmp_path / "as_it_is", BakeConfig(refine_steps=0, **small), quiet)
-    monkeypatch.setattr("vfr_bake.baking.tuning.Tuning._gained", lambda *_: False)
+    monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: False)
     bake(model, tmp_path / "left_out", BakeConfig(refine_steps=20, **small), quiet)
     one, other = (Asset.open(tmp_path / name).arrays for name in ("as_it_is", "left_out"))
     assert np.array_equal(one.features, other.features) and np.array_equal(one.density, other.density)

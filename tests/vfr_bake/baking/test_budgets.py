@@ -11,12 +11,12 @@ import pytest
 
 from player.asset.asset import Asset
 from player.errors import TrainingError
-from vfr_bake.baking import estimate, pace
+from vfr_bake.baking import limits
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.estimate import MESH_SECONDS, N_RAYS, expected_seconds, make_plan
-from vfr_bake.baking.pace import keep_to_time
-from vfr_bake.baking.presets import PRESETS
+from vfr_bake.baking.limits import keep_to_time
+from vfr_bake.baking.plan import MESH_SECONDS, N_RAYS, expected_seconds, make_plan
 from vfr_bake.config import BakeConfig
+from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
 
 SMALL: dict[str, Any] = {
@@ -66,7 +66,7 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
         bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), quiet)
     # The files are measured again: what takes longer than it did before refinement is refused as well.
     times = iter([1.0, 1.0, 9.0])
-    monkeypatch.setattr(pace, "frame_ms", lambda *_: next(times))
+    monkeypatch.setattr(limits, "frame_ms", lambda *_: next(times))
     monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda *_: next(times))
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
         bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), quiet)
@@ -103,7 +103,7 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
             now += left.pop(0)
 
         with monkeypatch.context() as patch:
-            patch.setattr(estimate, "time", SimpleNamespace(perf_counter=lambda: now))
+            patch.setattr(plan, "time", SimpleNamespace(perf_counter=lambda: now))
             patch.setattr(type(model.sampler), "composited_features", answer)
             found = expected_seconds(model, config, plan)
         assert not left

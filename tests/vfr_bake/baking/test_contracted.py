@@ -20,9 +20,9 @@ from player.march.contraction import contract
 from player.render import render
 from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.contracted import lattice_step, weighty_cells
+from vfr_bake.baking.cells import lattice_step, weighty_cells
+from vfr_bake.baking.distillation import Lessons, Taught, collect_lessons
 from vfr_bake.baking.grids import unit_points
-from vfr_bake.baking.lessons import Lessons, Taught, collect_lessons
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture

@@ -11,9 +11,8 @@ import torch
 
 from player.asset.asset import Asset
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.culling import FLOORS, cull, whole
-from vfr_bake.baking.loss import HeldOut, expected_loss
-from vfr_bake.baking.visibility import close_gaps, marked_cells
+from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, whole
+from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.rendering.samples import LIMITS
@@ -136,7 +135,7 @@ def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path
 def test_where_every_floor_loses_too_much_nothing_is_left_out(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vfr_bake.baking.culling.FLOORS", (0.9, 0.5))
+    monkeypatch.setattr("vfr_bake.baking.cells.FLOORS", (0.9, 0.5))
     cells = cull(model, 48, HeldOut(model, 1), None, 0.001, quiet)
     assert cells.floor == 0 and cells.report().startswith("none") and cells.lost
     assert np.array_equal(cells.visible, whole(model, 48).visible)

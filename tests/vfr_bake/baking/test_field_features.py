@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from player.render import choose_march
-from vfr_bake.baking.field_features import RAYS_AT_ONCE, with_field_features
+from vfr_bake.baking.cells import occupied_cells
+from vfr_bake.baking.distillation import with_field_features
 from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout
-from vfr_bake.baking.visibility import occupied_cells
 from vfr_bake.training.model_file import Model
 
 
@@ -25,8 +25,8 @@ def test_they_are_those_of_a_grid_that_holds_them_all(model: Model, monkeypatch:
     march = choose_march("numba", contracted=False)[1].march
     wanted = march(replace(grid, features=every), rays_o, rays_d, 0)
     assert len(wanted.hits) > 100
-    monkeypatch.setattr("vfr_bake.baking.field_features.RAYS_AT_ONCE", len(wanted.hits) // 3)
-    assert len(wanted.hits) // 3 < RAYS_AT_ONCE, "in several parts"
+    monkeypatch.setattr("vfr_bake.baking.distillation.FIELD_RAYS_AT_ONCE", len(wanted.hits) // 3)
+    assert len(wanted.hits) // 3 < FIELD_RAYS_AT_ONCE, "in several parts"
     played = march(grid, rays_o, rays_d, 0)
     composed = with_field_features(model, layout, grid, rays_o, rays_d, played)
     assert np.array_equal(composed.hits, wanted.hits) and np.array_equal(composed.opacity, wanted.opacity)

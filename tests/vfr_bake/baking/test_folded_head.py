@@ -11,8 +11,7 @@ import torch
 
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
-from vfr_bake.baking.folded_head import FoldedHead, runner
-from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.refinement import Steps, Stored, refine
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.head import Head

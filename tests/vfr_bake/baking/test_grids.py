@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from player.asset.bricks import unpack_vertices
+from vfr_bake.baking.cells import corners_of, occupied_cells, subdivided
 from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout, unit_points
-from vfr_bake.baking.visibility import corners_of, occupied_cells, subdivided
 from vfr_bake.training.model_file import Model
 
 COARSE = 40

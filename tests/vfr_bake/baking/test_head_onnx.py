@@ -22,7 +22,7 @@ from exporters.head.onnx_head import HeadWeights, Range, head_onnx, weight_scale
 from exporters.head.ranges import activation_ranges
 from player.asset.asset import Asset
 from tests.exporters.formats import block
-from vfr_bake.baking.head_weights import fold_head
+from vfr_bake.baking.head import fold_head
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.head import Head
 from vfr_bake.field.spherical_harmonics import SphericalHarmonics

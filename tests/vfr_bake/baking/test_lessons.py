@@ -7,7 +7,7 @@ import pytest
 
 from player.errors import TrainingError
 from tests.numerics.fog import FEATURE, fog
-from vfr_bake.baking.lessons import Taught, collect_lessons
+from vfr_bake.baking.distillation import Taught, collect_lessons
 
 ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
 """Where rays along x begin that meet the box, and that pass it."""
@@ -33,7 +33,7 @@ def test_lessons_are_those_of_the_rays_that_meet_something(
 ) -> None:
     """In their order, however many rays are looked at together; the fog's one feature composes to its own
     value times the opacity."""
-    monkeypatch.setattr("vfr_bake.baking.lessons.RAYS_AT_ONCE", at_once)
+    monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", at_once)
     rays = taught([PAST, ALONG, PAST, PAST, ALONG, ALONG])
     grid = fog(0.1)
     lessons = collect_lessons(rays, grid, n_fetches)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vfr_bake.baking.presets import PRESETS
+from vfr_bake.presets import PRESETS
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "bake.md"
 

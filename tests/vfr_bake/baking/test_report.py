@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from vfr_bake.baking.loss import expected_loss
+from vfr_bake.baking.held_out import expected_loss
 from vfr_bake.baking.report import BakeReport, bars
 
 STAGE = {"psnr": 40.0, "loss_db": 0.5, "samples_median": 5.0, "samples_p95": 9.0}

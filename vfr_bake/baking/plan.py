@@ -13,11 +13,16 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.errors import ConfigError
-from vfr_bake.baking.contracted import BLOCK, CELL_SHARE, rays_of_contracted_views
-from vfr_bake.baking.contracted import N_RAYS as UNBOUNDED_RAYS
-from vfr_bake.baking.culling import FLOORS
+from vfr_bake.baking.cells import (
+    BLOCK,
+    CELL_SHARE,
+    FLOORS,
+    occupied_cells,
+    pixel_footprints,
+    rays_of_contracted_views,
+    rays_of_views,
+)
 from vfr_bake.baking.refinement import BATCH
-from vfr_bake.baking.visibility import occupied_cells, pixel_footprints, rays_of_views
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
@@ -25,6 +30,8 @@ PROGRAM_BYTES = 800_000_000
 """Of Python, torch, numba and the model itself."""
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
+UNBOUNDED_RAYS = 500_000
+"""Rays that head and stored values learn from: all of them meet something, and at many samples each."""
 FEWEST_RAYS = 100_000
 RAY_BYTES = {False: 300, True: 1_900}
 """Of a ray that is learned from, by whether the scene is unbounded: 168 bytes of what the model shows, and
