@@ -103,7 +103,7 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
             now += left.pop(0)
 
         with monkeypatch.context() as patch:
-            patch.setattr(plan, "time", SimpleNamespace(perf_counter=lambda: now))
+            patch.setattr("vfr_bake.baking.plan.time", SimpleNamespace(perf_counter=lambda: now))
             patch.setattr(type(model.sampler), "composited_features", answer)
             found = expected_seconds(model, config, plan)
         assert not left

@@ -9,7 +9,7 @@ import pytest
 
 from player.render import choose_march
 from vfr_bake.baking.cells import occupied_cells
-from vfr_bake.baking.distillation import with_field_features
+from vfr_bake.baking.distillation import FIELD_RAYS_AT_ONCE, with_field_features
 from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout
 from vfr_bake.training.model_file import Model
 
