@@ -308,17 +308,16 @@ def _eval(options: Any) -> int:
 
 def _bench(options: Any) -> int:
     from vfr_bake.bench.page import table_lines, trade_page
-    from vfr_bake.bench.settings import plan_of
     from vfr_bake.bench.trade import measure_trade
     from vfr_bake.training.lpips import Lpips
 
-    plan = plan_of(options)
+    options.check()
     for target in (options.html, options.json):
         if target is not None and str(target) != "-":
             check_target(target, options.force)
     lpips = None if options.lpips is None else Lpips(options.lpips)
     with Bars() as bars:
-        trade = measure_trade(plan, lpips, bars.count)
+        trade = measure_trade(options, lpips, bars.count)
     if options.html is not None:
         write_bytes(options.html, trade_page(trade))
     _result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))

@@ -3,9 +3,12 @@ units."""
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
+from player.app.option_types import size
 from player.errors import ConfigError
 from player.files.json_files import brief
 from vfr_bake.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
@@ -35,9 +38,10 @@ FIELD_BY_DEVICE = {"cpu": {}, "cuda": {"log2_table_size": 19}}
 """Settings of the architecture that follow from the device: the paper's batches fill the paper's tables."""
 
 
-def _check(condition: bool, name: str, expected: str, got: Any) -> None:
-    if not condition:
-        raise ConfigError(f"{name}: expected {expected}, got {brief(got)}")
+def check(settings: object, name: str, fits: bool, expected: str) -> None:
+    """Raises ConfigError, with what was expected, if the setting `name` does not fit."""
+    if not fits:
+        raise ConfigError(f"{name}: expected {expected}, got {brief(getattr(settings, name))}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,27 +76,18 @@ class FieldConfig:
     """Features that multiply each basis function (equation 4 of the paper)."""
 
     def __post_init__(self) -> None:
-        _check(1 <= self.n_levels <= 32, "n_levels", "1 to 32", self.n_levels)
-        _check(
-            2 <= self.base_resolution <= self.max_resolution,
-            "base_resolution",
-            "2 to max_resolution",
-            self.base_resolution,
-        )
-        _check(self.max_resolution <= 8192, "max_resolution", "at most 8192", self.max_resolution)
-        _check(10 <= self.log2_table_size <= 24, "log2_table_size", "10 to 24", self.log2_table_size)
-        _check(0 <= self.density_width <= 1024, "density_width", "0 to 1024", self.density_width)
-        _check(4 <= self.head_width <= 1024, "head_width", "4 to 1024", self.head_width)
-        _check(
-            1 <= self.n_directional_layers <= 16,
-            "n_directional_layers",
-            "1 to 16",
-            self.n_directional_layers,
-        )
-        _check(1 <= self.sh_degree <= 8, "sh_degree", "1 to 8", self.sh_degree)
-        _check(1 <= self.n_sh_features <= 32, "n_sh_features", "1 to 32", self.n_sh_features)
+        check(self, "n_levels", 1 <= self.n_levels <= 32, "1 to 32")
+        fits = 2 <= self.base_resolution <= self.max_resolution
+        check(self, "base_resolution", fits, "2 to max_resolution")
+        check(self, "max_resolution", self.max_resolution <= 8192, "at most 8192")
+        check(self, "log2_table_size", 10 <= self.log2_table_size <= 24, "10 to 24")
+        check(self, "density_width", 0 <= self.density_width <= 1024, "0 to 1024")
+        check(self, "head_width", 4 <= self.head_width <= 1024, "4 to 1024")
+        check(self, "n_directional_layers", 1 <= self.n_directional_layers <= 16, "1 to 16")
+        check(self, "sh_degree", 1 <= self.sh_degree <= 8, "1 to 8")
+        check(self, "n_sh_features", 1 <= self.n_sh_features <= 32, "1 to 32")
         for name, choices in CHOICES.items():
-            _check(getattr(self, name) in choices, name, f"one of {', '.join(choices)}", getattr(self, name))
+            check(self, name, getattr(self, name) in choices, f"one of {', '.join(choices)}")
 
     @property
     def n_channels(self) -> int:
@@ -104,10 +99,14 @@ def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
     """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
     names and wrong kinds."""
     defaults = asdict(FieldConfig())
-    _check(set(values) == set(defaults), where, f"the settings {sorted(defaults)}", brief([*values]))
+    if set(values) != set(defaults):
+        raise ConfigError(f"{where}: expected the settings {sorted(defaults)}, got {brief([*values])}")
     for name, value in values.items():
         kind = type(defaults[name])
-        _check(type(value) is kind, f"{where}: {name}", f"a value of type {kind.__name__}", brief(value))
+        if type(value) is not kind:
+            raise ConfigError(
+                f"{where}: {name}: expected a value of type {kind.__name__}, got {brief(value)}"
+            )
     return FieldConfig(**values)
 
 
@@ -150,9 +149,9 @@ class FieldOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pace:
-    """Settings of a training that follow from the device where they are not given: how much a step takes, how
-    far it goes, how many there are."""
+class DeviceSettings:
+    """Settings of a training that follow from the device where they are not given: the number of steps, the
+    size of a batch, and the learning rates. `TrainConfig` says what each of them means."""
 
     steps: int = 60_000
     batch_samples: int = 4096
@@ -162,15 +161,15 @@ class Pace:
     network_rate: float = 4e-3
 
     def __post_init__(self) -> None:
-        _check(self.steps >= 1, "steps", "at least 1", self.steps)
-        _check(1024 <= self.batch_samples <= 2**22, "batch_samples", "1,024 to 4,194,304", self.batch_samples)
-        _check(32 <= self.batch_rays <= 2**17, "batch_rays", "32 to 131,072", self.batch_rays)
-        _check(1 <= self.max_rays <= 2**20, "max_rays", "1 to 1,048,576", self.max_rays)
-        _check(0 < self.grid_rate < 1, "grid_rate", "between 0 and 1", self.grid_rate)
-        _check(0 < self.network_rate < 1, "network_rate", "between 0 and 1", self.network_rate)
+        check(self, "steps", self.steps >= 1, "at least 1")
+        check(self, "batch_samples", 1024 <= self.batch_samples <= 2**22, "1,024 to 4,194,304")
+        check(self, "batch_rays", 32 <= self.batch_rays <= 2**17, "32 to 131,072")
+        check(self, "max_rays", 1 <= self.max_rays <= 2**20, "1 to 1,048,576")
+        check(self, "grid_rate", 0 < self.grid_rate < 1, "between 0 and 1")
+        check(self, "network_rate", 0 < self.network_rate < 1, "between 0 and 1")
 
 
-GPU_PACE = {
+GPU_SETTINGS = {
     "batch_samples": 2**18,
     "batch_rays": 2**13,
     "max_rays": 2**16,
@@ -184,8 +183,8 @@ GPU_STEPS = {False: 20_000, True: 40_000}
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of `vfr-train`. What is None follows from the device (`pace`): the defaults of a CPU are made
-    for two cores, those of a GPU are the paper's."""
+    """Settings of `vfr-train`. What is None follows from the device (`for_device`): the defaults of a CPU are
+    made for two cores, those of a GPU are the paper's."""
 
     kind: SceneKind = "auto"
     """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted, sampled by
@@ -236,33 +235,30 @@ class TrainConfig:
     field: FieldOptions = field(default_factory=FieldOptions)
 
     def __post_init__(self) -> None:
-        _check(self.kind in get_args(SceneKind), "kind", f"one of {get_args(SceneKind)}", self.kind)
-        _check(1 <= self.downscale <= 64, "downscale", "1 to 64", self.downscale)
-        _check(self.device in get_args(Device), "device", f"one of {get_args(Device)}", self.device)
-        _check(self.minutes is None or self.minutes > 0, "minutes", "more than 0", self.minutes)
-        _check(self.pilot_steps >= 0, "pilot_steps", "at least 0", self.pilot_steps)
-        _check(0.1 <= self.step_cells <= 16, "step_cells", "0.1 to 16", self.step_cells)
-        _check(
-            8 <= self.occupancy_resolution <= 512,
-            "occupancy_resolution",
-            "8 to 512",
-            self.occupancy_resolution,
-        )
-        _check(0 <= self.distortion < 1e3, "distortion", "0 to 1000", self.distortion)
-        _check(0 <= self.near_gradients < 1e3, "near_gradients", "0 to 1000", self.near_gradients)
-        _check(self.eval_views is None or self.eval_views >= 0, "eval_views", "at least 0", self.eval_views)
-        _check(self.checkpoint_minutes > 0, "checkpoint_minutes", "more than 0", self.checkpoint_minutes)
-        self.pace("cpu", False)  # so that what is out of range is refused before pictures are read
+        check(self, "kind", self.kind in get_args(SceneKind), f"one of {get_args(SceneKind)}")
+        check(self, "downscale", 1 <= self.downscale <= 64, "1 to 64")
+        check(self, "device", self.device in get_args(Device), f"one of {get_args(Device)}")
+        check(self, "minutes", self.minutes is None or self.minutes > 0, "more than 0")
+        check(self, "pilot_steps", self.pilot_steps >= 0, "at least 0")
+        check(self, "step_cells", 0.1 <= self.step_cells <= 16, "0.1 to 16")
+        check(self, "occupancy_resolution", 8 <= self.occupancy_resolution <= 512, "8 to 512")
+        check(self, "distortion", 0 <= self.distortion < 1e3, "0 to 1000")
+        check(self, "near_gradients", 0 <= self.near_gradients < 1e3, "0 to 1000")
+        check(self, "eval_views", self.eval_views is None or self.eval_views >= 0, "at least 0")
+        check(self, "checkpoint_minutes", self.checkpoint_minutes > 0, "more than 0")
+        self.for_device("cpu", False)  # so that what is out of range is refused before pictures are read
 
-    def pace(self, device: str, unbounded: bool) -> Pace:
+    def for_device(self, device: str, unbounded: bool) -> DeviceSettings:
         """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.
 
-        >>> TrainConfig(steps=7).pace("cuda", False).steps, TrainConfig().pace("cuda", True).steps
+        >>> TrainConfig(steps=7).for_device("cuda", False).steps, TrainConfig().for_device("cuda", True).steps
         (7, 40000)
         """
-        defaults = {"steps": GPU_STEPS[unbounded]} | GPU_PACE if device == "cuda" else {}
-        given = {name: getattr(self, name) for name in Pace.__dataclass_fields__}
-        return Pace(**(defaults | {name: value for name, value in given.items() if value is not None}))
+        defaults = {"steps": GPU_STEPS[unbounded]} | GPU_SETTINGS if device == "cuda" else {}
+        given = {name: getattr(self, name) for name in DeviceSettings.__dataclass_fields__}
+        return DeviceSettings(
+            **(defaults | {name: value for name, value in given.items() if value is not None})
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,50 +312,27 @@ class BakeConfig:
     """Views between the training cameras on which each step of the bake is measured."""
 
     def __post_init__(self) -> None:
-        _check(self.preset in PRESETS, "preset", f"one of {tuple(PRESETS)}", self.preset)
-        _check(
-            self.resolution is None or 8 <= self.resolution <= 2048,
-            "resolution",
-            "8 to 2048",
-            self.resolution,
-        )
-        _check(
-            self.feature_resolution is None or 8 <= self.feature_resolution <= (self.resolution or 2048),
-            "feature_resolution",
-            "8 to 2048, at most the resolution",
-            self.feature_resolution,
-        )
-        _check(
-            self.max_loss_db is None or self.max_loss_db > 0, "max_loss_db", "more than 0", self.max_loss_db
-        )
-        _check(self.max_mb is None or self.max_mb > 0, "max_mb", "more than 0", self.max_mb)
-        _check(self.target_ms is None or self.target_ms > 0, "target_ms", "more than 0", self.target_ms)
-        _check(self.max_memory > 0, "max_memory", "more than 0", self.max_memory)
-        _check(self.check_views >= 1, "check_views", "at least 1", self.check_views)
+        check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")
+        check(self, "resolution", self.resolution is None or 8 <= self.resolution <= 2048, "8 to 2048")
+        most = self.resolution or 2048
+        fits = self.feature_resolution is None or 8 <= self.feature_resolution <= most
+        check(self, "feature_resolution", fits, "8 to 2048, at most the resolution")
+        for name in ("max_loss_db", "max_mb", "target_ms"):
+            limit = getattr(self, name)
+            check(self, name, limit is None or limit > 0, "more than 0")
+        check(self, "max_memory", self.max_memory > 0, "more than 0")
+        check(self, "check_views", self.check_views >= 1, "at least 1")
+        check(self, "k", self.k == "auto" or 0 <= self.k <= 64, "auto or 0 to 64")
+        fits = self.weight_floor is None or 0 < self.weight_floor < 1
+        check(self, "weight_floor", fits, "between 0 and 1")
         choice = self.choice()
-        _check(1 <= choice.n_channels <= 64, "n_channels", "1 to 64", choice.n_channels)
-        _check(self.k == "auto" or 0 <= self.k <= 64, "k", "auto or 0 to 64", self.k)
-        _check(7 <= choice.code_levels <= 127, "code_levels", "7 to 127", choice.code_levels)
-        _check(
-            choice.head_width == 0 or 8 <= choice.head_width <= 256,
-            "head_width",
-            "0 or 8 to 256",
-            choice.head_width,
-        )
-        _check(0 <= choice.refine_steps <= 1_000_000, "refine_steps", "0 to 1,000,000", choice.refine_steps)
-        _check(choice.head_bits in (8, 32), "head_bits", "8 or 32", choice.head_bits)
-        _check(
-            self.weight_floor is None or 0 < self.weight_floor < 1,
-            "weight_floor",
-            "between 0 and 1",
-            self.weight_floor,
-        )
-        _check(
-            choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024,
-            "mesh_resolution",
-            "0 or 8 to 1024",
-            choice.mesh_resolution,
-        )
+        check(choice, "n_channels", 1 <= choice.n_channels <= 64, "1 to 64")
+        check(choice, "code_levels", 7 <= choice.code_levels <= 127, "7 to 127")
+        check(choice, "head_width", choice.head_width == 0 or 8 <= choice.head_width <= 256, "0 or 8 to 256")
+        check(choice, "refine_steps", 0 <= choice.refine_steps <= 1_000_000, "0 to 1,000,000")
+        check(choice, "head_bits", choice.head_bits in (8, 32), "8 or 32")
+        fits = choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024
+        check(choice, "mesh_resolution", fits, "0 or 8 to 1024")
 
     def choice(self, unbounded: bool = False) -> BakeChoice:
         """The preset for an object or an unbounded scene, with what is given in its place.
@@ -377,3 +350,50 @@ class BakeConfig:
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_fetches"] = None if self.k == "auto" else self.k
         return replace(preset, **{name: value for name, value in given.items() if value is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig:
+    """What `vfr-bench` is to measure."""
+
+    assets: tuple[Path, ...]
+    """Folders of assets of one scene."""
+    data: str
+    """The data set, as for vfr-train: its test views are compared."""
+    model: Path | None = None
+    """Also measure this full model, and count losses from it."""
+    views: int = 8
+    """Test views, spread evenly."""
+    sizes: tuple[str, ...] = ()
+    """Sizes of the timed frames, for example 400x400 800x800; the photographs' own, half and twice of it if
+    none is given. The front is drawn for the photographs' own, which is always measured."""
+    samples: tuple[int, ...] = (1, 2, 3, 4, 5, 8, 12, 16, 32, 0)
+    """Numbers of lookups a ray, 0 for every sample; the assets' own is always among them."""
+    frames: int = 20
+    """Timed frames of each setting and size."""
+    threads: int | None = None
+    """Threads of the player; one for each core if not given."""
+    max_memory: float | None = None
+    """Gigabytes of memory that each asset may take when it is opened; half of the machine's if not given."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot be measured."""
+        if not self.assets:
+            raise ConfigError("assets: expected at least one folder, got none")
+        if len(set(self.assets)) < len(self.assets):
+            raise ConfigError(f"assets: expected each once, got {[*map(str, self.assets)]}")
+        if not self.samples:
+            raise ConfigError("samples: expected at least one number, got none")
+        check(self, "views", self.views >= 1, "at least 1")
+        if not all(0 <= k <= 1024 for k in self.samples):
+            raise ConfigError(f"samples: expected 0 to 1024, got {[*self.samples]}")
+        check(self, "frames", self.frames >= 2, "at least 2")
+        check(self, "threads", self.threads is None or self.threads >= 1, "at least 1")
+        self.frame_sizes()
+
+    def frame_sizes(self) -> list[tuple[int, int]]:
+        """`sizes` as pairs of width and height in pixels. Raises ConfigError."""
+        try:
+            return [size(text) for text in self.sizes]
+        except ArgumentTypeError as error:
+            raise ConfigError(f"sizes: {error}") from None

@@ -9,7 +9,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from vfr_bake.config import BakeConfig, TrainConfig
+from vfr_bake.config import BakeConfig, BenchConfig, TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class Eval:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench:
+class Bench(BenchConfig):
     """Measure what baked assets of one scene give and take: quality, time, size, memory, for every number of
     lookups a ray.
 
@@ -84,23 +84,6 @@ class Bench:
 
     assets: Positional[tuple[Path, ...]]
     """Folders of assets of one scene."""
-    data: str
-    """The data set, as for vfr-train: its test views are compared."""
-    model: Path | None = None
-    """Also measure this full model, and count losses from it."""
-    views: int = 8
-    """Test views, spread evenly."""
-    sizes: tuple[str, ...] = ()
-    """Sizes of the timed frames, for example 400x400 800x800; the photographs' own, half and twice of it if
-    none is given. The front is drawn for the photographs' own, which is always measured."""
-    samples: tuple[int, ...] = (1, 2, 3, 4, 5, 8, 12, 16, 32, 0)
-    """Numbers of lookups a ray, 0 for every sample; the assets' own is always among them."""
-    frames: int = 20
-    """Timed frames of each setting and size."""
-    threads: int | None = None
-    """Threads of the player; one for each core if not given."""
-    max_memory: float | None = None
-    """Gigabytes of memory that each asset may take when it is opened; half of the machine's if not given."""
     lpips: Literal["alex", "vgg"] | None = None
     """Also measure LPIPS with this network, whose weights have to be on this machine."""
     html: Path | None = None

@@ -70,8 +70,8 @@ def test_the_help_names_the_defaults_that_hold(
     with pytest.raises(SystemExit):
         train_main(["--help"])
     said = re.sub(r"[\s│]+", "", capsys.readouterr().out)
-    cpu, gpu = (TrainConfig().pace(device, False) for device in ("cpu", "cuda"))
-    scenes = TrainConfig().pace("cuda", True)
+    cpu, gpu = (TrainConfig().for_device(device, False) for device in ("cpu", "cuda"))
+    scenes = TrainConfig().for_device("cuda", True)
     assert cpu.grid_rate == gpu.grid_rate
     for text in (
         f"Objects {EVAL_VIEWS[False]}, scenes {EVAL_VIEWS[True]}, a view of which",

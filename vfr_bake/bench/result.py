@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from vfr_bake.bench.front import Point, pareto_front, recommend
-from vfr_bake.bench.settings import Size
-from vfr_bake.bench.timing import Times
+from vfr_bake.bench.timing import Size, Times
 from vfr_bake.bench.worst import WorstPixel
 
 MAX_PSNR = 99.0

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from vfr_bake.bench.settings import Size
-
+Size = tuple[int, int]
+"""Width and height of a frame in pixels."""
 Ask = Callable[..., dict[str, Any]]
 SEED = 0
 """Of the order within the rounds."""

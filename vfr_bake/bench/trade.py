@@ -25,9 +25,9 @@ from player.render import bounded_threads
 from vfr_bake.bench.commands import bake_command, eval_command, play_command
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import Setting, Trade, conclude
-from vfr_bake.bench.settings import Plan, Size
-from vfr_bake.bench.timing import Times, measure_times, notch
+from vfr_bake.bench.timing import Size, Times, measure_times, notch
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
+from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene
 from vfr_bake.training.metrics import (
     Distance,
@@ -59,21 +59,21 @@ class Views:
     """[h, w, 3] float32 in [0, 1], over the background."""
 
 
-def measure_trade(plan: Plan, lpips: Distance | None, progress: Progress) -> Trade:
+def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:
     """Play the assets, with every k, at every size; `progress` is called with what is done and how far.
 
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
     """
-    assets = {str(folder): Asset.open(folder, max_memory=plan.max_memory) for folder in plan.assets}
-    views = _read_views(plan, list(assets.values()), progress)
+    assets = {str(folder): Asset.open(folder, max_memory=config.max_memory) for folder in config.assets}
+    views = _read_views(config, list(assets.values()), progress)
     own = views.cameras[0].width, views.cameras[0].height
-    sizes = list(dict.fromkeys([own, *(plan.sizes or _around(own))]))
-    ks = set(plan.samples) | {asset.manifest.n_samples for asset in assets.values()}
+    sizes = list(dict.fromkeys([own, *(config.frame_sizes() or _around(own))]))
+    ks = set(config.samples) | {asset.manifest.n_samples for asset in assets.values()}
     samples = sorted(ks, key=lambda k: k or 1e9)
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
-        run = _Run(Path(folder), views, plan, lpips, progress)
-        model, full = (None, None) if plan.model is None else run.model(plan.model, sizes, plan.data)
+        run = _Run(Path(folder), views, config, lpips, progress)
+        model, full = (None, None) if config.model is None else run.model(config.model, sizes, config.data)
         first = run.first_pictures(list(assets), own)
         players = [stack.enter_context(run.player(name)) for name in assets]
         qualities = [
@@ -85,7 +85,7 @@ def measure_trade(plan: Plan, lpips: Distance | None, progress: Progress) -> Tra
             len(views.cameras),
             sizes,
             samples,
-            plan.frames,
+            config.frames,
             lambda done, of: progress("frame times", done, of),
         )
         played = players[0].ask(view=0, size=own, samples=samples[0], rgb=None)
@@ -107,10 +107,10 @@ def measure_trade(plan: Plan, lpips: Distance | None, progress: Progress) -> Tra
     ]
     settings, sentence = conclude(rows, model)
     conditions = {
-        "data": plan.data,
-        "model": None if plan.model is None else str(plan.model),
+        "data": config.data,
+        "model": None if config.model is None else str(config.model),
         "views": [camera.name for camera in views.cameras],
-        "frames_a_setting_and_size": plan.frames,
+        "frames_a_setting_and_size": config.frames,
         "threads": played["threads"],
         "march": played["march"],
         "front_at": list(own),
@@ -138,7 +138,7 @@ class _Run:
     """What all measurements share."""
 
     def __init__(
-        self, folder: Path, views: Views, plan: Plan, lpips: Distance | None, progress: Progress
+        self, folder: Path, views: Views, config: BenchConfig, lpips: Distance | None, progress: Progress
     ) -> None:
         self._views = views
         self._lpips = lpips
@@ -146,8 +146,8 @@ class _Run:
         self._picture = folder / "picture.npy"
         self._cameras = folder / "cameras.json"
         self._cameras.write_bytes(write_cameras(views.cameras))
-        self._threads = str(bounded_threads(plan.threads) if plan.threads else 0)
-        self._max_memory = str(plan.max_memory or 0)
+        self._threads = str(bounded_threads(config.threads) if config.threads else 0)
+        self._max_memory = str(config.max_memory or 0)
 
     def player(self, name: str) -> Process:
         return Process(
@@ -263,12 +263,12 @@ def played_bytes(asset: Asset) -> int:
     return sum(entry.bytes for name, entry in files if not name.startswith("report."))
 
 
-def _read_views(plan: Plan, assets: list[Asset], progress: Progress) -> Views:
+def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) -> Views:
     downscale = assets[0].manifest.provenance.get("train", {}).get("downscale", 1)
-    scene = load_scene(plan.data, lambda done, of: progress("reading pictures", done, of), downscale)
+    scene = load_scene(config.data, lambda done, of: progress("reading pictures", done, of), downscale)
     if not scene.test.cameras:
-        raise DataError(f"{plan.data}: test views: expected at least 1, got none")
-    n_views = min(plan.views, len(scene.test.cameras))
+        raise DataError(f"{config.data}: test views: expected at least 1, got none")
+    n_views = min(config.views, len(scene.test.cameras))
     chosen = np.linspace(0, len(scene.test.cameras) - 1, n_views).round().astype(int)
     cameras = [scene.test.cameras[i].transformed(scene.world_from_model) for i in chosen]
     backgrounds = {asset.manifest.background for asset in assets}

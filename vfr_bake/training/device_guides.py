@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vfr_bake.config import Pace, TrainConfig
+from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.device_grid import DeviceOccupancyGrid
 from vfr_bake.rendering.occupancy import OccupancyGrid
@@ -25,7 +25,9 @@ from vfr_bake.training.optimiser import DeviceGridAdam
 class DeviceOccupancyGuide(OccupancyPace):
     """Marches an object's box and keeps its occupancy grid."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, step_length: float, device: torch.device) -> None:
+    def __init__(
+        self, config: TrainConfig, pace: DeviceSettings, step_length: float, device: torch.device
+    ) -> None:
         super().__init__(pace, step_length)
         self._grid = DeviceOccupancyGrid(config.occupancy_resolution, step_length, config.seed, device)
 
@@ -59,7 +61,7 @@ class DeviceOccupancyGuide(OccupancyPace):
 class DeviceProposalGuide(ProposalPace):
     """Trains the two proposal grids of an unbounded scene beside the field, by autograd."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, near: float, device: torch.device) -> None:
+    def __init__(self, config: TrainConfig, pace: DeviceSettings, near: float, device: torch.device) -> None:
         super().__init__(config, pace, ProposalSampler(near).to(device))
         self._adams = [DeviceGridAdam(grid.table) for grid in self._sampler.grids]  # type: ignore[arg-type]
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.config import Pace, TrainConfig
+from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import spacing
 from vfr_bake.rendering.compositing import distortion
@@ -80,7 +80,7 @@ class Guide(Protocol):
 class OccupancyPace:
     """How many rays of an object fill a batch: what its guides have in common on all devices."""
 
-    def __init__(self, pace: Pace, step_length: float) -> None:
+    def __init__(self, pace: DeviceSettings, step_length: float) -> None:
         self._pace = pace
         self._samples_per_ray = 2 / step_length
 
@@ -109,7 +109,9 @@ class OccupancyPace:
 class OccupancyGuide(OccupancyPace):
     """Marches an object's box and keeps its occupancy grid."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, step_length: float, processes: Processes) -> None:
+    def __init__(
+        self, config: TrainConfig, pace: DeviceSettings, step_length: float, processes: Processes
+    ) -> None:
         super().__init__(pace, step_length)
         self._processes = processes
         self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
@@ -142,7 +144,7 @@ class ProposalPace:
     """When the proposals of a scene learn and how far they are believed: what its guides have in common on
     all devices."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, sampler: ProposalSampler) -> None:
+    def __init__(self, config: TrainConfig, pace: DeviceSettings, sampler: ProposalSampler) -> None:
         self._config, self._pace, self._sampler = config, pace, sampler
         self._adams: Sequence[TableAdam] = ()
         self._learns = True
@@ -168,7 +170,7 @@ class ProposalPace:
 class ProposalGuide(ProposalPace):
     """Trains the two proposal grids of an unbounded scene beside the field."""
 
-    def __init__(self, config: TrainConfig, pace: Pace, near: float) -> None:
+    def __init__(self, config: TrainConfig, pace: DeviceSettings, near: float) -> None:
         self.sampler = ProposalSampler(near)
         super().__init__(config, pace, self.sampler)
         self._adams = [GridAdam(grid.table) for grid in self.sampler.grids]  # type: ignore[arg-type]

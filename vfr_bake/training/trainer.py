@@ -96,7 +96,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config = config
         self.device = choose_device(config.device)
-        self.pace = config.pace(self.device.type, scene.unbounded)
+        self.pace = config.for_device(self.device.type, scene.unbounded)
         self.processes = processes or Processes(0, 1)
         backend = backend or ("numba" if self.device.type == "cpu" else "torch")
         if backend == "torch" and self.processes.size > 1:

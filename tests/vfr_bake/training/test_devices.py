@@ -154,12 +154,12 @@ def test_several_processes_stay_on_the_cpu() -> None:
 
 
 def test_what_is_not_given_follows_from_the_device() -> None:
-    cpu, gpu = (TrainConfig().pace(device, False) for device in ("cpu", "cuda"))
+    cpu, gpu = (TrainConfig().for_device(device, False) for device in ("cpu", "cuda"))
     assert (cpu.steps, cpu.batch_rays, cpu.max_rays, cpu.network_rate) == (60_000, 512, 16_384, 4e-3)
     assert (gpu.steps, gpu.batch_samples, gpu.batch_rays) == (20_000, 2**18, 2**13)
     assert (gpu.network_rate, gpu.grid_rate) == (0.01, 0.01)
-    assert TrainConfig().pace("cuda", True).steps == 40_000
-    assert TrainConfig(batch_rays=64).pace("cuda", True).batch_rays == 64
+    assert TrainConfig().for_device("cuda", True).steps == 40_000
+    assert TrainConfig(batch_rays=64).for_device("cuda", True).batch_rays == 64
     assert FieldOptions().resolved(False, "cuda").log2_table_size == 19
     assert FieldOptions(log2_table_size=15).resolved(False, "cuda").log2_table_size == 15
     assert FieldOptions().resolved(False) == FieldOptions().resolved(False, "cpu")
