@@ -1,16 +1,16 @@
 """`report.json` and `report.html`: what the bake chose, left out and lost, for programs and for people.
 
-The page is one file: plots are SVG inside it, pictures are PNG inside it, nothing is loaded from elsewhere.
+A page is one file: plots are SVG inside it, pictures are PNG inside it, nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from vfr_bake.training.model_file import Model
 N_PICTURES = 2
 """Views shown side by side in the report."""
 PICTURE_PIXELS = 160_000
-"""Of each of them at most: the full model takes a second for 10,000 pixels of an unbounded scene."""
+"""Most pixels of such a view: the full model takes a second for 10,000 pixels of an unbounded scene."""
 BAR_WIDTH = 420
 """Pixels of the longest bar of a plot."""
 STYLE = """
@@ -37,6 +37,22 @@ svg text { font: 13px system-ui, sans-serif }
 img { max-width: 100%; image-rendering: pixelated }
 .missed { color: #b00 }
 """
+
+
+class Pictures(NamedTuple):
+    """One view as two pictures, [height, width, 3] in [0, 1]."""
+
+    name: str
+    wanted: np.ndarray
+    """The picture to be reached: the full model's, or a photograph."""
+    played: np.ndarray
+    """The asset's picture."""
+
+    def html(self) -> str:
+        """A paragraph with both pictures and their difference."""
+        data = base64.b64encode(png_bytes(comparison(self.wanted, self.played))).decode()
+        name = escape(self.name)
+        return f'<p>{name}<br><img alt="{name}" src="data:image/png;base64,{data}"></p>'
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,61 +71,79 @@ class BakeReport:
     left_out: dict[str, str]
     """What is not in the asset, and what that changed."""
     lookups: dict[str, float]
-    """dB that each number of lookups a ray loses against all; none where the number was given."""
+    """Loss in dB of each number of lookups a ray against all of them; empty where the number was given."""
     missed: list[str]
-    """Limits that were not met, in words; none if all were."""
-    pictures: list[tuple[str, np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Name, the model's picture and the played one, [height, width, 3] in [0, 1]."""
+    """Limits that were not met, in words; empty if all were."""
+    pictures: list[Pictures] = field(default_factory=list)
+    """The full model's pictures and the played ones."""
 
     def json(self) -> bytes:
         """The content of report.json."""
-        document = {
-            "asked": self.asked,
-            "stages": self.stages,
-            "bytes": self.n_bytes,
-            "seconds": self.seconds,
-            "left_out": self.left_out,
-            "lookups": self.lookups,
-            "missed": self.missed,
-        }
+        names = ("asked", "stages", "seconds", "left_out", "lookups", "missed")
+        document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
     def html(self) -> bytes:
         """The content of report.html."""
         last = self.stages[-1]
         megabytes = sum(self.n_bytes.values()) / 1e6
-        parts = [
+        lookups = f"<h2>Lookups a ray: loss against all</h2>{bars(self.lookups, 'dB', 3)}"
+        columns = {"psnr": 2, "loss_db": 3, "samples_median": 0, "samples_p95": 0}
+        titles = ["after", "dB to the model's pictures", "expected loss, dB", "samples a ray, median"]
+        stages = [
+            row(stage["name"], *(f"{stage[key]:.{digits}f}" for key, digits in columns.items()))
+            for stage in self.stages
+        ]
+        return page(
+            self.title,
             f"<p>{megabytes:.1f} MB, baked in {sum(self.seconds.values()):.0f} s; the written files play "
             f"{last['psnr']:.1f} dB from the model's own pictures, an expected loss of "
             f"{last['loss_db']:.2f} dB against photographs.</p>",
             *(f'<p class="missed">Missed: {escape(text)}</p>' for text in self.missed),
             "<h2>Loss, stage by stage</h2>",
             bars({stage["name"]: stage["loss_db"] for stage in self.stages}, "dB", 3),
-            _stage_table(self.stages),
-            *(
-                ["<h2>Lookups a ray: loss against all</h2>", bars(self.lookups, "dB", 3)]
-                if self.lookups
-                else []
-            ),
-            "<h2>Bytes</h2>",
-            bars({name: size / 1e6 for name, size in self.n_bytes.items()}, "MB", 2),
-            "<h2>Time</h2>",
-            bars(self.seconds, "s", 0),
-            "<h2>What was left out</h2>",
-            _table(self.left_out),
-            "<h2>Pictures</h2>",
-            f"<p>Full model, played from the files, difference (white: {BRIGHTEST_ERROR:g} of the range or "
-            "more). These views were not learned from.</p>",
-            *(_picture(*picture) for picture in self.pictures),
+            table([title_row(*titles, "95th percentile"), *stages]),
+            lookups if self.lookups else "",
+            f"<h2>Bytes</h2>{bars({name: size / 1e6 for name, size in self.n_bytes.items()}, 'MB', 2)}",
+            f"<h2>Time</h2>{bars(self.seconds, 's', 0)}",
+            f"<h2>What was left out</h2>{_pairs(self.left_out)}",
+            f"<h2>Pictures</h2><p>Full model, played from the files, difference (white: {BRIGHTEST_ERROR:g} "
+            "of the range or more). These views were not learned from.</p>",
+            *(pictures.html() for pictures in self.pictures),
             "<h2>What was asked</h2>",
-            _table({key: json.dumps(value) for key, value in sorted(self.asked.items())}),
-        ]
-        title = escape(self.title)
-        page = (
-            f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-            f"<style>{STYLE}</style></head><body><h1>{title}</h1>{''.join(parts)}</body></html>\n"
+            _pairs({key: json.dumps(value) for key, value in sorted(self.asked.items())}),
         )
-        return page.encode()
+
+
+def page(title: str, *parts: str) -> bytes:
+    """A page of HTML."""
+    title = escape(title)
+    text = (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{STYLE}</style></head><body><h1>{title}</h1>{''.join(parts)}</body></html>\n"
+    )
+    return text.encode()
+
+
+def table(rows: Iterable[str]) -> str:
+    """A table of HTML rows."""
+    return f"<table>{''.join(rows)}</table>"
+
+
+def title_row(*titles: str) -> str:
+    """The first row of a table."""
+    return f"<tr>{''.join(f'<th>{escape(title, quote=False)}</th>' for title in titles)}</tr>"
+
+
+def row(first: str, *numbers: str, bold: bool = False) -> str:
+    """A row of a table: a name and numbers.
+
+    >>> row("grid", "1.5")
+    '<tr><td>grid</td><td class="number">1.5</td></tr>'
+    """
+    tag, begin, end = ("th", "<b>", "</b>") if bold else ("td", "", "")
+    cells = "".join(f'<td class="number">{begin}{escape(number)}{end}</td>' for number in numbers)
+    return f"<tr><{tag}>{escape(first)}</{tag}>{cells}</tr>"
 
 
 def bars(values: dict[str, float], unit: str, digits: int) -> str:
@@ -132,37 +166,16 @@ def bars(values: dict[str, float], unit: str, digits: int) -> str:
     return f'<svg width="{BAR_WIDTH + 320}" height="{height}" role="img">{"".join(rows)}</svg>'
 
 
-def _stage_table(stages: list[dict[str, Any]]) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(stage['name'])}</td>"
-        + "".join(
-            f'<td class="number">{stage[key]:.{digits}f}</td>'
-            for key, digits in (("psnr", 2), ("loss_db", 3), ("samples_median", 0), ("samples_p95", 0))
-        )
-        + "</tr>"
-        for stage in stages
-    )
-    return (
-        "<table><tr><th>after</th><th>dB to the model's pictures</th><th>expected loss, dB</th>"
-        f"<th>samples a ray, median</th><th>95th percentile</th></tr>{rows}</table>"
-    )
+def _pairs(values: dict[str, str]) -> str:
+    return table(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in values.items())
 
 
-def _table(values: dict[str, str]) -> str:
-    rows = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in values.items())
-    return f"<table>{rows}</table>"
-
-
-def _picture(name: str, full: np.ndarray, played: np.ndarray) -> str:
-    data = base64.b64encode(png_bytes(comparison(full, played))).decode()
-    return f'<p>{escape(name)}<br><img alt="{escape(name)}" src="data:image/png;base64,{data}"></p>'
-
-
-def side_by_side(model: Model, asset: Asset) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Name, the model's picture and the asset's [height, width, 3] of some views between the cameras."""
+def side_by_side(model: Model, asset: Asset) -> Iterator[Pictures]:
+    """Some views between the cameras, by the full model and by the asset."""
     with Renderer(asset) as renderer:
         for view in views_between(model, N_PICTURES, seed=3):
             share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
             camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
             full = render_image(model.field, model.sampler, camera, model.background)
-            yield camera.name, full, renderer.render(camera.transformed(model.world_from_model)).rgb
+            played = renderer.render(camera.transformed(model.world_from_model)).rgb
+            yield Pictures(camera.name, full, played)

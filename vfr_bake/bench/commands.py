@@ -1,4 +1,4 @@
-"""The commands that bake, play or score a setting again."""
+"""The commands that bake or play a setting again."""
 
 from __future__ import annotations
 
@@ -45,12 +45,3 @@ def play_command(folder: str, samples: int, size: tuple[int, int]) -> str:
     width, height = size
     words = ["--samples", str(samples), "--size", f"{width}x{height}", "--orbit", "60", "--output", "frames/"]
     return shlex.join(["vfr-play", folder, *words])
-
-
-def eval_command(model: str, data: str) -> str:
-    """What renders the test views with the full model.
-
-    >>> eval_command("model.pt", "demo")
-    'vfr-eval model.pt demo'
-    """
-    return shlex.join(["vfr-eval", model, data])

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
+from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.front import Point, pareto_front, recommend
 from vfr_bake.bench.timing import Size, Times
 from vfr_bake.bench.worst import WorstPixel
@@ -61,10 +60,10 @@ class Trade:
     """The first one is that of the first photograph, for which the front is drawn."""
     conditions: dict[str, Any]
     """Views, rounds, threads, march."""
-    pictures: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    """By asset, its worst view: what was wanted and what was played, [h, w, 3] in [0, 1]."""
+    pictures: list[Pictures] = field(default_factory=list)
+    """The worst view of each asset, under the asset's name."""
     worst: dict[str, list[WorstPixel]] = field(default_factory=dict)
-    """By asset, its worst pixels with the asset's own k."""
+    """The worst pixels of each asset with its own k, by the asset's name."""
 
     def document(self) -> dict[str, Any]:
         """The content of the JSON file."""

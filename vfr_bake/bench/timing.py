@@ -75,7 +75,7 @@ def measure_times(
         shared = [_mean_ms([visits[other, size][turn] for other in range(len(players))])
                   for turn in range(n_rounds)]  # fmt: skip
         for k in samples:
-            times[player, k, size] = _times([answers[k] for answers in rounds], slope, shared)
+            times[player, k, size] = frame_times([answers[k] for answers in rounds], slope, shared)
     return times
 
 
@@ -110,7 +110,9 @@ def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
     return max(float(np.median(slopes)), 0.0) if slopes else None
 
 
-def _times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
+def frame_times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
+    """The times of frames from what the process answered to each; `slope` is the milliseconds of a fetch, and
+    `shared` what `notch` divides out."""
     ms, march, head, fetches = (
         np.array([answer[key] for answer in answers], np.float64)
         for key in ("ms", "march_ms", "head_ms", "fetches")

@@ -7,6 +7,7 @@ asset: its pictures for quality, then frames in turns for time (`vfr_bake.bench.
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,22 +23,15 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
 from player.render import bounded_threads
-from vfr_bake.bench.commands import bake_command, eval_command, play_command
+from vfr_bake.baking.report import Pictures
+from vfr_bake.bench.commands import bake_command, play_command
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import Setting, Trade, conclude
-from vfr_bake.bench.timing import Size, Times, measure_times, notch
+from vfr_bake.bench.timing import Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene
-from vfr_bake.training.metrics import (
-    Distance,
-    ViewScore,
-    mean_scores,
-    over_background,
-    psnr,
-    score_view,
-    ssim,
-)
+from vfr_bake.training.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
 
 N_FIRST_PICTURES = 3
 """Times that an asset is opened for its first picture; the median counts."""
@@ -68,7 +62,8 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
     assets = {str(folder): Asset.open(folder, max_memory=config.max_memory) for folder in config.assets}
     views = _read_views(config, list(assets.values()), progress)
     own = views.cameras[0].width, views.cameras[0].height
-    sizes = list(dict.fromkeys([own, *(config.frame_sizes() or _around(own))]))
+    half_and_twice = [((own[0] + 1) // 2, (own[1] + 1) // 2), (2 * own[0], 2 * own[1])]
+    sizes = list(dict.fromkeys([own, *(config.frame_sizes() or half_and_twice)]))
     ks = set(config.samples) | {asset.manifest.n_samples for asset in assets.values()}
     samples = sorted(ks, key=lambda k: k or 1e9)
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
@@ -117,8 +112,8 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
         "background": views.background.tolist(),
         "bits": 8,
     }
-    pictures = {name: quality.worst_view for name, quality in zip(assets, qualities, strict=True)}
-    worst = {name: quality.worst for name, quality in zip(assets, qualities, strict=True)}
+    pictures = [quality.worst_view for quality in qualities]
+    worst = {quality.worst_view.name: quality.worst for quality in qualities}
     return Trade(settings, sentence, sizes, conditions, pictures, worst)
 
 
@@ -127,11 +122,12 @@ class _Quality:
     """One asset's pictures, compared."""
 
     scores: dict[int, dict[str, float | None]]
-    """By k."""
+    """The scores for each k."""
     peak_mb: float | None
-    worst_view: tuple[np.ndarray, np.ndarray]
-    """Of the asset's own k: what was wanted and what was played."""
+    worst_view: Pictures
+    """The view that is farthest off with the asset's own k."""
     worst: list[WorstPixel]
+    """The pixels that are farthest off with the asset's own k."""
 
 
 class _Run:
@@ -156,37 +152,30 @@ class _Run:
 
     def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
         """The full model's row and its pictures, one a view."""
-        own, n_views = sizes[0], len(self._views.cameras)
-        pictures, times = [], {}
+        n_views = len(self._views.cameras)
+        frames = [(sizes[0], view) for view in range(n_views)]
+        frames += [(size, turn % n_views) for size in sizes[1:] for turn in range(MODEL_FRAMES)]
+        answers: dict[Size, list[dict[str, Any]]] = {size: [] for size in sizes}
+        pictures = []
         with Process("vfr_bake.bench.model_frames", str(path), str(self._cameras), self._threads) as process:
             process.ask(view=0, size=[32, 32], rgb=None)
-            milliseconds = []
-            for view in range(n_views):
-                answer = process.ask(view=view, size=own, rgb=str(self._picture))
-                pictures.append(np.load(self._picture))
-                milliseconds.append(answer["ms"])
-                self._progress("full model", view + 1, n_views + MODEL_FRAMES * (len(sizes) - 1))
-            times[own] = _whole_frames(milliseconds)
-            peak = answer["peak_mb"]
-            for index, size in enumerate(sizes[1:]):
-                milliseconds = []
-                for turn in range(MODEL_FRAMES):
-                    milliseconds.append(process.ask(view=turn % n_views, size=size, rgb=None)["ms"])
-                    done = n_views + MODEL_FRAMES * index + turn + 1
-                    self._progress("full model", done, n_views + MODEL_FRAMES * (len(sizes) - 1))
-                times[size] = _whole_frames(milliseconds)
-        scores = self.scores(pictures, None)
+            for done, (size, view) in enumerate(frames, start=1):
+                kept = str(self._picture) if size == sizes[0] else None
+                answers[size].append(process.ask(view=view, size=size, rgb=kept))
+                if kept is not None:
+                    pictures.append(np.load(kept))
+                self._progress("full model", done, len(frames))
         setting = Setting(
             name=str(path),
             asset=None,
             samples=None,
             what={"preset": "full model"},
-            scores=scores,
-            times=times,
+            scores=self.scores(pictures, None),
+            times={size: frame_times(some, None, [1.0] * len(some)) for size, some in answers.items()},
             n_bytes=path.stat().st_size,
-            peak_mb=peak,
+            peak_mb=answers[sizes[0]][-1]["peak_mb"],
             first_picture_ms=None,
-            commands=(eval_command(str(path), data),),
+            commands=(shlex.join(["vfr-eval", str(path), data]),),
         )
         return setting, pictures
 
@@ -211,7 +200,7 @@ class _Run:
         """Every view with every k, against the photographs and the model's pictures if there are some."""
         wanted = self._views.photographs if full is None else full
         scores: dict[int, dict[str, float | None]] = {}
-        worst_view, worst, peak = (wanted[0], wanted[0]), [], None
+        worst_view, worst, peak = Pictures(name, wanted[0], wanted[0]), [], None
         for done, k in enumerate(samples):
             pictures = []
             for view, photograph in enumerate(self._views.photographs):
@@ -222,23 +211,18 @@ class _Run:
             scores[k] = self.scores(pictures, full)
             if k == asset.manifest.n_samples:
                 lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, pictures, strict=True)]))
-                worst_view = wanted[lowest], pictures[lowest]
+                worst_view = Pictures(name, wanted[lowest], pictures[lowest])
                 worst = worst_pixels(asset, self._views.cameras, wanted, pictures)
             self._progress(f"quality of {name}", done + 1, len(samples))
         return _Quality(scores, peak, worst_view, worst)
 
     def scores(self, pictures: list[np.ndarray], full: list[np.ndarray] | None) -> dict[str, float | None]:
         """Means over the views."""
-        scores: list[ViewScore] = [
-            score_view(camera.name, picture, photograph, self._lpips)
-            for camera, picture, photograph in zip(
-                self._views.cameras, pictures, self._views.photographs, strict=True
-            )
-        ]
-        means = mean_scores(scores)
-        pairs = [] if full is None else list(zip(pictures, full, strict=True))
-        means["psnr_to_model"] = float(np.mean([psnr(a, b) for a, b in pairs])) if pairs else None
-        means["ssim_to_model"] = float(np.mean([ssim(a, b) for a, b in pairs])) if pairs else None
+        views = zip(self._views.cameras, pictures, self._views.photographs, strict=True)
+        means = mean_scores([score_view(view.name, a, b, self._lpips) for view, a, b in views])
+        for name, score in (("psnr_to_model", psnr), ("ssim_to_model", ssim)):
+            off = None if full is None else [score(a, b) for a, b in zip(pictures, full, strict=True)]
+            means[name] = None if off is None else float(np.mean(off))
         return means
 
 
@@ -276,25 +260,3 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) ->
         raise ConfigError(f"assets: expected one background, got {sorted(backgrounds)}")
     background = np.array(backgrounds.pop(), np.float32)
     return Views(cameras, background, [over_background(scene.test.images[i], background) for i in chosen])
-
-
-def _around(size: Size) -> list[Size]:
-    width, height = size
-    return [((width + 1) // 2, (height + 1) // 2), (2 * width, 2 * height)]
-
-
-def _whole_frames(milliseconds: list[float]) -> Times:
-    """Times of frames that are not taken apart."""
-    low, high = np.percentile(milliseconds, [25, 75])
-    whole = float(np.median(milliseconds))
-    return Times(
-        median=whole,
-        p95=float(np.percentile(milliseconds, 95)),
-        quartiles=(float(low), float(high)),
-        uncertainty=notch(np.array(milliseconds), [1.0] * len(milliseconds)),
-        frames=len(milliseconds),
-        march=0.0,
-        lookups=None,
-        head=0.0,
-        rest=whole,
-    )

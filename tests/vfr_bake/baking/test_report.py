@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vfr_bake.baking.held_out import expected_loss
-from vfr_bake.baking.report import BakeReport, bars
+from vfr_bake.baking.report import BakeReport, Pictures, bars
 
 STAGE = {"psnr": 40.0, "loss_db": 0.5, "samples_median": 5.0, "samples_p95": 9.0}
 
@@ -24,7 +24,7 @@ def report(**changes: object) -> BakeReport:
         "left_out": {"head": "256 wide, this one is <64>"},
         "lookups": {"1": 0.5, "2": 0.125},
         "missed": [],
-        "pictures": [("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
+        "pictures": [Pictures("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
     }
     return BakeReport(**(parts | changes))  # type: ignore[arg-type]
 
