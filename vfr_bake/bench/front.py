@@ -7,11 +7,12 @@ slower beyond the uncertainty of both, and better, smaller or faster (beyond the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 MAX_LOSS_DB, MAX_MS, MAX_MB = 0.1, 100.0, 20.0
-"""What a setting is recommended for."""
+"""Limits on the loss in dB, on the milliseconds of a frame and on the megabytes, for each of which a setting
+is recommended."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Point:
     """dB against the photographs."""
     ms: float
     uncertainty: float
-    """Of `ms`."""
+    """Half width of the interval around `ms` that noise alone explains, milliseconds."""
     megabytes: float
 
 
@@ -58,34 +59,20 @@ k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).
     def told(point: Point) -> str:
         return f"{reference - point.psnr:.2f} dB, {point.ms:.0f} ms, {point.megabytes:.0f} MB"
 
-    def best(fitting: list[Point], wanted: str, otherwise: Point, key: str) -> str:
+    def best_for(wanted: str, limit: float, cost: Callable[[Point], float], fast: bool = False) -> str:
+        """What to play for at most `limit`: the fastest that keeps to it, or the best."""
+        fitting = [point for point in points if cost(point) <= limit]
         if not fitting:
-            return f"for {wanted} there is none, nearest is {otherwise.name} ({told(otherwise)})"
-        if key == "ms":
-            chosen = min(fitting, key=lambda point: (point.ms, -point.psnr))
-        else:
-            chosen = max(fitting, key=lambda point: (point.psnr, -point.ms))
+            nearest = min(points, key=cost)
+            return f"for {wanted} there is none, nearest is {nearest.name} ({told(nearest)})"
+        chosen = min(fitting, key=lambda p: (p.ms, -p.psnr) if fast else (-p.psnr, p.ms))
         return f"for {wanted} play {chosen.name} ({told(chosen)})"
 
-    parts = [
-        best(
-            [point for point in points if reference - point.psnr <= MAX_LOSS_DB],
-            f"at most {MAX_LOSS_DB:g} dB below {against}",
-            max(points, key=lambda point: point.psnr),
-            "ms",
-        ),
-        best(
-            [point for point in points if point.ms <= MAX_MS],
-            f"at most {MAX_MS:g} ms a frame",
-            min(points, key=lambda point: point.ms),
-            "psnr",
-        ),
-        best(
-            [point for point in points if point.megabytes <= MAX_MB],
-            f"at most {MAX_MB:g} MB",
-            min(points, key=lambda point: point.megabytes),
-            "psnr",
-        ),
-    ]
+    below = f"at most {MAX_LOSS_DB:g} dB below {against}"
+    parts = (
+        best_for(below, MAX_LOSS_DB, lambda point: reference - point.psnr, fast=True),
+        best_for(f"at most {MAX_MS:g} ms a frame", MAX_MS, lambda point: point.ms),
+        best_for(f"at most {MAX_MB:g} MB", MAX_MB, lambda point: point.megabytes),
+    )
     sentence = "; ".join(parts)
     return f"{sentence[0].upper()}{sentence[1:]}."
