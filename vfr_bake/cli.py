@@ -232,9 +232,10 @@ def _bake(options: Any) -> int:
     check_bakeable(model, options.config)
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
+    fine, coarse = plan.resolutions
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes and {plan.n_bytes / 1e9:.1f} GB of memory at most, "
-        f"densities on {plan.resolution} cells per axis and features on {plan.feature_resolution}, "
+        f"densities on {fine} cells per axis and features on {coarse}, "
         f"about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )

@@ -112,7 +112,7 @@ def test_a_bake_asks_before_it_begins(
     from vfr_bake.baking import bake, plan
     from vfr_bake.training import model_file
 
-    made = SimpleNamespace(n_bytes=1, resolution=1, feature_resolution=1, n_cells=1, n_rays=lambda n: n)
+    made = SimpleNamespace(n_bytes=1, resolutions=(1, 1), n_cells=1, n_rays=lambda n: n)
     child_runs(monkeypatch, DIES)
     monkeypatch.setattr(model_file, "load_model", lambda *_: None)
     monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)

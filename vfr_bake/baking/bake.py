@@ -173,12 +173,12 @@ class _Bake:
             )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        n_cells = int(np.count_nonzero(visible)) * (plan.feature_resolution // len(visible)) ** 3
+        n_cells = int(np.count_nonzero(visible)) * (plan.resolutions.features // len(visible)) ** 3
         if n_cells > plan.most_cells:
             raise TrainingError(
                 f"bake: cells: expected at most {plan.most_cells:,}, which fit into "
                 f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of "
-                f"{plan.feature_resolution**3:,}: is the model "
+                f"{plan.resolutions.features**3:,}: is the model "
                 "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
         self.n_rays = plan.n_rays(n_cells)

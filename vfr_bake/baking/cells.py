@@ -1,23 +1,18 @@
-"""Which cells a bake stores, and how long the player's steps through them are.
+"""Which cells of the grid a bake stores, and how long the player's steps through them are.
 
-Which cells are stored: those that matter, by what leaving the others out loses.
+In an object's box, cells are stored that matter to the pictures. A sample's own weight says little about
+that: in a fog every sample of a ray weighs next to nothing, and all of them together are the picture. What
+counts is the sum along a ray. So cells whose samples weigh less than a floor in every view are left out only
+where the pictures without them lose next to nothing, measured on views that nothing else looks at.
 
-A sample's own weight says little: in a fog every sample of a ray weighs next to nothing, and all of them
-together are the picture. What counts is the sum along a ray, so that a floor on the weights is taken only
-where the pictures without the cells below it, on views that nothing else looks at, lose next to nothing.
-
-Which cells of the grid any training view sees: only those are stored.
-
-What the bake of an unbounded scene does in its own way: the cells come from the model's own samples.
-
-There is no occupancy grid: where no view has ever put a sample, the field holds what nobody has taught it. So
-a cell is stored only if the intervals that the proposals chose on some ray weigh something in it.
+An unbounded scene has no occupancy grid: where no view has ever put a sample, the field holds untrained
+values. A cell is stored only if the intervals that the proposals chose on some ray have weight in it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +29,38 @@ from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
+FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
+"""Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
+is taken, and where none does, nothing is left out."""
+HITS, CONTRACTED_HITS = 8, 24
+"""Rays that meet a surface cell of a box, and a block of cells at the unit sphere of an unbounded scene, over
+all views, on average. The cells of a box that still escape are gaps to be closed."""
+VIEWS_OF_A_CELL = 0.4
+"""Share of the training views that see a given piece of surface, roughly."""
+BLOCK = 2
+"""Cells along each edge of a block. Blocks are found whole in an unbounded scene: the model's proposals take
+their time, 4,000 rays a second of one core, and so a quarter of the rays is enough. Surfaces are some cells
+thick anyway."""
+FASTEST_CELLS = 2.0
+"""Cells between two samples of a ray where it is fastest in contracted space; where it is slowest there are
+two fifths of that."""
+CONTRACTED_RAYS_AT_ONCE = 1 << 14
+WEIGHT_FLOOR = 0.01
+"""Weight that a cell of an unbounded scene must have on some ray where no floor is given. Fox at 1088 cells
+loses nothing to it; it would have half again as many vertices with 0.003."""
+CELL_SHARE = 0.008
+"""Share of all cells of contracted space that is stored, before anything is known of a scene."""
+
+Progress = Callable[[int, int], object]
+"""Called with (done, of)."""
+
+
+class Resolutions(NamedTuple):
+    """Cells per axis of the two grids of an asset."""
+
+    densities: int
+    features: int
+
 
 class StoredCells(NamedTuple):
     """What is stored."""
@@ -41,51 +68,45 @@ class StoredCells(NamedTuple):
     visible: np.ndarray
     """[n, n, n] bool: cells of the features' grid, or blocks of them."""
     step: float
-    """Of the march: model units, of an unbounded scene dphi of `player.march.contracted`."""
+    """Length of a march step: model units in a box, dphi of `player.march.contracted` in contracted space."""
     left_out: str | None
     """What is not stored, in words."""
 
 
 def find_cells(
-    model: Model, config: BakeConfig, resolutions: tuple[int, int], held_out: HeldOut, progress: Progress
+    model: Model, config: BakeConfig, resolutions: Resolutions, held_out: HeldOut, progress: Progress
 ) -> StoredCells:
     """The cells of an object's box, or of contracted space, that matter in some view.
 
     Raises TrainingError when nothing is seen.
     """
-    resolution = resolutions[1]
     if model.field.config.unbounded:
         floor = config.weight_floor or WEIGHT_FLOOR
-        visible = weighty_cells(model, resolution, floor, progress)
+        visible = weighty_cells(model, resolutions.features, floor, progress)
         left_out = (
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
             f"{floor:g}; part of the loss after 'grid'"
         )
-        return StoredCells(visible, lattice_step(resolutions[0]), left_out)
+        return StoredCells(visible, lattice_step(resolutions.densities), left_out)
     step = float(model.occupancy.step)
     if config.no_cull:
-        return StoredCells(whole(model, resolution).visible, step, None)
+        return StoredCells(occupied_cells(model, resolutions.features), step, None)
     most_db = config.choice().culled_loss_db
-    cells = cull(model, resolution, held_out, config.weight_floor, most_db, progress)
+    cells = cull(model, resolutions.features, held_out, config.weight_floor, most_db, progress)
     return StoredCells(cells.visible, step, cells.report())
 
 
-FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
-"""Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
-is taken, and where none does, nothing is left out."""
-
-
 @dataclass(frozen=True, eq=False)
-class Cells:
-    """What is stored of a box."""
+class CulledCells:
+    """The stored cells of a box, and what decided."""
 
     visible: np.ndarray
     """[n, n, n] bool."""
-    floor: float
-    """The weight that decided; 0 where every cell that may hold matter is stored."""
-    lost: dict[float, float]
+    floor: float = 0.0
+    """The weight that a sample must have; 0 where every cell that may hold matter is stored."""
+    lost: dict[float, float] = field(default_factory=dict)
     """Expected loss in dB of each floor that was tried, on its own."""
-    removed: float
+    removed: float = 0.0
     """Share of the cells that may hold matter which are not stored."""
 
     def report(self) -> str:
@@ -99,14 +120,9 @@ class Cells:
         )
 
 
-def whole(model: Model, resolution: int) -> Cells:
-    """Every cell that the model holds matter in."""
-    return Cells(occupied_cells(model, resolution), 0.0, {}, 0.0)
-
-
 def cull(
     model: Model, resolution: int, held_out: HeldOut, floor: float | None, most_db: float, progress: Progress
-) -> Cells:
+) -> CulledCells:
     """The cells of a grid of `resolution` that weigh something in some view, gaps of one cell between them
     closed.
 
@@ -125,13 +141,17 @@ def cull(
         lost[tried] = max(_loss(model, held_out, visible) - least, 0.0)
         if lost[tried] <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)
-            return Cells(visible, tried, lost, max(removed, 0.0))
+            return CulledCells(visible, tried, lost, max(removed, 0.0))
     if floor is not None:
-        raise TrainingError(
-            f"no cell weighs {floor} in any training view: the model is empty or a thin fog: "
-            "train longer, or lower --weight-floor"
-        )
-    return Cells(held, 0.0, lost, 0.0)
+        raise _nothing_seen(floor)
+    return CulledCells(held, lost=lost)
+
+
+def _nothing_seen(floor: float) -> TrainingError:
+    return TrainingError(
+        f"no cell weighs {floor} in any training view: the model is empty or a thin fog: "
+        "train longer, or lower --weight-floor"
+    )
 
 
 def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
@@ -145,16 +165,6 @@ def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
         *model.field.kernel_arguments(), LIMITS, features, opacity, depth,
     )  # fmt: skip
     return held_out.loss_of(features, opacity)
-
-
-HITS = 8
-"""Rays that meet a surface cell over all views, on average; the cells that still escape are gaps to be
-closed."""
-VIEWS_OF_A_CELL = 0.4
-"""Share of the training views that see a given piece of surface, roughly."""
-
-Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
 
 
 def marked_cells(
@@ -233,12 +243,11 @@ def close_gaps(cells: np.ndarray) -> np.ndarray:
 
 
 def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
-    """Each cell or either neighbour along an axis."""
+    """[n, n, n] bool: whether a cell or either of its neighbours along an axis is marked."""
     out = cells.copy()
-    lower, upper = [slice(None)] * 3, [slice(None)] * 3
-    lower[axis], upper[axis] = slice(None, -1), slice(1, None)
-    out[tuple(lower)] |= cells[tuple(upper)]
-    out[tuple(upper)] |= cells[tuple(lower)]
+    found, given = np.moveaxis(out, axis, 0), np.moveaxis(cells, axis, 0)
+    found[:-1] |= given[1:]
+    found[1:] |= given[:-1]
     return out
 
 
@@ -248,17 +257,11 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
     >>> int(corners_of(np.ones((1, 1, 1), bool)).sum())
     8
     """
-    corners = cells
     for axis in range(3):
-        shape = list(corners.shape)
-        shape[axis] += 1
-        grown = np.zeros(shape, bool)
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        grown[tuple(low)] |= corners
-        grown[tuple(high)] |= corners
-        corners = grown
-    return corners
+        padded = np.pad(cells, [(int(i == axis),) * 2 for i in range(3)])
+        along = np.moveaxis(padded, axis, 0)
+        cells = np.moveaxis(along[:-1] | along[1:], 0, axis)
+    return cells
 
 
 def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) -> np.ndarray:
@@ -272,24 +275,8 @@ def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) 
     return cells[np.ix_(which[planes], which, which)]
 
 
-CONTRACTED_HITS = 24
-"""Rays that meet a block of cells at the unit sphere over all views, on average."""
-BLOCK = 2
-"""Cells along each edge of a block. Blocks are found whole: the model's proposals take their time, 4,000 rays
-a second of one core, and so a quarter of the rays is enough. Surfaces are some cells thick anyway."""
-FASTEST_CELLS = 2.0
-"""Cells between two samples of a ray where it is fastest in contracted space; where it is slowest two fifths
-of it."""
-CONTRACTED_RAYS_AT_ONCE = 1 << 14
-WEIGHT_FLOOR = 0.01
-"""Weight that a cell must have on some ray where none is asked for. Fox at 1088 cells loses nothing to it; it
-would have half again as many vertices with 0.003."""
-CELL_SHARE = 0.008
-"""Cells that are stored, of all, before anything is known of a scene."""
-
-
 def lattice_step(resolution: int) -> float:
-    """dphi of `player.march.contracted` for densities on a grid of `resolution` cells.
+    """The step dphi of `player.march.contracted` for densities on a grid of `resolution` cells per axis.
 
     >>> round(lattice_step(512), 5)
     0.00699
@@ -321,10 +308,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
             _mark(model, rays_o[rows], rays_d[rows], weight_floor, visible)
         progress(index + 1, len(cameras))
     if not visible.any():
-        raise TrainingError(
-            f"no cell weighs {weight_floor} in any training view: the model is empty or a thin fog: "
-            "train longer, or lower --weight-floor"
-        )
+        raise _nothing_seen(weight_floor)
     return close_gaps(visible.view(bool))
 
 
@@ -336,9 +320,8 @@ def rays_of_contracted_views(model: Model, resolution: int) -> float:
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
     footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
-    return min(
-        CONTRACTED_HITS / (VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))), 1.0
-    )
+    hits = VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))
+    return min(CONTRACTED_HITS / hits, 1.0)
 
 
 @torch.no_grad()

@@ -4,18 +4,17 @@ Densities and features are stored at the vertices of two grids over the same box
 is where a surface is: densities take the finer one, a byte a vertex; features, whose vertices take a byte a
 channel, the coarser one.
 
-Fewer feature channels, at the least loss for the colours.
-
-Compositing is linear, so a linear map of the features can be applied per vertex before it and undone after
-it: W1 sum w_i F_i ~ (W1 Q) sum w_i (P F_i). With the second moment G = E[x x^T] of the rendered features x =
-sum w_i F_i and the mean square M = E[J^T J] of the colours' derivatives J = A d rgb / dx, the colours' error
-E |J (x - Q P x)|^2 is least, J and x taken as independent, for P = U^T S and Q = S^-1 U, where S = M^(1/2)
-and U holds the first r eigenvectors of S G S (Eckart-Young).
+Fewer feature channels are stored than the field has, at the least loss for the colours. Compositing is
+linear, so a linear map of the features can be applied per vertex before it and undone after it:
+W1 sum w_i F_i ~ (W1 Q) sum w_i (P F_i). With the second moment G = E[x x^T] of the rendered features
+x = sum w_i F_i and the mean square M = E[J^T J] of the colours' derivatives J = A d rgb / dx, the colours'
+error E |J (x - Q P x)|^2 is least, J and x taken as independent, for P = U^T S and Q = S^-1 U, where
+S = M^(1/2) and U holds the first r eigenvectors of S G S (Eckart-Young).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,21 +25,23 @@ from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, build_grid
 from player.asset.vertex_rows import VertexRows, vertex_rows
-from vfr_bake.baking.cells import corners_of, subdivided
+from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.field.head import Head
 from vfr_bake.training.model_file import Model
 
 SLAB = 64
-"""Planes of vertices that are looked at together."""
+"""Planes of vertices that are found together."""
 VERTEX_CHUNK = 1 << 18
 """Vertices evaluated at once: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
 """Optical depths of one march step at codes 0 and 255: from invisible to opaque, in steps of 5.9 %."""
 FAR = 30.0
-"""In contracted space a step has different lengths, from dphi on: codes begin at what is invisible even so
-many model units away, where a step is as long as its square."""
-Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
+"""Distance in model units, in contracted space: there a step is as long as dphi at the middle and as dphi
+times the square of the distance far away. The smallest density code is invisible even at this distance."""
+ROWS_AT_ONCE = 1 << 18
+"""Vertices whose codes are rounded at once."""
+LEAST_SENSITIVITY = 1e-6
+"""Every eigenvalue of M is at least this share of their mean, so that S has an inverse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +50,9 @@ class Vertices:
 
     coords: np.ndarray
     masks: np.ndarray
-    """Of their bricks, as `player.asset.bricks` has them."""
+    """Coordinates and masks of the bricks that hold the vertices, as in `player.asset.bricks`."""
     index: np.ndarray
-    """[n, 3] int16."""
+    """[n, 3] int16 position of each vertex, in cells."""
     resolution: int
     """Cells per axis."""
 
@@ -69,10 +70,12 @@ class Layout:
     densities: Vertices
     features: Vertices
     step: float
+    """Length of a march step, as in `StoredCells`."""
     density_range: tuple[float, float]
+    """Logarithms of the densities of codes 0 and 255."""
     contracted: bool = False
     near: float = 0.0
-    """Where rays begin, model units, if contracted."""
+    """Distance at which rays begin in contracted space, model units."""
 
     @property
     def aabb(self) -> tuple[tuple[float, ...], ...]:
@@ -105,17 +108,20 @@ class Layout:
 def make_layout(
     visible: np.ndarray,
     step: float,
-    resolutions: tuple[int, int],
+    resolutions: Resolutions,
     contracted: bool = False,
     near: float = 0.0,
 ) -> Layout:
-    """What is stored of the cells `visible` [n, n, n] bool, for march steps of `step`, from `near` on:
-    densities and features at the corners of the cells of their own grids that lie in them, of which there are
-    `resolutions` along each axis."""
+    """What is stored of the cells `visible` [n, n, n] bool, for march steps of `step`, from `near` on.
+
+    Densities and features are stored at the corners of those cells of their own grids that lie in visible
+    cells; `resolutions` are the cells along each axis of their grids.
+    """
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
-    densities = _corners(visible, resolutions[0])
-    features = densities if resolutions[1] == resolutions[0] else _corners(visible, resolutions[1])
+    densities = _corners(visible, resolutions.densities)
+    same = resolutions.features == resolutions.densities
+    features = densities if same else _corners(visible, resolutions.features)
     return Layout(densities, features, step, density_range, contracted, near)
 
 
@@ -146,8 +152,8 @@ def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.nd
 
 
 def _corners(cells: np.ndarray, resolution: int) -> Vertices:
-    """Those of the cells, `resolution` along each axis, that lie in `cells` [n, n, n] bool: slab by slab,
-    because a fine grid as a whole takes gigabytes."""
+    """The corners of a grid's cells, `resolution` along each axis, that lie in `cells` [n, n, n] bool. They
+    are found slab by slab, because a fine grid as a whole takes gigabytes."""
     parts = []
     for first in range(0, resolution + 1, SLAB):
         last = min(first + SLAB, resolution + 1)
@@ -162,19 +168,14 @@ def _corners(cells: np.ndarray, resolution: int) -> Vertices:
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
-    """[n, 3] float32: where vertices are looked up in the unit cube of the field. Corners of cells that stick
-    out of contracted space, where the field has learnt nothing, take what is at its border."""
+    """[n, 3] float32 points in the unit cube of the field at which vertices are evaluated. Corners of cells
+    that stick out of contracted space, where the field is not trained, take what is at its border."""
     points = index / resolution
     if contracted:
         centred = points - 0.5
         norm = np.linalg.norm(centred, axis=-1, keepdims=True)
         points = np.where(norm > 0.5, centred * (0.5 / np.maximum(norm, 0.5)) + 0.5, points)
     return points.astype(np.float32)
-
-
-ROWS_AT_ONCE = 1 << 18
-LEAST_SENSITIVITY = 1e-6
-"""Share of the mean that every direction of M keeps, so that S has an inverse."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ class Projection:
 
 
 def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Projection:
-    """The best projection to `n_stored` channels, or to all where there are no more.
+    """The best projection to `n_stored` channels, or to all channels where there are no more.
 
     `sensitivity` [n_channels, n_channels] is M, `rendered` [n, n_channels] rendered features.
 
@@ -218,14 +219,14 @@ def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity
     colours = head(features, torch.from_numpy(dirs)) * torch.from_numpy(opacity)[:, None]
     total = np.zeros((rendered.shape[1],) * 2)
     for channel in range(3):
-        (slope,) = torch.autograd.grad(colours[:, channel].sum(), features, retain_graph=channel < 2)
-        total += slope.double().numpy().T @ slope.double().numpy()
+        (gradient,) = torch.autograd.grad(colours[:, channel].sum(), features, retain_graph=channel < 2)
+        total += gradient.double().numpy().T @ gradient.double().numpy()
     return total / max(len(rendered), 1)
 
 
 def code_step(values: np.ndarray, levels: int = 127) -> float:
-    """Step of the signed codes of projected `values` [n, n_stored]: the largest magnitude is at `levels`; 1
-    for zeros.
+    """The step between signed codes of projected `values` [n, n_stored], such that the largest magnitude has
+    the code `levels`; 1 if all values are 0.
 
     It is the same for all channels: P makes an error in any of them weigh alike in the colours, so that the
     least bytes for a given error are those of one step, and a channel of little use takes few bits by itself.

@@ -17,6 +17,7 @@ from vfr_bake.baking.cells import (
     BLOCK,
     CELL_SHARE,
     FLOORS,
+    Resolutions,
     occupied_cells,
     pixel_footprints,
     rays_of_contracted_views,
@@ -27,48 +28,44 @@ from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
-"""Of Python, torch, numba and the model itself."""
+"""Bytes that Python, torch, numba and the model itself take."""
 N_RAYS = 2_000_000
 """Rays that head and stored values learn from, where there is memory for them."""
 UNBOUNDED_RAYS = 500_000
-"""Rays that head and stored values learn from: all of them meet something, and at many samples each."""
+"""The same for an unbounded scene: there all rays meet something, and at many samples each."""
 FEWEST_RAYS = 100_000
 RAY_BYTES = {False: 300, True: 1_900}
-"""Of a ray that is learned from, by whether the scene is unbounded: 168 bytes of what the model shows, and
-its samples, 20 bytes each; of an object a third meets something, at about 10 samples, of a scene all, at 33,
-and while they are put together they are there twice."""
-STORED_SHARE = 1.0
-"""Cells that are stored for each that may hold matter, and the corners that they add."""
+"""Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
+20 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all rays
+of an unbounded scene do, at 33. While the samples are put together they are there twice."""
 CHANNEL_BYTES = 6
-"""Of a stored channel of a cell, which has about 1.2 vertices: the float that learns, and the code that is
-played."""
+"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
+the code that is played."""
 DENSITY_BYTES = 40
-"""Of a density, of which each cell of the features has as many as finer cells."""
+"""Bytes that a density takes; a cell of the features holds as many densities as finer cells."""
 REFINED_BY = 0.8
-"""Of a bake's time: then come the mesh, and what is written is played."""
+"""Share of a bake's time after which refinement ends: then the mesh is made, and the written files are
+played."""
 N_TIMED, VIEWS_TIMED = 2048, 16
-"""Rays that tell how fast the model answers, and the pictures that they are of, about."""
+"""Rays that are timed to tell how fast the model answers, and the number of views they come from, roughly."""
 STEP_COST, VERTEX_COST = {False: 2.5, True: 0.2}, 0.12
-"""Of a lesson in a step of refinement, by whether the scene is unbounded (whose model takes its time for a
-ray), and of a vertex, in rays of the model."""
+"""Time of a training ray in a step of refinement, by whether the scene is unbounded (whose model takes its
+time for a ray), and time of a vertex; the unit is the time that the model takes for a ray."""
 OWN_HEAD = 4
-"""Times as long a step takes with the model's own head."""
+"""How many times as long a step takes with the model's own head."""
 MESH_SECONDS = 40.0
-"""Of what hardly depends on the scene: the mesh, and playing what is written."""
+"""Seconds for what hardly depends on the scene: the mesh, and playing the written files."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """What follows from the memory allowed, and what is expected."""
 
-    resolution: int
-    """Cells per axis of the densities."""
-    feature_resolution: int
-    """Cells per axis of the features."""
+    resolutions: Resolutions
     n_cells: float
     """Cells of the features' grid that are expected to be stored."""
     cell_bytes: float
-    """Of one of them, with its densities."""
+    """Bytes that one of them takes, with its densities."""
     unbounded: bool
     room: float
     """Bytes for cells and rays."""
@@ -76,21 +73,16 @@ class Plan:
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
 
     @property
-    def resolutions(self) -> tuple[int, int]:
-        """Of densities and features."""
-        return self.resolution, self.feature_resolution
-
-    @property
     def ray_bytes(self) -> int:
         return RAY_BYTES[self.unbounded]
 
     @property
     def most_cells(self) -> int:
-        """More do not fit beside the fewest rays."""
+        """The number of cells that fit beside the fewest rays."""
         return int((self.room - FEWEST_RAYS * self.ray_bytes) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
-        """Rays that are learned from beside so many cells."""
+        """Training rays for which there is room beside so many cells."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
         return int(np.clip(left, FEWEST_RAYS, UNBOUNDED_RAYS if self.unbounded else N_RAYS))
 
@@ -107,24 +99,23 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
-    resolution, coarse = _resolutions(model, config)
+    resolutions = _resolutions(model, config)
+    fine, coarse = resolutions
     marks = _marks_bytes(model, config) * coarse**3
-    n_stored = min(choice.n_channels, field.n_channels)
-    cell_bytes = CHANNEL_BYTES * n_stored + 60
-    cell_bytes += DENSITY_BYTES * (resolution / coarse) ** 3
+    cell_bytes = CHANNEL_BYTES * min(choice.n_channels, field.n_channels) + 60
+    cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
     room = config.max_memory * 1e9 - PROGRAM_BYTES
-    plan = Plan(resolution, coarse, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
+    plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
     if plan.most_cells <= 0 or marks > room:
         least = max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(
-            f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {resolution} cells "
+            f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {fine} cells "
             f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"
         )
     return plan
 
 
-def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
-    """Cells per axis of the densities and of the features."""
+def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
     choice, field = config.choice(model.field.config.unbounded), model.field.config
     if config.resolution:
         resolution = config.resolution
@@ -138,11 +129,11 @@ def _resolutions(model: Model, config: BakeConfig) -> tuple[int, int]:
     resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
     coarse = config.feature_resolution or round(choice.feature_share * resolution)
     coarse = int(np.clip(coarse, 8, min(field.max_resolution, resolution)))
-    return resolution, coarse - coarse % BLOCK if field.unbounded else coarse
+    return Resolutions(resolution, coarse - coarse % BLOCK if field.unbounded else coarse)
 
 
 def _marks_bytes(model: Model, config: BakeConfig) -> float:
-    """For each cell of the features' grid, while it is decided which are stored."""
+    """Bytes for each cell of the features' grid while it is decided which of them are stored."""
     unbounded = model.field.config.unbounded
     n_floors = len(FLOORS) if config.weight_floor is None and not unbounded else 1
     n_bytes = 4 + (0 if config.no_cull else n_floors)
@@ -153,7 +144,7 @@ def _cells(model: Model, resolution: int) -> float:
     """How many cells of the features' grid will be stored, roughly."""
     if model.field.config.unbounded:
         return CELL_SHARE * resolution**3
-    return STORED_SHARE * float(np.count_nonzero(occupied_cells(model, resolution)))
+    return float(np.count_nonzero(occupied_cells(model, resolution)))
 
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
@@ -165,17 +156,15 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         begin = time.perf_counter()
         model.sampler.composited_features(model.field, rays_o, rays_d)
         times.append(time.perf_counter() - begin)
-    finer = plan.resolution / plan.feature_resolution
-    work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + finer**3)
+    fine, coarse = plan.resolutions
+    work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + (fine / coarse) ** 3)
     if unbounded:
-        work += rays_of_contracted_views(model, plan.feature_resolution)
+        work += rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
-        shorter = max(model.occupancy.step * plan.feature_resolution / 2, 1.0)
-        work += shorter * rays_of_views(model, plan.feature_resolution)
+        work += max(model.occupancy.step * coarse / 2, 1.0) * rays_of_views(model, coarse)
     steps = (3 if choice.head_width else 2 * OWN_HEAD) * choice.refine_steps
-    before, refinement = (
-        times[-1] / len(rays_o) * rays for rays in (work, steps * BATCH * STEP_COST[unbounded])
-    )
+    ray_seconds = times[-1] / len(rays_o)
+    before, refinement = ray_seconds * work, ray_seconds * steps * BATCH * STEP_COST[unbounded]
     if config.refine_steps is None:
         refinement = min(refinement, max(60 * REFINED_BY * choice.minutes - before, 0.0))
     return before + refinement + MESH_SECONDS

@@ -11,7 +11,7 @@ import torch
 
 from player.asset.asset import Asset
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, whole
+from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, occupied_cells
 from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import head_colours
@@ -101,7 +101,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
         rgb[met] += opacity[met, None] * head_colours(model.field, features[met], held_out.rays_d[met])
         return expected_loss(float(np.mean((rgb - held_out.wanted) ** 2)), held_out.model_psnr)
 
-    expected = loss(visible) - loss(whole(model, 96).visible)
+    expected = loss(visible) - loss(occupied_cells(model, 96))
     assert expected > 0.05, "a floor this high loses something"
     # Gaps that were closed may lie where the model's samples are not, and a march stops at 99.9 %.
     assert cells.lost[floor] == pytest.approx(expected, rel=0.05)
@@ -138,4 +138,4 @@ def test_where_every_floor_loses_too_much_nothing_is_left_out(
     monkeypatch.setattr("vfr_bake.baking.cells.FLOORS", (0.9, 0.5))
     cells = cull(model, 48, HeldOut(model, 1), None, 0.001, quiet)
     assert cells.floor == 0 and cells.report().startswith("none") and cells.lost
-    assert np.array_equal(cells.visible, whole(model, 48).visible)
+    assert np.array_equal(cells.visible, occupied_cells(model, 48))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from player.asset.bricks import unpack_vertices
-from vfr_bake.baking.cells import corners_of, occupied_cells, subdivided
+from vfr_bake.baking.cells import Resolutions, corners_of, occupied_cells, subdivided
 from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout, unit_points
 from vfr_bake.training.model_file import Model
 
@@ -29,7 +29,7 @@ def test_a_finer_cell_belongs_to_the_cell_around_its_middle(n: int, resolution: 
 @pytest.mark.parametrize("resolution", [COARSE, 64, 100])
 def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model, resolution: int) -> None:
     visible, step = occupied_cells(model, COARSE), model.occupancy.step
-    layout = make_layout(visible, step, (resolution, COARSE))
+    layout = make_layout(visible, step, Resolutions(resolution, COARSE))
     assert (layout.densities.resolution, layout.features.resolution) == (resolution, COARSE)
     for vertices, cells in ((layout.densities, subdivided(visible, resolution)), (layout.features, visible)):
         assert len(vertices) == corners_of(cells).sum()
@@ -44,7 +44,7 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
 
 
 def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
-    layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, (64, COARSE))
+    layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, Resolutions(64, COARSE))
     matrix = np.random.default_rng(0).normal(size=(3, model.field.config.n_channels))
     features = evaluate_features(model, layout, matrix, quiet)
     points = unit_points(layout.features.index, COARSE, contracted=False)
