@@ -29,7 +29,7 @@ from player.files.files import check_target
 from player.head.head import Head
 from vfr_bake import __version__
 from vfr_bake.baking.cells import find_cells
-from vfr_bake.baking.distillation import Taught, teach, with_field_features
+from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
     Layout,
     Projection,
@@ -123,14 +123,14 @@ class _Bake:
 
     def run(self, folder: Path, force: bool) -> BakeResult:
         layout = self._cells()
-        stored, taught = self._store(layout)
+        stored, teacher = self._store(layout)
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
         left = REFINED_BY * 60 * self.choice.minutes - (time.monotonic() - self._begun)
-        tuning = Tuning(self.model, self.config, self.choice, self.held_out, self._progress, left)
+        tuning = Tuning(self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
-            stored = tuning.run(stored, layout, taught)
+            stored = tuning.run(stored, layout, teacher)
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
@@ -194,16 +194,16 @@ class _Bake:
             asset = unwritten_asset(Path(folder), manifest, arrays, files)
             return bake_mesh(asset, size, self._report)
 
-    def _store(self, layout: Layout) -> tuple[Stored, Taught]:
+    def _store(self, layout: Layout) -> tuple[Stored, TeacherRays]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
             views = cameras + views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
-            taught = teach(model, views, self.n_rays, 0, self._progress("teacher"))
+            teacher = render_teacher(model, views, self.n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
-            projection = self._projection(taught)
+            projection = self._projection(teacher)
             features = evaluate_features(model, layout, projection.matrix, self._progress("features"))
             step = code_step(features, choice.code_levels)
             features /= np.float32(step)
@@ -222,14 +222,14 @@ class _Bake:
             f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
             "than that after 'grid', before refinement"
         )
-        return Stored(head, features, density), taught
+        return Stored(head, features, density), teacher
 
-    def _projection(self, taught: Taught) -> Projection:
+    def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
-        some = taught.some(N_SENSITIVITY)
+        some = teacher.some(N_SENSITIVITY)
         sensitivity = head_sensitivity(head, some.features, some.rays_d, some.opacity)
-        every = project(sensitivity, taught.features, most)
+        every = project(sensitivity, teacher.features, most)
         if self.config.n_channels is not None:
             return every
         for projection in map(every.first, range(1, most)):

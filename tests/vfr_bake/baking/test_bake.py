@@ -25,12 +25,12 @@ from player.march.march import march
 from player.render import render
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import corners_of, pixel_footprints
-from vfr_bake.baking.distillation import Lessons, player_fetches
+from vfr_bake.baking.distillation import TrainingRays, player_fetches
 from vfr_bake.baking.grids import code_step, encode_features, head_sensitivity, project
 from vfr_bake.baking.head import FoldedHead, fold_head
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.baking.limits import SMALL_FILES
-from vfr_bake.baking.refinement import BATCH, HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, learn_head, refine
+from vfr_bake.baking.refinement import BATCH, HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, refine, train_head
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.head import Head
@@ -120,13 +120,13 @@ def test_folded_head_equals_the_head() -> None:
     np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6)
 
 
-def lessons_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> Lessons:
-    """One fetch a lesson, each of its own vertex of a grid of 16 cells."""
+def training_rays_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> TrainingRays:
+    """One fetch a ray, each of its own vertex of a grid of 16 cells."""
     n = len(codes)
     coords, masks, order = pack_vertices(np.argwhere(np.ones((16, 16, 16)))[:n])
     points = np.argwhere(np.ones((16, 16, 16)))[:n][order].astype(np.float32)
     rows, ones = vertex_rows(coords, masks, 16), np.ones(n, np.float32)
-    return Lessons(
+    return TrainingRays(
         np.arange(n + 1), points, ones, ones, dirs, ones.copy(), wanted, ones, rows, np.float32(1), rows
     )
 
@@ -142,27 +142,27 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
         wanted = FoldedHead(weights)(codes, dirs).numpy()
     # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
     baked = (codes * 0.8 + 10).numpy().round()
-    lessons = lessons_of(baked, dirs.numpy(), wanted)
+    training_rays = training_rays_of(baked, dirs.numpy(), wanted)
     stored = Stored(weights, baked, np.zeros(4000, np.float32))
 
     def error(stored: Stored) -> float:
-        composed = torch.from_numpy(lessons.composed(stored.features))
+        composed = torch.from_numpy(training_rays.composed(stored.features))
         with torch.no_grad():
             shown = FoldedHead(stored.head)(composed, dirs).numpy()
         return float(np.mean((shown - wanted) ** 2))
 
     before = error(stored)
-    nothing = refine(stored, lessons, Steps(0, lambda *_: None))
+    nothing = refine(stored, training_rays, Steps(0, lambda *_: None))
     assert error(nothing) == pytest.approx(before, rel=1e-3)
-    learned = learn_head(stored, lessons, Steps(200, lambda *_: None), HEAD_RATE)
+    learned = train_head(stored, training_rays, Steps(200, lambda *_: None), HEAD_RATE)
     head_alone = replace(stored, head=learned)
     assert error(head_alone) < before / 5
     alone = error(head_alone)
-    same = refine(stored, lessons, Steps(200, lambda *_: None), code_rate=0)
+    same = refine(stored, training_rays, Steps(200, lambda *_: None), code_rate=0)
     assert np.array_equal(same.features, baked), "left alone"
     assert error(same) == pytest.approx(alone, rel=1e-3)
     own = replace(stored, features=baked.copy())
-    both = refine(own, lessons, Steps(200, lambda *_: None), code_rate=4)
+    both = refine(own, training_rays, Steps(200, lambda *_: None), code_rate=4)
     assert error(both) < alone
     assert both.features is own.features, "moved where they are"
     assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
@@ -205,22 +205,24 @@ def test_a_round_takes_fewer_steps_where_there_is_no_time(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("n_fetches", [0, 1, 3, 5])
-def test_a_lesson_composes_what_the_player_composes(model: Model, tmp_path: Path, n_fetches: int) -> None:
+def test_a_training_ray_composes_what_the_player_composes(
+    model: Model, tmp_path: Path, n_fetches: int
+) -> None:
     settings = BakeConfig(resolution=48, mesh_resolution=16, refine_steps=0, check_views=1)
     bake(model, tmp_path / "asset", settings, quiet)
     grid = Asset.open(tmp_path / "asset").grid
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_fetches)
-    hits, opacity, fetches = player_fetches(grid, rays_o, rays_d, n_fetches)
+    hits, opacity, *fetches = player_fetches(grid, rays_o, rays_d, n_fetches)
     counts, points, weights, lengths = fetches
     assert np.array_equal(hits, played.hits) and len(hits) > 100
     np.testing.assert_array_equal(opacity, played.opacity[hits])
-    lessons = lessons_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
+    training_rays = training_rays_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
     starts = np.concatenate([[0], np.cumsum(counts)])
-    lessons = replace(lessons, starts=starts, points=points, weights=weights, lengths=lengths)
-    lessons = replace(lessons, features=grid.rows, feature_scale=grid.feature_scale)
+    training_rays = replace(training_rays, starts=starts, points=points, weights=weights, lengths=lengths)
+    training_rays = replace(training_rays, features=grid.rows, feature_scale=grid.feature_scale)
     assert (lengths == grid.step).all()
-    composed = lessons.composed(grid.features.astype(np.float32))
+    composed = training_rays.composed(grid.features.astype(np.float32))
     # float32 sums of up to 127 in another order
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
 

@@ -21,7 +21,7 @@ from player.render import render
 from tests.vfr_bake.baking.training import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import lattice_step, weighty_cells
-from vfr_bake.baking.distillation import Lessons, Taught, collect_lessons
+from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import unit_points
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.data.capture import PosedImages
@@ -156,25 +156,27 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("k", [0, 4])
-def test_a_lesson_composes_what_the_player_composes(model: Model, folder: Path, k: int) -> None:
+def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: Path, k: int) -> None:
     grid = Asset.open(folder).grid
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = contracted_march_compiled.march(grid, rays_o, rays_d, k)
     nothing = np.zeros((len(rays_o), 3), np.float32)
-    taught = Taught(rays_o, rays_d, nothing, nothing, nothing[:, 0])
+    teacher_rays = TeacherRays(rays_o, rays_d, nothing, nothing, nothing[:, 0])
     arrays = Asset.open(folder).arrays
     densities = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
-    lessons: Lessons = collect_lessons(taught, grid, k, densities)
-    assert len(lessons) == len(played.hits) > 1000
-    composed = lessons.composed(grid.features.astype(np.float32))
+    training_rays: TrainingRays = collect_training_rays(teacher_rays, grid, k, densities)
+    assert len(training_rays) == len(played.hits) > 1000
+    composed = training_rays.composed(grid.features.astype(np.float32))
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=5e-3)
-    np.testing.assert_allclose(lessons.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(training_rays.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
     if k == 0:  # the ways of the samples are what makes their weights
-        fetches = lessons.fetches(np.arange(len(lessons)))
-        code = (fetches.density_shares * _codes(folder)[fetches.density_rows]).sum(axis=1)
-        optical = np.exp(grid.density_low + grid.density_slope * code) * lessons.lengths
-        first = lessons.starts[:-1]
-        np.testing.assert_allclose(-np.expm1(-optical[first]), lessons.weights[first], rtol=1e-3, atol=1e-6)
+        fetches = training_rays.fetches(np.arange(len(training_rays)))
+        code = (fetches.densities.shares * _codes(folder)[fetches.densities.rows]).sum(axis=1)
+        optical = np.exp(grid.density_low + grid.density_slope * code) * training_rays.lengths
+        first = training_rays.starts[:-1]
+        np.testing.assert_allclose(
+            -np.expm1(-optical[first]), training_rays.weights[first], rtol=1e-3, atol=1e-6
+        )
 
 
 def _codes(folder: Path) -> np.ndarray:

@@ -16,7 +16,7 @@ from vfr_bake.baking.refinement import Steps, Stored, refine
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.head import Head
 
-from .test_bake import lessons_of
+from .test_bake import training_rays_of
 
 
 def folded() -> HeadWeights:
@@ -58,14 +58,14 @@ def test_refinement_gets_back_what_8_bits_lose() -> None:
     codes = codes.round()
     wanted = runner(weights)(codes, dirs)
     ranges = tuple((low, 2 * high) for low, high in activation_ranges(weights, codes, dirs))
-    lessons = lessons_of(codes, dirs, wanted)
+    training_rays = training_rays_of(codes, dirs, wanted)
 
     def error(stored: Stored) -> float:
-        composed = lessons.composed(stored.features)
+        composed = training_rays.composed(stored.features)
         return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
 
     stored = Stored(weights, codes, np.zeros(len(codes), np.float32))
-    tuned = refine(stored, lessons, Steps(400, lambda done, of: None), code_rate=0, ranges=ranges)
+    tuned = refine(stored, training_rays, Steps(400, lambda done, of: None), code_rate=0, ranges=ranges)
     assert error(tuned) < 0.8 * error(stored)
     untouched = replace(tuned, head=weights)
     assert error(untouched) == pytest.approx(error(stored), rel=1e-6)
