@@ -17,7 +17,7 @@ from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins
 from player.march.march import MAX_TAU
-from vfr_bake.field.density import LARGEST_LOGIT, TruncatedExp
+from vfr_bake.field.networks import LARGEST_LOGIT, TruncatedExp
 from vfr_bake.rendering.compositing import composite, composite_reference
 from vfr_bake.torch_kernels.compositing import composite as composite_torch
 

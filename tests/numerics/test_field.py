@@ -15,7 +15,7 @@ from exporters.head.spherical_harmonics import MAX_DEGREE, sh_monomials
 from tests.reference import hash_grid_feature, spherical_harmonics
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+from vfr_bake.field.networks import SphericalHarmonics
 from vfr_bake.kernels.contraction import contracted_unit
 from vfr_bake.torch_kernels.hash_grid import encode
 from vfr_bake.torch_kernels.proposals import contracted_unit as contracted_torch

@@ -26,7 +26,7 @@ from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, build_grid
 from player.asset.vertex_rows import VertexRows, vertex_rows
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
-from vfr_bake.field.head import Head
+from vfr_bake.field.networks import Head
 from vfr_bake.training.model_file import Model
 
 SLAB = 64

@@ -18,8 +18,7 @@ from torch.nn.functional import gelu
 
 from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
-from vfr_bake.field.head import Head
-from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+from vfr_bake.field.networks import Head, SphericalHarmonics
 
 
 def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.density import LARGEST_LOGIT, make_density
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.field.head import Head
+from vfr_bake.field.networks import LARGEST_LOGIT, Head, make_density
 from vfr_bake.kernels import march as kernels
 
 

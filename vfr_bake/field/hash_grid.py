@@ -15,12 +15,23 @@ from numba import get_num_threads
 from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.memory import zeros
 from vfr_bake.kernels import hash_grid as kernels
 from vfr_bake.torch_kernels.hash_grid import Levels, features_at
 
 Backend = Literal["numba", "torch"]
 """Whose kernels run: numba's, on a CPU, or torch's, on any device."""
+
+
+def zeros(*shape: int) -> Tensor:
+    """A float32 tensor of zeros whose memory NumPy has allocated.
+
+    For large arrays NumPy asks Linux for pages of 2 MB, torch does not. A hash grid is read and written at
+    random, and with pages of 4 kB nearly every access would first have to look its page up.
+
+    >>> zeros(2, 3).shape
+    torch.Size([2, 3])
+    """
+    return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def level_resolutions(n_levels: int, base_resolution: int, max_resolution: int) -> list[int]:

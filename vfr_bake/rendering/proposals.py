@@ -15,8 +15,7 @@ from numba import get_num_threads
 from torch import Tensor, nn
 
 from vfr_bake.field.field import VfrField
-from vfr_bake.field.hash_grid import GridLayout
-from vfr_bake.field.memory import zeros
+from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.samples import LIMITS, Samples

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from vfr_bake.field.density import LARGEST_LOGIT
+from vfr_bake.field.networks import LARGEST_LOGIT
 
 OPAQUE_DEPTH = float(-np.log(1e-3))
 """Optical depth at which a ray stops: what lies behind weighs less than 1e-3 in all."""

@@ -9,8 +9,7 @@ import torch
 from numba import get_num_threads
 from torch import Tensor
 
-from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.field.memory import zeros
+from vfr_bake.field.hash_grid import HashGrid, zeros
 from vfr_bake.kernels.adam import adam_step, scatter_and_step
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15

@@ -16,7 +16,7 @@ from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
-from vfr_bake.field.pilot import Pilot
+from vfr_bake.field.networks import Pilot
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler

@@ -33,7 +33,7 @@ from vfr_bake.baking.limits import SMALL_FILES
 from vfr_bake.baking.refinement import BATCH, HEAD_RATE, N_TIMED, N_WARM, Steps, Stored, refine, train_head
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
-from vfr_bake.field.head import Head
+from vfr_bake.field.networks import Head
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr

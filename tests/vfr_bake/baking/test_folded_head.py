@@ -14,7 +14,7 @@ from exporters.head.ranges import activation_ranges
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.refinement import Steps, Stored, refine
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.head import Head
+from vfr_bake.field.networks import Head
 
 from .test_bake import training_rays_of
 

@@ -24,8 +24,7 @@ from player.asset.asset import Asset
 from tests.exporters.formats import block
 from vfr_bake.baking.head import fold_head
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.head import Head
-from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+from vfr_bake.field.networks import Head, SphericalHarmonics
 
 N_CHANNELS = 16
 SCALE = 0.02

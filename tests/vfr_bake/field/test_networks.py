@@ -8,11 +8,15 @@ import torch
 
 from tests.reference import spherical_harmonics
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.density import LARGEST_LOGIT, DensityNetwork, TruncatedExp
 from vfr_bake.field.field import VfrField
-from vfr_bake.field.head import Head
-from vfr_bake.field.pilot import Pilot
-from vfr_bake.field.spherical_harmonics import SphericalHarmonics
+from vfr_bake.field.networks import (
+    LARGEST_LOGIT,
+    DensityNetwork,
+    Head,
+    Pilot,
+    SphericalHarmonics,
+    TruncatedExp,
+)
 from vfr_bake.kernels.march import density_logits
 
 

@@ -14,7 +14,7 @@ from tests.vfr_bake.rendering.test_proposals import (
     naive_resample,
 )
 from vfr_bake.config import TrainConfig
-from vfr_bake.field.density import LARGEST_LOGIT
+from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels import proposals as compiled
 from vfr_bake.kernels.proposals import spacing
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED

@@ -14,7 +14,7 @@ from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
-from vfr_bake.field.pilot import Pilot
+from vfr_bake.field.networks import Pilot
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.model_file import load_model, save_model, trained_model
