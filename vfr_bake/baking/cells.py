@@ -24,9 +24,8 @@ from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, views_between, wi
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
 from vfr_bake.kernels.march import chebyshev_distance, mark_visible_cells, render_features
-from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.compositing import LIMITS, composite
 from vfr_bake.rendering.proposals import ProposalSampler
-from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
-from vfr_bake.rendering.compositing import composite
-from vfr_bake.rendering.samples import LIMITS, Samples
+from vfr_bake.rendering.compositing import LIMITS, Samples, composite
 
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""

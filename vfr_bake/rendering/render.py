@@ -10,8 +10,7 @@ import torch
 
 from player.cameras.camera import Camera
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.compositing import composite
-from vfr_bake.rendering.samples import Samples
+from vfr_bake.rendering.compositing import Samples, composite
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import march as kernels
-from vfr_bake.rendering.samples import LIMITS, OPAQUE_DEPTH, Samples
+from vfr_bake.rendering.compositing import LIMITS, OPAQUE_DEPTH, Samples
 
 if TYPE_CHECKING:
     from vfr_bake.rendering.occupancy import OccupancyGrid

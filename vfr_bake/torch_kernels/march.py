@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.rendering.samples import OPAQUE_DEPTH, Samples
+from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
 from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels.compositing import sums_before
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels.proposals import PADDING
-from vfr_bake.rendering.samples import OPAQUE_DEPTH
+from vfr_bake.rendering.compositing import OPAQUE_DEPTH
 from vfr_bake.torch_kernels.compositing import sums_before
 
 

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.device_grid import DeviceOccupancyGrid
-from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
+from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid, ProposalSampler
-from vfr_bake.rendering.samples import OPAQUE_DEPTH, Samples
 from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels import proposals as kernels
 from vfr_bake.torch_kernels.compositing import Padding, distortion, sums_before

@@ -16,10 +16,9 @@ from torch import Tensor
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import spacing
-from vfr_bake.rendering.compositing import distortion
+from vfr_bake.rendering.compositing import Samples, distortion
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
-from vfr_bake.rendering.samples import Samples
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes

@@ -17,10 +17,9 @@ from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
-from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.compositing import Samples, composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
-from vfr_bake.rendering.samples import Samples
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide

@@ -14,8 +14,8 @@ from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, occupied_cells
 from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
+from vfr_bake.rendering.compositing import LIMITS
 from vfr_bake.rendering.render import head_colours
-from vfr_bake.rendering.samples import LIMITS
 from vfr_bake.training.model_file import Model
 
 

@@ -22,7 +22,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.march import mark_visible_cells
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
-from vfr_bake.rendering.samples import LIMITS
+from vfr_bake.rendering.compositing import LIMITS
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import FusedGridAdam, GridAdam
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from tests.vfr_bake.rendering.test_occupancy import inside_cells
-from vfr_bake.rendering.device_grid import DeviceOccupancyGrid
+from vfr_bake.rendering.occupancy import DeviceOccupancyGrid
 
 
 class Ball:

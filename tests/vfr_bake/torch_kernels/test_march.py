@@ -9,7 +9,7 @@ import torch
 from tests.vfr_bake.rendering.test_march import STEP, field_of_density, half_full, rays
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering import sampling as numba_path
-from vfr_bake.rendering.samples import Samples
+from vfr_bake.rendering.compositing import Samples
 from vfr_bake.torch_kernels import march as kernels
 
 

@@ -17,8 +17,8 @@ from vfr_bake.config import TrainConfig
 from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels import proposals as compiled
 from vfr_bake.kernels.proposals import spacing
+from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED
-from vfr_bake.rendering.samples import OPAQUE_DEPTH, Samples
 from vfr_bake.torch_kernels import proposals as kernels
 from vfr_bake.training.device_guides import DeviceProposalGuide
 from vfr_bake.training.guides import ProposalGuide
