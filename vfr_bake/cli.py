@@ -265,10 +265,9 @@ def _eval(options: Any) -> int:
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
     from vfr_bake.data import load_scene
-    from vfr_bake.training.comparison import comparison
     from vfr_bake.training.evaluation import render_views
     from vfr_bake.training.lpips import Lpips
-    from vfr_bake.training.metrics import mean_scores, score_view
+    from vfr_bake.training.metrics import comparison, mean_scores, score_view
     from vfr_bake.training.model_file import load_model
 
     lpips = None if options.lpips is None else Lpips(options.lpips)

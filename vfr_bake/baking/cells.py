@@ -22,8 +22,8 @@ from player.errors import TrainingError
 from player.march.contracted import MAX_SPEED
 from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, views_between, widened
 from vfr_bake.config import BakeConfig
-from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
-from vfr_bake.kernels.march import chebyshev_distance, mark_visible_cells, render_features
+from vfr_bake.kernels.march import chebyshev_distance, render_features
+from vfr_bake.kernels.visibility import mark_visible_cells, mark_weighty_cells
 from vfr_bake.rendering.compositing import LIMITS, composite
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.training.model_file import Model

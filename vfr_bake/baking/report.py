@@ -19,7 +19,7 @@ from player.files.images import png_bytes
 from player.render import Renderer
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.comparison import BRIGHTEST_ERROR, comparison
+from vfr_bake.training.metrics import BRIGHTEST_ERROR, comparison
 from vfr_bake.training.model_file import Model
 
 N_PICTURES = 2

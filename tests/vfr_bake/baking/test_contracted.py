@@ -27,7 +27,7 @@ from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
-from vfr_bake.kernels.contracted_visibility import mark_weighty_cells
+from vfr_bake.kernels.visibility import mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.metrics import psnr

@@ -19,7 +19,7 @@ from numba import config
 from vfr_bake.config import FieldOptions
 from vfr_bake.kernels import adam, hash_grid
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels.march import mark_visible_cells
+from vfr_bake.kernels.visibility import mark_visible_cells
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.compositing import LIMITS

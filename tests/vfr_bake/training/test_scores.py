@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from player.errors import MissingExtraError, ShapeError
-from vfr_bake.training.comparison import BRIGHTEST_ERROR, comparison
-from vfr_bake.training.metrics import ViewScore, mean_scores, psnr, score_view, ssim
+from vfr_bake.training.metrics import (
+    BRIGHTEST_ERROR,
+    ViewScore,
+    comparison,
+    mean_scores,
+    psnr,
+    score_view,
+    ssim,
+)
 
 FLOAT32 = 1e-5
 """SSIM's variances are differences of float32 near 1, beside 9e-4: 1e-7 / 9e-4 a window, less in the mean."""

@@ -19,8 +19,7 @@ from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.near_gradients import scale_near_gradients
-from vfr_bake.training.trainer import Trainer
+from vfr_bake.training.trainer import Trainer, scale_near_gradients
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
 
