@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from player.errors import DataError
+from player.cameras.colmap import colmap_folder
 from vfr_bake.config import SceneKind
-from vfr_bake.data.capture import Capture
-from vfr_bake.data.colmap import colmap_folder, load_colmap_folder
 from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
-from vfr_bake.data.transforms import has_transforms, load_transforms_folder
 
 __all__ = ["PosedImages", "Scene", "load_scene"]
 
@@ -45,19 +43,3 @@ def needs_cameras(data: str | Path) -> bool:
         return True
     known = not folder.is_dir() or has_transforms(folder) or colmap_folder(folder) is not None
     return not known and has_pictures(folder)
-
-
-def load_folder(folder: Path, progress: Progress | None = None) -> Capture:
-    """The pictures and cameras in `folder`, in whichever form they are there. Raises as `load_scene`."""
-    if not folder.exists():
-        raise DataError(f"{folder}: no such folder: expected one with pictures and cameras, or the word demo")
-    if not folder.is_dir():
-        raise DataError(f"{folder}: expected a folder with a transforms.json or a COLMAP model, got a file")
-    if has_transforms(folder):
-        return load_transforms_folder(folder, progress)
-    if colmap_folder(folder):
-        return load_colmap_folder(folder, progress)
-    empty = "an empty folder" if not any(folder.iterdir()) else "neither"
-    raise DataError(
-        f"{folder}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got {empty}"
-    )

@@ -342,10 +342,10 @@ def choose_device(name: str) -> torch.device:
 def scale_near_gradients(features: Tensor, t_mid: Tensor, distance: float) -> Tensor:
     """`features` [n_samples, n_channels] as they are; what flows back to them is times min(1, (t / d)^2).
 
-    Space just before a camera is sampled far more densely than what it looks at, and fog there explains a single
-    picture better than any surface does, above all where poses are off. Philip and Deschaintre, "Floaters no
-    more", 2023: the gradient at distance t is scaled by min(1, (t / d)^2), the share of its density that a volume
-    of space has at the distance d.
+    Space just before a camera is sampled far more densely than what it looks at, and fog there explains a
+    single picture better than any surface does, above all where poses are off. Philip and Deschaintre,
+    "Floaters no more", 2023: the gradient at distance t is scaled by min(1, (t / d)^2), the share of its
+    density that a volume of space has at the distance d.
 
     `t_mid` [n_samples] and `distance` > 0 (d) are distances from the cameras in model units.
 

@@ -15,7 +15,8 @@ from player.cameras.camera import Camera
 from player.cameras.colmap import read_cameras, read_images, read_points
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError
-from vfr_bake.data import load_folder, load_scene
+from vfr_bake.data import load_scene
+from vfr_bake.data.folders import load_folder
 from vfr_bake.data.demo import demo_cameras
 
 SIZE = 24
