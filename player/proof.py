@@ -109,18 +109,14 @@ def _deadly(code: int) -> str | None:
 
 def verdict() -> str:
     """RIGHT, or WRONG and what; the process ends where LLVM or the processor end it."""
-    from player.compiled import contracted_march as contracted_march_compiled
     from player.compiled import march as march_compiled
     from player.head import proof as proof_head
-    from player.march import contracted_march, march
+    from player.march import march
 
-    for name, compiled, plain, contracted in (
-        ("the march", march_compiled, march, False),
-        ("the contracted march", contracted_march_compiled, contracted_march, True),
-    ):
+    for name, contracted in (("the march", False), ("the contracted march", True)):
         grid, rays = _grid(contracted), _rays()
         for k in (0, 3):
-            got, expected = compiled.march(grid, *rays, k), plain.march(grid, *rays, k)
+            got, expected = march_compiled.march(grid, *rays, k), march.march(grid, *rays, k)
             alike = all(
                 ours.shape == theirs.shape and np.allclose(ours, theirs, rtol=1e-4, atol=2e-3)
                 for ours, theirs in zip(got, expected, strict=True)

@@ -119,7 +119,7 @@ class Renderer:
         """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here."""
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
-        self.march, self._module = choose_march(march, asset.manifest.contracted)
+        self.march, self._module = choose_march(march)
         self._write_pixels, self._directions = write_pixels, None
         if self.march == "numba":
             from player.compiled import pixels as pixels_compiled
@@ -216,8 +216,7 @@ class Renderer:
     ) -> None:
         """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
         index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-        within = None if self._grid.contracted else bounds
-        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, within)
+        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
         if frame.features is not None:
             frame.features[index[result.hits]] = result.features
         if normals is not None:
@@ -285,26 +284,25 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def choose_march(name: March, contracted: bool = False) -> tuple[str, ModuleType]:
-    """Name and module of a march through a box, or through contracted space."""
+def choose_march(name: March) -> tuple[str, ModuleType]:
+    """Name and module of a march."""
     if name != "numpy":
         from player import proof
         from player.compiled import compiling
 
         if compiling.available() and not proof.refuted():
-            from player.compiled import contracted_march as contracted_march_compiled
             from player.compiled import march as march_compiled
 
-            return "numba", contracted_march_compiled if contracted else march_compiled
+            return "numba", march_compiled
         if name == "numba":
             raise MissingExtraError(
                 "march: expected compiled code that runs on this processor, got some that does not"
                 if compiling.available()
                 else "march: expected numba, which is not installed: pip install 'vfr-bake[fast]'"
             )
-    from player.march import contracted_march, march
+    from player.march import march
 
-    return "numpy", contracted_march if contracted else march
+    return "numpy", march
 
 
 def import_ahead(scipy: bool = True) -> None:

@@ -20,8 +20,7 @@ from exporters.shapes.mesh import unit
 from player.asset.asset import Asset
 from player.asset.bricks import unpack_vertices
 from player.asset.density import decode_density
-from player.asset.grid import SparseGrid
-from player.asset.vertex_rows import VertexRows, vertex_rows
+from player.asset.grid import SparseGrid, VertexRows, vertex_rows
 from player.errors import ShapeError
 from player.head.head import Head
 from player.march.fetches import MIN_TOTAL, stored_features

@@ -9,6 +9,7 @@ the normal. docs/exports.md has the measurement that chose between them.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -78,6 +79,7 @@ class _Shader:
 
     def __init__(self, asset: Asset, pool: ThreadPoolExecutor) -> None:
         self._asset = asset
+        self._grid = replace(asset.grid, contracted=False)  # where surfaces are, space is not contracted
         self._march = choose_march("auto")[1].march
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         self._model_from_world = np.linalg.inv(asset.world_from_model)
@@ -98,7 +100,7 @@ class _Shader:
         reach = np.float32(STAND_OFF * voxel_size(self._asset.grid))
         rays_o = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32) - reach * rays_d
         bounds = np.zeros(len(points), np.float32), np.full(len(points), 3 * reach, np.float32)
-        result = self._march(self._asset.grid, rays_o, rays_d, self._asset.manifest.n_samples, bounds)
+        result = self._march(self._grid, rays_o, rays_d, self._asset.manifest.n_samples, bounds)
         rgb = np.zeros((len(points), 3), np.float32)
         opacity = result.opacity[result.hits]
         rgb[result.hits] = self._head(result.features / opacity[:, None], rays_d[result.hits])

@@ -33,7 +33,7 @@ from player.files.memory import allowed_bytes
 from player.files.replace import clear_up
 
 MAX_VERTICES = 2**31 - 1
-"""Stored vertices of a grid, whose rows are numbered in 32 bits (`player.asset.vertex_rows`)."""
+"""Stored vertices of a grid, whose rows are numbered in 32 bits (`player.asset.grid.VertexRows`)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,15 +18,47 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.asset.bricks import BRICK, bricks_per_axis, dense_index, live_cells, stored_bits, with_apron
+from player.asset.bricks import (
+    BRICK,
+    bricks_per_axis,
+    dense_index,
+    live_cells,
+    stored_bits,
+    with_apron,
+    with_corners,
+)
 from player.asset.density import decode_constants
-from player.asset.vertex_rows import VertexRows, vertex_rows
 
 SPARE = 2
 """Bytes behind the densities: compiled code reads whole words."""
 
 MAX_DISTANCE = 31
 """Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
+
+
+@dataclass(frozen=True, eq=False)
+class VertexRows:
+    """Which row of an array holds which stored vertex of a grid. Rows are in the order of bricks, then of
+    bits (`player.asset.bricks`)."""
+
+    resolution: int
+    """Cells per axis."""
+    n_per_axis: int
+    """Bricks per axis, nb."""
+    bricks: np.ndarray
+    """[nb^3] int32 at (bx * nb + by) * nb + bz: the brick that holds a cell, -1 where no corner of any cell
+    is stored."""
+    rows: np.ndarray
+    """[n_bricks * 729] int32 at brick * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: the row of a vertex, -1 if
+    it is not stored. Bricks have an apron, so that the eight corners of a cell are in one."""
+
+    def find(self, index: np.ndarray) -> np.ndarray:
+        """Rows [n] int64 of vertices [n, 3] that may lie outside; -1 where none is stored."""
+        inside = np.all((index >= 0) & (index < BRICK * self.n_per_axis), axis=-1)
+        cells = np.where(inside[:, None], index, 0).T
+        brick = self.bricks[brick_number(cells, self.n_per_axis)]
+        row = self.rows[corner_number(brick, cells)]
+        return np.where(inside & (brick >= 0), row, -1).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +91,21 @@ class SparseGrid:
     def n_channels(self) -> int:
         return self.features.shape[1]
 
+    def cells(self, g: np.ndarray) -> np.ndarray:
+        """The cells [3, ...] int32 that hold the points `g` [3, ...], grid coordinates. What is on the border
+        belongs to the last cells, and so does what is beyond it."""
+        return np.clip(g.astype(np.int32), 0, self.resolution - 1)
+
+    def slots(self, cells: np.ndarray) -> np.ndarray:
+        """The entries [...] of `table` for the bricks of cells [3, ...]."""
+        return self.table.take(brick_number(cells, self.n_per_axis))
+
+    def are_live(self, slots: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Whether cells [3, ...] are live, [...] bool, from the entries `slots` [...] of their bricks."""
+        x, y, z = cells & 7
+        bits = self.live.take(np.maximum(slots, 0) * 64 + (x * 8 + y)) >> z.astype(np.uint8)
+        return ((bits & 1) != 0) & (slots >= 0)
+
     @property
     def codes(self) -> np.ndarray:
         """[n_slots, 729] uint8: the densities, slot by slot."""
@@ -80,6 +127,31 @@ class SparseGrid:
 def most_samples(diagonal: float, step: float) -> int:
     """Places of a lattice of `step` on so long a diagonal, and three for rounding."""
     return int(diagonal / step) + 3
+
+
+def brick_number(cells: np.ndarray, n_per_axis: int) -> np.ndarray:
+    """Where in an array over all bricks, `n_per_axis` along each axis, those of cells [3, ...] are.
+
+    >>> int(brick_number(np.array([0, 9, 17]), 3))
+    5
+    """
+    x, y, z = cells >> 3
+    return (x * n_per_axis + y) * n_per_axis + z
+
+
+def corner_number(bricks: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Where in an array of bricks with an apron, of 9 x 9 x 9 vertices each, the lowest corners of cells
+    [3, ...] are; its neighbours are 81 further along x, 9 along y, 1 along z.
+
+    Args:
+        bricks: [...] the number of each cell's brick among those that the array has; one below 0 counts as 0.
+        cells: [3, ...].
+
+    >>> int(corner_number(np.array(2), np.array([0, 9, 17])))
+    1468
+    """
+    x, y, z = cells & 7
+    return np.maximum(bricks, 0).astype(np.int64) * 729 + (x * 81 + y * 9 + z)
 
 
 def build_grid(
@@ -140,6 +212,25 @@ def build_grid(
         contracted=contracted,
         near=near,
     )
+
+
+def vertex_rows(coords: np.ndarray, masks: np.ndarray, resolution: int) -> VertexRows:
+    """Rows of the vertices of bricks as they are on disk; at least one is stored.
+
+    >>> from player.asset.bricks import pack_vertices
+    >>> coords, masks, _ = pack_vertices(np.array([[0, 0, 0], [9, 0, 0], [9, 0, 1]]))
+    >>> vertex_rows(coords, masks, 16).find(np.array([[9, 0, 1], [0, 0, 0], [1, 0, 0], [-1, 0, 0]])).tolist()
+    [2, 0, -1, -1]
+    """
+    n_per_axis = bricks_per_axis(resolution)
+    stored = stored_bits(masks)
+    rows = np.full((len(stored) + 1, stored.shape[1]), -1, np.int32)
+    rows[:-1][stored] = np.arange(np.count_nonzero(stored), dtype=np.int32)
+    held = with_corners(coords, masks, n_per_axis)
+    apron = np.empty((len(held), 9, 9, 9), np.int32)
+    with_apron(rows, held, dense_index(coords, n_per_axis), apron)
+    bricks = dense_index(held, n_per_axis).reshape(-1)
+    return VertexRows(resolution, n_per_axis, bricks, apron.reshape(-1))
 
 
 def _with_apron(

@@ -36,7 +36,7 @@ per model unit.
 FEATURES. The features of a ray are the sum of weight times trilinear code; scales are folded into the head.
 `dirs` are unit directions in the model frame.
 
-MARCH. `player.march.march`, with the step `step`; `player.march.contracted_march` where `contracted` is true.
+MARCH. `player.march.march`, with the step `step`, on the path that `contracted` says (`player.march.path`).
 `n_samples` fetches as `player.march.fetches` chooses them.
 
 COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.

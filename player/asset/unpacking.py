@@ -73,9 +73,9 @@ class Counts(NamedTuple):
 def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     """Most memory that is taken while `n_packed` bytes of files become arrays and those a grid.
 
-    Bytes a brick, a row, a cell of a table are those of the arrays in `player.asset.asset`,
-    `player.asset.grid` and `player.asset.vertex_rows`, and of their temporaries;
-    tests/player/asset/test_unpacking.py compares the sum with what numpy asks for.
+    Bytes a brick, a row, a cell of a table are those of the arrays in `player.asset.asset` and
+    `player.asset.grid`, and of their temporaries; tests/player/asset/test_unpacking.py compares the sum with
+    what numpy asks for.
     """
     d, f = densities, features
     kept = sum(70 * grid.n_bricks + grid.n_codes for grid in (d, f))

@@ -27,7 +27,7 @@ def first_use() -> bool:
     if numba is None:
         return False
     folder = place(SOURCES).folder
-    return folder is None or not any(folder.glob("*march.*.nbi"))
+    return folder is None or not any(folder.glob("*._march_rays-*.nbi"))
 
 
 def not_kept() -> str | None:

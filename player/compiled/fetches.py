@@ -6,7 +6,7 @@ this.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -27,8 +27,10 @@ from player.compiled.lanes import (
     scatter,
     splat,
     store,
+    unpacked,
     while_any,
 )
+from player.compiled.packets import N_WEIGHTS, TOTAL, brick_number, corner_number
 
 
 class _Chosen:
@@ -60,7 +62,7 @@ def _choose_fetches(_: Any, samples: Any, n_rows: Any, sums: Any, mass: Any, cho
         most = b.udiv(context.make_array(chosen)(context, b, arguments[4]).nitems, LONG(3 * LANES))
         room = splat(b, b.trunc(most, INT))
         one_each = Lanes(b, ir.Constant(ir.VectorType(INT, LANES), list(range(LANES))))
-        n_weights, total = load(b, summed, LONG(2 * LANES)), load(b, summed, LONG(3 * LANES))
+        n_weights, total = (load(b, summed, LONG(row * LANES)) for row in (N_WEIGHTS, TOTAL))
         bins = room.to_float()
         visible = load(b, opacity, LONG(0))
         zero = total.like(0.0)
@@ -122,34 +124,39 @@ there. k is at least 1; of every sample, `samples` are the fetches as they are.
 """
 
 
-def _stored_corners(
-    _: Any, stored: Any, sizes: Any, places: Any, weights: Any, rows: Any, shares: Any
-) -> Any:
+class Stored(NamedTuple):
+    """The features of a `player.asset.grid.SparseGrid`, and the grid of their vertices."""
+
+    bricks: np.ndarray
+    rows: np.ndarray
+    features: np.ndarray
+    resolution: int
+    n_per_axis: int
+    scale: np.float32
+    """Cells of the features' grid in a cell of the densities'."""
+
+
+def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, shares: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        bricks, of_bricks = (
-            address(context, b, kind, b.extract_value(arguments[0], n))
-            for n, kind in enumerate(signature.args[0])
-        )
+        grid = unpacked(context, b, signature.args[0], arguments[0])
         at, weight_at, row_at, share_at = (
-            address(context, b, signature.args[n], arguments[n]) for n in range(2, 6)
+            address(context, b, signature.args[n], arguments[n]) for n in range(1, 5)
         )
-        resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(arguments[1], n), INT)) for n in range(2))
-        scale = splat(b, b.extract_value(arguments[1], 2))
+        resolution, n_per_axis = (splat(b, b.trunc(n, INT)) for n in (grid.resolution, grid.n_per_axis))
+        scale = splat(b, grid.scale)
         low, share = [], []
         for axis in range(3):
             g = (load(b, at, LONG(axis * LANES)) * scale).most(0.0).least(resolution.to_float())
             low.append(g.to_int().least(resolution - 1))
             fraction = g - low[axis].to_float()
             share.append((1.0 - fraction, fraction))
-        x, y, z = (cell >> 3 for cell in low)
-        held = gather(bricks, (x * n_per_axis + y) * n_per_axis + z, 4, resolution > 0)
-        x, y, z = (cell & 7 for cell in low)
-        first = held.wide() * 729 + (x * 81 + y * 9 + z).wide()
+        held = gather(grid.bricks, brick_number(low, n_per_axis), 4, resolution > 0)
+        first = corner_number(held, low)
         total = scale.like(0.0)
         parts = []
         for x, y in np.ndindex(2, 2):
-            pair = gather(of_bricks, first, 4, held > -1, LONG, x * 81 + y * 9).halves()
+            pair = gather(grid.rows, first, 4, held > -1, LONG, x * 81 + y * 9).halves()
             for z, row in enumerate(pair):
                 there = (held > -1) & (row > -1)
                 parts.append(
@@ -165,12 +172,12 @@ def _stored_corners(
         store(share_at, LONG(8 * LANES), total)
         return b.sext(most.greatest(), LONG)
 
-    return types.int64(stored, sizes, places, weights, rows, shares), generate
+    return types.int64(stored, places, weights, rows, shares), generate
 
 
 stored_corners: Any = intrinsic(_stored_corners)
-"""stored_corners((bricks, rows), (resolution, n_per_axis, scale), places [3, LANES] float32, weights [LANES]
-float32, rows [8, LANES] int32, shares [9, LANES] float32): the greatest of the rows.
+"""stored_corners(stored: Stored, places [3, LANES] float32, weights [LANES] float32, rows [8, LANES] int32,
+shares [9, LANES] float32): the greatest of the rows.
 
 The corners around LANES places, cells of the densities' grid: their rows, and their shares of the weights.
 Of what is not stored the share is 0, and the row. Behind the shares there is how much of the interpolation

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
+from numba import types
 from numba.core import cgutils
 
 from player.compiled.processor import has_wide_registers
@@ -182,6 +183,17 @@ def choose(condition: Lanes, yes: Lanes, no: Any) -> Lanes:
 def address(context: Any, builder: Any, kind: Any, array: Any) -> Any:
     """Where the numbers of an array begin, an argument of type `kind`."""
     return context.make_array(kind)(context, builder, array).data
+
+
+def unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """A named tuple, an argument of type `kind`, whose arrays are addresses of their numbers."""
+    parts = (builder.extract_value(value, n) for n in range(len(kind.types)))
+    return kind.instance_class(
+        *(
+            address(context, builder, of, part) if isinstance(of, types.Array) else part
+            for of, part in zip(kind.types, parts, strict=True)
+        )
+    )
 
 
 def splat(builder: Any, scalar: Any) -> Lanes:

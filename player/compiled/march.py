@@ -1,25 +1,80 @@
 """The march of `player.march.march`, compiled by numba: the same semantics, LANES rays at a time.
 
-Every function has its readable twin in `player.march.march`, whose docstring states the mathematics; the
-tests compare the two. Arithmetic that decides which cell a sample falls into is float32 in the same order in
-both.
+Its readable twin states the mathematics; the tests compare the two. Arithmetic that decides which cell a
+sample falls into is float32 in the same order in both.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.grid import SparseGrid
+from player.compiled.add_rows import CHANNELS, add_rows
 from player.compiled.compiling import compiled, inlined
-from player.compiled.fetches import choose_fetches
-from player.compiled.grid import LANES, add_fetches, fetch_arrays, result_arrays, take_hits
-from player.compiled.packets import BOX_ROWS, SUMS, march_box
+from player.compiled.fetches import Stored, choose_fetches, stored_corners
+from player.compiled.lanes import LANES
+from player.compiled.packets import (
+    BOX_ROWS,
+    DEPTH,
+    ENTRY,
+    FIRST,
+    LENGTH,
+    N_SAMPLES,
+    N_WEIGHTS,
+    SPACE_ROWS,
+    SUMS,
+    TAU,
+    BoxSteps,
+    Lookup,
+    SpaceSteps,
+    march_packet,
+    place_fetches,
+)
+from player.compiled.prefetch import prefetch
 from player.compiled.scratch import check_scratch, scratch
-from player.march.march import MarchResult
+from player.march.contracted import MAX_SPEED, enter_space
+from player.march.fetches import MIN_TOTAL
+from player.march.march import MIN_OPACITY, MarchResult
 
 F32 = np.float32
+
+
+class Work(NamedTuple):
+    """What the march of a packet and its fetches work in."""
+
+    samples: np.ndarray
+    """[2, n, LANES] float32: s and weights of the samples."""
+    sums: np.ndarray
+    """[SUMS, LANES] float32: what is found of the rays."""
+    chosen: np.ndarray
+    """[3, k, LANES] float32: what `choose_fetches` chooses."""
+    masses: np.ndarray
+    """[LANES] float32: opacities, 0 where nothing is fetched."""
+    into: np.ndarray
+    """[LANES] int64: rows of the features that the rays are added to."""
+    places: np.ndarray
+    """[3, LANES] float32: where a fetch of each ray is, cells of the densities' grid."""
+    weights: np.ndarray
+    """[LANES] float32: the weights of these fetches."""
+    rows: np.ndarray
+    """[8, LANES] int32: rows of the features that are stored around the places."""
+    shares: np.ndarray
+    """[9, LANES] float32: shares of these rows, as `stored_corners` finds them."""
+
+
+class Found(NamedTuple):
+    """What is found on n rays; `player.march.march.MarchResult` has the first rows of the last two."""
+
+    opacity: np.ndarray
+    depth: np.ndarray
+    n_density_samples: np.ndarray
+    hits: np.ndarray
+    """[n] int64."""
+    features: np.ndarray
+    """[n, whole CHANNELS] float32."""
 
 
 def march(
@@ -30,72 +85,86 @@ def march(
     bounds: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> MarchResult:
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
-    n_rays = len(rays_o)
-    near = np.zeros(n_rays, F32) if bounds is None else bounds[0]
-    far = np.full(n_rays, np.inf, F32) if bounds is None else bounds[1]
-    capacity = grid.most_samples
+    if grid.contracted:
+        steps, packets = _enter_space(grid, rays_o, rays_d)
+        capacity = steps.n_samples
+    else:
+        steps, packets = _enter_box(grid, rays_o, rays_d, bounds)
+        capacity = grid.most_samples
+    n_rays, width = len(rays_o), -(-grid.n_channels // CHANNELS) * CHANNELS
     k = min(n_fetches, capacity)  # no ray has more samples
-    out = result_arrays(n_rays, grid.n_channels)
-    packet = scratch((BOX_ROWS + 1, LANES), F32, 0), scratch(LANES, np.int32)
-    found = scratch((2, capacity, LANES), F32), scratch((SUMS, LANES), F32)
-    fetches = fetch_arrays(k)
-    origin, scale = tuple(grid.aabb_min), tuple(grid.cells_per_unit)
-    n_hits = _march_rays(
-        (grid.resolution, grid.n_per_axis, grid.step, grid.density_low, grid.density_slope, origin, scale),
-        (grid.table, grid.live, grid.density),
-        (grid.rows.bricks, grid.rows.rows, grid.features),
-        (grid.rows.resolution, grid.rows.n_per_axis, grid.feature_scale),
-        (np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far),
-        k,
-        packet,
-        found,
-        fetches,
-        out,
+    work = Work(
+        samples=scratch((2, capacity, LANES), F32),
+        sums=scratch((SUMS, LANES), F32),
+        chosen=scratch((3, max(k, 1), LANES), F32, 0),
+        masses=scratch(LANES, F32),
+        into=scratch(LANES, np.int64),
+        places=scratch((3, LANES), F32, 0),
+        weights=scratch(LANES, F32),
+        rows=scratch((8, LANES), np.int32),
+        shares=scratch((9, LANES), F32),
     )
-    check_scratch(packet, found, fetches, out)
-    opacity, depth, counts, features, hits = out
+    found = Found(
+        opacity=scratch(n_rays, F32, 0),
+        depth=scratch(n_rays, F32, 0),
+        n_density_samples=scratch(n_rays, np.int32, 0),
+        hits=scratch(n_rays, np.int64),
+        features=scratch((n_rays, width), F32, 0),
+    )
+    vertices = grid.rows
+    n_hits = _march_rays(
+        Lookup(
+            grid.table, grid.live, grid.density, grid.resolution, grid.n_per_axis,
+            grid.density_low, grid.density_slope,
+        ),
+        Stored(
+            vertices.bricks, vertices.rows, grid.features, vertices.resolution, vertices.n_per_axis,
+            grid.feature_scale,
+        ),
+        steps, packets, k, work, found,
+    )  # fmt: skip
+    check_scratch(packets, work, found)
+    opacity, depth, counts, hits, features = found
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
 
 
+def _enter_box(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[BoxSteps, np.ndarray]:
+    """The packets of rays through a box, [n_packets, BOX_ROWS, LANES] float32."""
+    n_rays = len(rays_o)
+    near, far = (np.zeros(n_rays, F32), np.full(n_rays, np.inf, F32)) if bounds is None else bounds
+    packets = scratch((-(-n_rays // LANES), BOX_ROWS, LANES), F32, 0)
+    _enter_rays(
+        F32(grid.resolution), grid.aabb_min, grid.cells_per_unit, grid.step,
+        F32(grid.most_samples - 1) * grid.step,  # there is no room for more samples, whatever the ray
+        np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far, packets,
+    )  # fmt: skip
+    return BoxSteps(grid.step), packets
+
+
+def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[SpaceSteps, np.ndarray]:
+    """The packets of rays through contracted space, [n_packets, SPACE_ROWS, LANES] float32."""
+    path = enter_space(grid, rays_o, rays_d)
+    n_packets = -(-len(rays_o) // LANES)
+    rows = np.zeros((SPACE_ROWS, n_packets * LANES), F32)
+    rows[:, : len(rays_o)] = (
+        *path.nearest, *path.along, path.cos, path.sin, path.width, path.length, path.t_nearest
+    )  # fmt: skip
+    packets = scratch((n_packets, SPACE_ROWS, LANES), F32)
+    packets[:] = rows.reshape(SPACE_ROWS, n_packets, LANES).swapaxes(0, 1)
+    half, fastest = grid.step * F32(0.5), MAX_SPEED * grid.step * path.cells
+    angles = np.cos(half), np.sin(half), np.sin(grid.step)
+    return SpaceSteps(path.table, path.table.shape[1], *angles, fastest, path.cells), packets
+
+
 @compiled
-def _march_rays(settings, lookup, stored, sizes, rays, k, packet, found, fetches, out):
-    """Packets of rays: their samples first, then a fetch of each ray at a time into its row of `features`."""
-    resolution, n_per_axis, step, low, slope, _, _ = settings
-    entered, first = packet
-    samples, sums = found
-    chosen, masses, _, _, _, _, _ = fetches
-    _, depth, _, features, _ = out
-    n_rays, n_hits = len(depth), 0
-    longest = F32(samples.shape[1] - 1) * step  # there is no room for more, whatever the ray
-    for start in range(0, n_rays, LANES):
-        n_lanes = min(LANES, n_rays - start)
-        _enter(settings, rays, start, n_lanes, longest, entered, first)
-        rows = march_box(lookup, (resolution, n_per_axis, low, slope), step, entered, first, samples, sums)
-        hits_before = n_hits
-        n_hits = take_hits(start, n_lanes, sums, fetches, out, n_hits)
-        for lane in range(n_lanes):
-            if sums[2, lane] > F32(0.0):
-                depth[start + lane] = entered[BOX_ROWS, lane] + sums[4, lane] / sums[3, lane]
-        if n_hits == hits_before:
-            continue
-        if k > 0:
-            rows = choose_fetches(samples, rows, sums, masses, chosen)
-        wanted = chosen if k > 0 else samples
-        for j in range(rows):
-            _fetch(stored, sizes, entered, wanted, j, k > 0, fetches, features)
-    return n_hits
-
-
-@inlined
-def _enter(settings, rays, start, n_lanes, longest, entered, first):
-    """The rays from `start` on, where they enter the box: the rows of `march_box`, and t_in."""
-    resolution, _, step, _, _, origin, scale = settings
-    rays_o, rays_d, near, far = rays
-    size = F32(resolution)
-    first[:] = 0
-    entered[6] = F32(0.0)
-    for lane in range(n_lanes):
-        ray = start + lane
+def _enter_rays(size, origin, scale, step, longest, rays_o, rays_d, near, far, packets):
+    """Rays where they enter the box of `size` cells, into rows of packets."""
+    for ray in range(len(rays_o)):
         dx, dy, dz = rays_d[ray, 0] * scale[0], rays_d[ray, 1] * scale[1], rays_d[ray, 2] * scale[2]
         ox = (rays_o[ray, 0] - origin[0]) * scale[0]
         oy = (rays_o[ray, 1] - origin[1]) * scale[1]
@@ -107,12 +176,13 @@ def _enter(settings, rays, start, n_lanes, longest, entered, first):
         if not length > F32(0.0):
             continue
         ahead = max(near[ray] - t_in, F32(0.0)) / step - F32(0.5)
-        first[lane] = max(math.floor(min(ahead, F32(1e9))), 0)
-        entered[0, lane] = min(max(ox + t_in * dx, F32(0.0)), size)
-        entered[1, lane] = min(max(oy + t_in * dy, F32(0.0)), size)
-        entered[2, lane] = min(max(oz + t_in * dz, F32(0.0)), size)
-        entered[3, lane], entered[4, lane], entered[5, lane] = dx, dy, dz
-        entered[6, lane], entered[7, lane] = length, t_in
+        packet, lane = ray // LANES, ray % LANES
+        packets[packet, 0, lane] = min(max(ox + t_in * dx, F32(0.0)), size)
+        packets[packet, 1, lane] = min(max(oy + t_in * dy, F32(0.0)), size)
+        packets[packet, 2, lane] = min(max(oz + t_in * dz, F32(0.0)), size)
+        packets[packet, 3, lane], packets[packet, 4, lane], packets[packet, 5, lane] = dx, dy, dz
+        packets[packet, LENGTH, lane], packets[packet, ENTRY, lane] = length, t_in
+        packets[packet, FIRST, lane] = max(math.floor(min(ahead, F32(1e9))), 0)
 
 
 @inlined
@@ -127,27 +197,91 @@ def _slab(o, d, size, t_in, t_out):
     return max(t_in, min(a, b)), min(t_out, max(a, b))
 
 
-@inlined
-def _fetch(stored, sizes, entered, table, j, again, fetches, features):
-    """Add fetch j of every ray that has one: s and weights of `table`; `again` at the other place where
-    little is stored."""
-    _, masses, _, _, weights, _, _ = fetches
-    for lane in range(LANES):
-        weights[lane] = table[1, j, lane] if masses[lane] > F32(0.0) else F32(0.0)
-    _place(entered, table, 0, j, fetches)
-    if add_fetches(stored, sizes, fetches, features) > 0 and again:
-        _place(entered, table, 2, j, fetches)
-        add_fetches(stored, sizes, fetches, features)
+@compiled
+def _march_rays(lookup, stored, steps, packets, k, work, found):
+    """Packets of rays: their samples first, then a fetch of each ray at a time into its row of the features.
+    Returns the number of hits."""
+    n_hits = 0
+    for number in range(len(packets)):
+        rows = march_packet(lookup, steps, packets, number, work.samples, work.sums)
+        hits_before = n_hits
+        n_hits = _take_hits(number * LANES, work, found, n_hits)
+        if n_hits == hits_before:
+            continue
+        if k > 0:
+            rows = choose_fetches(work.samples, rows, work.sums, work.masses, work.chosen)
+        wanted = work.chosen if k > 0 else work.samples
+        for j in range(rows):
+            for lane in range(LANES):
+                work.weights[lane] = wanted[1, j, lane] if work.masses[lane] > F32(0.0) else F32(0.0)
+            place_fetches(steps, packets, number, wanted, j * LANES, work.places, work.weights)
+            if _add_fetches(stored, work, found.features) > 0 and k > 0:
+                other = (2 * wanted.shape[1] + j) * LANES  # where to fetch if little is stored at the first
+                place_fetches(steps, packets, number, wanted, other, work.places, work.weights)
+                _add_fetches(stored, work, found.features)
+    return n_hits
 
 
 @inlined
-def _place(entered, table, which, j, fetches):
-    """Grid coordinates at s on every ray."""
-    _, _, _, places, weights, _, _ = fetches
+def _take_hits(start, work, found, n_hits):
+    """What was found of the packet's rays, those from `start` on; a visible one is a hit, with a mass and a
+    row of the features. Returns how many hits there are now."""
+    work.masses[:] = F32(0.0)
+    for lane in range(min(LANES, len(found.opacity) - start)):
+        ray = start + lane
+        found.n_density_samples[ray] = int(work.sums[N_SAMPLES, lane])
+        if work.sums[N_WEIGHTS, lane] == F32(0.0):
+            continue
+        found.depth[ray] = work.sums[DEPTH, lane]
+        found.opacity[ray] = _opacity_of(work.sums[TAU, lane])
+        if found.opacity[ray] > MIN_OPACITY:
+            work.masses[lane], work.into[lane] = found.opacity[ray], n_hits
+            found.hits[n_hits] = ray
+            n_hits += 1
+    return n_hits
+
+
+@inlined
+def _opacity_of(tau):
+    """1 - exp(-tau) to float32 rounding: the difference in float64, or the series where that would cancel."""
+    if tau < F32(1e-5):
+        return tau - F32(0.5) * tau * tau
+    return F32(1.0 - math.exp(-np.float64(tau)))
+
+
+@inlined
+def _add_fetches(stored, work, out):
+    """Add a fetch of each ray to its row of `out`. Those that found too little stored keep their weight, all
+    others lose it; returns their number."""
+    features, weights, rows, shares = stored.features, work.weights, work.rows, work.shares
+    most = stored_corners(stored, work.places, weights, rows, shares)
+    n_channels = features.shape[1]
+    whole = most * n_channels + out.shape[1] <= features.size  # or the last rows cannot be read in registers
     for lane in range(LANES):
-        s = table[which, j, lane]
-        if math.isnan(s):
-            weights[lane], s = F32(0.0), F32(0.0)
-        places[0, lane] = entered[0, lane] + s * entered[3, lane]
-        places[1, lane] = entered[1, lane] + s * entered[4, lane]
-        places[2, lane] = entered[2, lane] + s * entered[5, lane]
+        if weights[lane] > F32(0.0):
+            for corner in range(0, 8, 2):  # the next along z is the next row
+                prefetch(features, rows[corner, lane])
+    left = 0
+    for lane in range(LANES):
+        if weights[lane] <= F32(0.0):
+            continue
+        if shares[8, lane] < MIN_TOTAL:
+            left += 1
+            continue
+        weights[lane] = F32(0.0)
+        into = work.into[lane]
+        if whole:
+            for first in range(0, n_channels, CHANNELS):
+                add_rows(features, rows, shares, lane, out, into, first)
+        else:
+            for c in range(n_channels):  # in the order of `add_rows`
+                a, b = _two(features, rows, shares, lane, 0, c), _two(features, rows, shares, lane, 2, c)
+                d, e = _two(features, rows, shares, lane, 4, c), _two(features, rows, shares, lane, 6, c)
+                out[into, c] += (a + b) + (d + e)
+    return left
+
+
+@inlined
+def _two(features, rows, shares, lane, corner, c):
+    one = shares[corner, lane] * features[rows[corner, lane], c]
+    return one + shares[corner + 1, lane] * features[rows[corner + 1, lane], c]

@@ -1,8 +1,8 @@
 """The march of LANES rays at a time, in step, each at a place of its own.
 
 Rays beside one another meet the same bricks at nearly the same samples, so that a packet takes hardly more
-steps than its longest ray does alone, and every step serves all of them. What `player.march.march` and
-`player.march.contracted_march` state is done here in the same order, in float32. Compiled code alone imports
+steps than its longest ray does alone, and every step serves all of them. What `player.march.march` states is
+done here in the same order, in float32, on either path of `player.march.path`. Compiled code alone imports
 this.
 
 A packet's numbers are float32 in rows of LANES, one of each ray. What is found is written in rows, too: s and
@@ -12,8 +12,10 @@ weight of sample j of all rays, the weight 0 where a ray has none. Where to fetc
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -30,67 +32,91 @@ from player.compiled.lanes import (
     load,
     splat,
     store,
+    unpacked,
     while_any,
 )
-from player.march.contracted import MIN_COS, SPARE
-from player.march.march import MAX_TAU, SKIP_MARGIN
+from player.march.box import SKIP_MARGIN
+from player.march.contracted import MIN_COS
+from player.march.march import MAX_TAU
 
-BOX_ROWS = 7
-"""Rows of a packet in a box: point and direction in grid coordinates, length; see `march_box`."""
-SPACE_ROWS = 10
-"""Rows of a packet in contracted space: p, w d, cos and sin of phi_0, w, length; see `march_space`."""
 
+class Lookup(NamedTuple):
+    """What a march reads of a `player.asset.grid.SparseGrid`."""
+
+    table: np.ndarray
+    live: np.ndarray
+    density: np.ndarray
+    resolution: int
+    n_per_axis: int
+    density_low: np.float32
+    density_slope: np.float32
+
+
+class BoxSteps(NamedTuple):
+    """What all rays through a box have in common."""
+
+    step: np.float32
+    """Model units between samples."""
+
+
+class SpaceSteps(NamedTuple):
+    """What all rays through contracted space have in common."""
+
+    lattice: np.ndarray
+    """[3, n_samples] float32: that of `player.march.contracted`."""
+    n_samples: int
+    cos_half: np.float32
+    sin_half: np.float32
+    """cos and sin of half a step of phi."""
+    sin_step: np.float32
+    """sin of a step of phi."""
+    fastest: np.float32
+    """Cells that a step makes at most."""
+    cells: np.float32
+    """Cells in a contracted unit."""
+
+
+BOX_ROWS = 9
+"""Rows of a packet in a box: entry point x, y, z and direction x, y, z in grid coordinates, length, t of the
+entry, first sample. A length of 0 stands for no ray."""
+LENGTH, ENTRY, FIRST = 6, 7, 8
+"""Those of the rows that are one number each."""
+SPACE_ROWS = 11
+"""Rows of a packet in contracted space: p and w d, x, y, z each, cos and sin of phi_0, w, length, t_p
+(`player.march.contracted.ContractedPath`). A length of 0 stands for no ray."""
+
+TAU, N_SAMPLES, N_WEIGHTS, TOTAL, DEPTH = range(5)
+"""Rows of what is found of a ray: its optical depth, the number of density samples, the number of those with
+weight, the sum of the weights, and t at their mean place."""
 SUMS = 5
-"""Rows of what is summed up over a ray: tau, the number of density samples, the number of those with weight,
-the sums of weight and of weight times s."""
+"""Rows of what is found of a ray, in all."""
 
 Three = tuple[Lanes, Lanes, Lanes]
 
 
-class _Grid(NamedTuple):
-    """Addresses of the grid's arrays, and its numbers."""
-
-    table: Any
-    live: Any
-    density: Any
-    n_per_axis: Lanes
-    last: Lanes
-    """Of the cells along an axis."""
-    low: Lanes
-    slope: Lanes
-
-
-class _Path(Protocol):
-    """How samples lie on the rays of a packet."""
-
-    def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
-        """s of the samples `i`, whether the rays reach so far, and their grid coordinates."""
-        ...
-
-    def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
-        """The sample to look at next, from one in a brick around which all are empty within `reach`."""
-        ...
-
-    def way(self) -> Lanes:
-        """Model units that the samples placed last stand for."""
-        ...
-
-
 class _Box:
-    def __init__(self, b: Any, packet: Any, step: Lanes) -> None:
+    """The path of a packet through a box, as `player.march.box.BoxPath`."""
+
+    def __init__(self, b: Any, packet: Any, steps: BoxSteps) -> None:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(BOX_ROWS)]
-        self._e, self._d, self._length = rows[:3], rows[3:6], rows[6]
-        self._step = step
+        self._e, self._d = rows[:3], rows[3:6]
+        self._length, self._entry, self._first = rows[LENGTH], rows[ENTRY], rows[FIRST]
+        self._step = splat(b, steps.step)
         self._per_step = 1.0 / self._step
         self._still = [d.call("fabs") <= 0 for d in self._d]
         self._inverse = [1.0 / d for d in self._d]
 
+    def first(self) -> Lanes:
+        """The first samples to look at."""
+        return self._first.to_int()
+
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
+        """s of the samples `i`, whether the rays reach so far, and their grid coordinates."""
         s = (i.to_float() + 0.5) * self._step
-        x, y, z = (e + s * d for e, d in zip(self._e, self._d, strict=True))
-        return s, active & (s < self._length), (x, y, z)
+        return s, active & (s < self._length), self.at(s)
 
     def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
+        """The sample to look at next, from one in a brick around which all are empty within `reach`."""
         leave = self._length
         for e, inverse, still, brick in zip(self._e, self._inverse, self._still, bricks, strict=True):
             ahead = ((brick + reach + 1) << 3).to_float() - float(SKIP_MARGIN)
@@ -100,33 +126,42 @@ class _Box:
         return (i + 1).most((leave * self._per_step + 0.5).to_int())
 
     def way(self) -> Lanes:
+        """Model units that the samples placed last stand for."""
         return self._step
+
+    def at(self, s: Lanes) -> Three:
+        """Grid coordinates of the places `s`."""
+        x, y, z = (e + s * d for e, d in zip(self._e, self._d, strict=True))
+        return x, y, z
+
+    def distance(self, s: Lanes) -> Lanes:
+        """t of the places `s`, model units."""
+        return self._entry + s
 
 
 class _Space:
-    def __init__(self, b: Any, packet: Any, lattice: Any, pitch: Any, numbers: list[Lanes]) -> None:
-        """pitch: samples that the lattice has, in 64 bits. numbers: cos and sin of half a step of phi, sin of
-        a step, cells that a step makes at most, cells in a contracted unit."""
+    """The path of a packet through contracted space, as `player.march.contracted.ContractedPath`; its methods
+    are those of `_Box`."""
+
+    def __init__(self, b: Any, packet: Any, steps: SpaceSteps) -> None:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
         self._p, self._wd = rows[:3], rows[3:6]
-        self._cos0, self._sin0, self._width, self._length = rows[6:]
-        self._lattice = [b.gep(lattice, [b.mul(pitch, LONG(row))]) for row in range(3)]
-        self._end = splat(b, b.trunc(pitch, INT)) - SPARE
-        self._cos_half, self._sin_half, self._sin_step, self._fastest, self._cells = numbers
-        self._turned: tuple[Lanes, Lanes]
+        self._cos0, self._sin0, self._width, self._length, self._t_nearest = rows[6:]
+        self._lattice = [b.gep(steps.lattice, [b.mul(steps.n_samples, LONG(row))]) for row in range(3)]
+        self._end = splat(b, b.trunc(steps.n_samples, INT))
+        self._cos_half, self._sin_half, self._sin_step, self._fastest, self._cells = (
+            splat(b, number) for number in steps[2:]
+        )
+        self._placed: tuple[Lanes, Lanes]  # cos and sin of phi of the samples placed last
+
+    def first(self) -> Lanes:
+        return self._end.like(0)
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
         active = active & (i < self._end)
         s, cos_s, sin_s = (gather(row, i, 4, active).as_float() for row in self._lattice)
-        cos = self._cos0 * cos_s - self._sin0 * sin_s
-        sin = self._sin0 * cos_s + self._cos0 * sin_s
-        self._turned = cos, sin
-        v = [cos * p + sin * wd for p, wd in zip(self._p, self._wd, strict=True)]
-        q = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).call("sqrt")
-        scale = choose(q <= cos, 1.0 / cos, (2.0 - cos / q) / q) * self._cells
-        middle = self._cells * 2.0
-        x, y, z = (axis * scale + middle for axis in v)
-        return s, active & (s < self._length), (x, y, z)
+        self._placed = self._turned(cos_s, sin_s)
+        return s, active & (s < self._length), self._on_grid(*self._placed)
 
     def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
         free = None
@@ -139,16 +174,57 @@ class _Space:
         return i + 1 + ((free - float(SKIP_MARGIN)) / self._fastest).to_int().most(0)
 
     def way(self) -> Lanes:
-        cos, sin = self._turned
+        cos, sin = self._placed
         a, b = cos * self._cos_half, sin * self._sin_half
         below = (a + b).most(float(MIN_COS)) * (a - b).most(float(MIN_COS))
         return self._width * self._sin_step / below
 
+    def at(self, s: Lanes) -> Three:
+        return self._on_grid(*self._turned(s.call("cos"), s.call("sin")))
 
-def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch: Any, out: Any) -> Any:
-    """March a packet from the samples `first` on: s into `samples`, weights `pitch` numbers behind; SUMS of
-    each ray into `out`. Returns how many rows were written."""
-    zero = grid.low.like(0.0)
+    def distance(self, s: Lanes) -> Lanes:
+        cos, sin = self._turned(s.call("cos"), s.call("sin"))
+        return self._t_nearest + self._width * sin / cos.most(float(MIN_COS))
+
+    def _turned(self, cos_s: Lanes, sin_s: Lanes) -> tuple[Lanes, Lanes]:
+        """cos and sin of phi, from those of s."""
+        return self._cos0 * cos_s - self._sin0 * sin_s, self._sin0 * cos_s + self._cos0 * sin_s
+
+    def _on_grid(self, cos: Lanes, sin: Lanes) -> Three:
+        v = [cos * p + sin * wd for p, wd in zip(self._p, self._wd, strict=True)]
+        q = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).call("sqrt")
+        scale = choose(q <= cos, 1.0 / cos, (2.0 - cos / q) / q) * self._cells
+        middle = self._cells * 2.0
+        x, y, z = (axis * scale + middle for axis in v)
+        return x, y, z
+
+
+def _path(context: Any, b: Any, kinds: Any, steps: Any, packets: Any, number: Any) -> _Box | _Space:
+    """The path of one of the packets; which one it is the type of `steps` says."""
+    common = unpacked(context, b, kinds[0], steps)
+    n_rows = BOX_ROWS if isinstance(common, BoxSteps) else SPACE_ROWS
+    packet = b.gep(address(context, b, kinds[1], packets), [b.mul(number, LONG(n_rows * LANES))])
+    return _Box(b, packet, common) if isinstance(common, BoxSteps) else _Space(b, packet, common)
+
+
+def brick_number(cells: Sequence[Lanes], n_per_axis: Lanes) -> Lanes:
+    """As that of `player.asset.grid`."""
+    x, y, z = (cell >> 3 for cell in cells)
+    return (x * n_per_axis + y) * n_per_axis + z
+
+
+def corner_number(bricks: Lanes, cells: Sequence[Lanes]) -> Lanes:
+    """As that of `player.asset.grid`, in 64 bits; for bricks that are there."""
+    x, y, z = (cell & 7 for cell in cells)
+    return bricks.wide() * 729 + (x * 81 + y * 9 + z).wide()
+
+
+def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any, out: Any) -> Any:
+    """March a packet: s into `samples`, weights `pitch` numbers behind; SUMS of each ray into `out`. Returns
+    how many rows were written."""
+    resolution, n_per_axis = (splat(b, b.trunc(n, INT)) for n in (grid.resolution, grid.n_per_axis))
+    low, slope = splat(b, grid.density_low), splat(b, grid.density_slope)
+    last, zero, first = (resolution - 1).to_float(), low.like(0.0), path.first()
     i, taken, active = Variable(first), Variable(first.like(0)), Variable(first >= 0)
     tau, trans, n_weights = Variable(zero), Variable(zero.like(1.0)), Variable(zero)
     total, moment = _Sum(zero), _Sum(zero)
@@ -156,16 +232,14 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
     with while_any(b, active):
         now = i.get()
         s, inside, g = path.place(now, active.get())
-        top = grid.last.to_float()
-        cell = [x.most(0.0).least(top).to_int() for x in g]
-        bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
-        number = (bricks[0] * grid.n_per_axis + bricks[1]) * grid.n_per_axis + bricks[2]
-        slot = gather(grid.table, number, 4, inside)
+        cell = [x.most(0.0).least(last).to_int() for x in g]
+        slot = gather(grid.table, brick_number(cell, n_per_axis), 4, inside)
         empty = inside & (slot < 0)
         busy = inside & (slot > -1)
         i.set(now + 1)
         active.set(inside)
         with b.if_then(empty.any()):
+            bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
             i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))
         with b.if_then(busy.any()):  # a grid without a slot has nothing to read
             within = [c & 7 for c in cell]
@@ -174,10 +248,9 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
             lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
             live = lit.is_not(0)
             with b.if_then(live.any()):
-                at = slot.wide() * 729 + (within[0] * 81 + within[1] * 9 + within[2]).wide()
                 f = [x - c.to_float() for x, c in zip(g, cell, strict=True)]
-                code = _trilinear(grid.density, at, f, live)
-                optical = (grid.low + grid.slope * code).exp() * path.way()
+                code = _trilinear(grid.density, corner_number(slot, cell), f, live)
+                optical = (low + slope * code).exp() * path.way()
                 optical = choose(live, optical, zero)
                 before = trans.get()
                 depth = tau.get() + optical
@@ -197,14 +270,20 @@ def _collect(b: Any, grid: _Grid, path: _Path, first: Lanes, samples: Any, pitch
                 store(samples, place, s)
                 store(samples, b.add(place, pitch), weight)
                 b.store(b.add(row, LONG(1)), n_rows)
-    sums = tau.get(), taken.get().to_float(), n_weights.get(), total.get(), moment.get()
-    for row, values in enumerate(sums):
+    depth = path.distance(moment.get() / total.get())
+    for row, values in (
+        (TAU, tau.get()),
+        (N_SAMPLES, taken.get().to_float()),
+        (N_WEIGHTS, n_weights.get()),
+        (TOTAL, total.get()),
+        (DEPTH, depth),
+    ):
         store(out, LONG(row * LANES), values)
     return b.load(n_rows)
 
 
 class _Sum:
-    """Of many numbers to the rounding of the last: Kahan's."""
+    """A sum of many numbers to the rounding of the last (Kahan)."""
 
     def __init__(self, zero: Lanes) -> None:
         self._sum, self._lost = Variable(zero), Variable(zero)
@@ -232,64 +311,49 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
     return c0 + (c1 - c0) * f[0]
 
 
-def _grid(context: Any, b: Any, kinds: Any, arrays: Any, numbers: Any) -> _Grid:
-    """From (table, live, density) and (resolution, n_per_axis, low, slope)."""
-    table, live, density = (
-        address(context, b, kind, b.extract_value(arrays, n)) for n, kind in enumerate(kinds)
-    )
-    resolution, n_per_axis = (splat(b, b.trunc(b.extract_value(numbers, n), INT)) for n in range(2))
-    low, slope = (splat(b, b.extract_value(numbers, n)) for n in (2, 3))
-    return _Grid(table, live, density, n_per_axis, resolution - 1, low, slope)
-
-
-def _march_box(
-    _: Any, lookup: Any, numbers: Any, step: Any, packet: Any, first: Any, samples: Any, out: Any
-) -> Any:
+def _march_packet(_: Any, lookup: Any, steps: Any, packets: Any, number: Any, samples: Any, out: Any) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        grid = _grid(context, b, signature.args[0], arguments[0], arguments[1])
-        rows, start, places, found = (
-            address(context, b, signature.args[n], arguments[n]) for n in range(3, 7)
-        )
-        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
-        path = _Box(b, rows, splat(b, arguments[2]))
-        return _collect(b, grid, path, load(b, start, LONG(0), INT), places, pitch, found)
+        kinds = signature.args
+        grid = unpacked(context, b, kinds[0], arguments[0])
+        path = _path(context, b, kinds[1:3], *arguments[1:4])
+        places, found = (address(context, b, kinds[n], arguments[n]) for n in (4, 5))
+        pitch = b.udiv(context.make_array(samples)(context, b, arguments[4]).nitems, LONG(2))
+        return _collect(b, grid, path, places, pitch, found)
 
-    return types.int64(lookup, numbers, step, packet, first, samples, out), generate
+    return types.int64(lookup, steps, packets, types.intp, samples, out), generate
 
 
-march_box: Any = intrinsic(_march_box)
-"""march_box((table, live, density), (resolution, n_per_axis, low, slope), step, packet [BOX_ROWS, LANES]
-float32, first [LANES] int32, samples [2, n, LANES] float32, out [SUMS, LANES] float32): rows written.
+march_packet: Any = intrinsic(_march_packet)
+"""march_packet(lookup: Lookup, steps: BoxSteps or SpaceSteps, packets [n_packets, BOX_ROWS or SPACE_ROWS,
+LANES] float32, number, samples [2, n, LANES] float32, out [SUMS, LANES] float32): march the packet `number`;
+rows written.
 
-`packet` has the entry points x, y, z and directions x, y, z in grid coordinates, and lengths; 0 where there
-is no ray. Into `samples` go s and weights. `samples` has room for the most samples that a ray can have.
+Into `samples` go s and weights; it has room for the most samples that a ray can have.
 """
 
 
-def _march_space(
-    _: Any, lookup: Any, numbers: Any, lattice: Any, steps: Any, packet: Any, samples: Any, out: Any
+def _place_fetches(
+    _: Any, steps: Any, packets: Any, number: Any, table: Any, first: Any, places: Any, weights: Any
 ) -> Any:
 
     def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        grid = _grid(context, b, signature.args[0], arguments[0], arguments[1])
-        table, rows, places, found = (
-            address(context, b, signature.args[n], arguments[n]) for n in (2, 4, 5, 6)
-        )
-        pitch = b.udiv(context.make_array(samples)(context, b, arguments[5]).nitems, LONG(2))
-        n = b.udiv(context.make_array(lattice)(context, b, arguments[2]).nitems, LONG(3))
-        of_steps = [splat(b, b.extract_value(arguments[3], i)) for i in range(5)]
-        path = _Space(b, rows, table, n, of_steps)
-        return _collect(b, grid, path, grid.last.like(0), places, pitch, found)
+        kinds = signature.args
+        path = _path(context, b, kinds[:2], *arguments[:3])
+        of_s, at, weight_at = (address(context, b, kinds[n], arguments[n]) for n in (3, 5, 6))
+        s, weight = load(b, of_s, arguments[4]), load(b, weight_at, LONG(0))
+        known = s >= 0  # NaN is not
+        store(weight_at, LONG(0), choose(known, weight, 0.0))
+        for axis, g in enumerate(path.at(choose(known, s, 0.0))):
+            store(at, LONG(axis * LANES), g)
+        return context.get_dummy_value()
 
-    return types.int64(lookup, numbers, lattice, steps, packet, samples, out), generate
+    arrays = steps, packets, types.intp, table, types.intp, places, weights
+    return types.void(*arrays), generate
 
 
-march_space: Any = intrinsic(_march_space)
-"""march_space((table, live, density), (resolution, n_per_axis, low, slope), lattice [3, n] float32, steps,
-packet [SPACE_ROWS, LANES] float32, samples [2, n, LANES] float32, out [SUMS, LANES] float32): rows written.
-
-`steps` are five float32: cos and sin of half a step of phi, sin of a step, cells that a step makes at most,
-cells in a contracted unit. `packet` has p, w d, cos and sin of phi_0, w and the length; 0 where there is no
-ray. The rest as in `march_box`.
+place_fetches: Any = intrinsic(_place_fetches)
+"""place_fetches(steps, packets, number, table float32, first, places [3, LANES] float32, weights [LANES]
+float32): grid coordinates of the LANES places s that are in `table` from its number `first` on, on the rays
+of the packet `number`. Where s is NaN the weight becomes 0.
 """

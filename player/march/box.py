@@ -1,5 +1,8 @@
-"""Rays meet the box: from origin and direction in the model frame to entry point and direction in grid
-coordinates."""
+"""Rays through a box: where they enter it, and the lattice of samples on them.
+
+A place on a ray is s, the distance behind the entry in model units. The samples of a ray are at `s_i = (i +
+1/2) step`, wherever it enters.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,20 @@ import numpy as np
 
 from player.asset.grid import SparseGrid
 
+SKIP_MARGIN = np.float32(0.01)
+"""Cells by which a jump stays inside what is known to be empty: a hundred times the rounding of a grid
+coordinate."""
 
-class Entries(NamedTuple):
-    """Rays in grid coordinates, from where they enter the box."""
+
+class BoxPath(NamedTuple):
+    """n rays from where they enter the box; the methods are those that `player.march.path` describes."""
 
     t: np.ndarray
-    """[n] float32, t of the entry."""
+    """[n] float32, t of the entry, model units."""
+    first: np.ndarray
+    """[n] int32, the first sample that may lie in a live cell."""
     length: np.ndarray
-    """[n] float32, way inside the box; <= 0 for a ray that misses it."""
+    """[n] float32, s where the ray ends; <= 0 for a ray that misses the box."""
     point: np.ndarray
     """[3, n] float32, entry point in cells."""
     direction: np.ndarray
@@ -24,28 +33,56 @@ class Entries(NamedTuple):
     step: np.float32
     """Model units between samples."""
 
+    def sample(self, i: np.ndarray) -> np.ndarray:
+        return (i + np.float32(0.5)) * self.step
+
+    def place(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
+        return self.at(ray, self.sample(i))
+
+    def jump(
+        self, ray: np.ndarray, i: np.ndarray, g: np.ndarray, brick: np.ndarray, reach: np.ndarray
+    ) -> np.ndarray:
+        direction = self.direction[:, ray]
+        ahead, behind = (brick + (reach + 1)) * 8 - SKIP_MARGIN, (brick - reach) * 8 + SKIP_MARGIN
+        still = direction == 0
+        face = np.where(direction > 0, ahead, behind).astype(np.float32)
+        s = (face - self.point[:, ray]) / np.where(still, np.float32(1), direction)
+        s[still] = np.inf
+        left = np.minimum(s.min(axis=0), np.float32(1e6)) / self.step - np.float32(0.5)
+        return np.maximum(i, np.floor(np.minimum(left, np.float32(1e9))).astype(np.int32)) + 1
+
+    def way(self, ray: np.ndarray, i: np.ndarray) -> np.float32:
+        return self.step
+
     def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Grid coordinates [3, n_places] at `s` [n_places] behind the entries of the rays `ray`
-        [n_places]."""
         return self.point[:, ray] + s * self.direction[:, ray]
 
     def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """t [n_places], model units."""
         return self.t[ray] + s
 
     def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Model units [n_places] that samples stand for: a step, wherever they are."""
         return np.full(len(ray), self.step)
 
     def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """`gradients` themselves: the box's axes are the model frame's."""
-        return gradients
+        return gradients  # the box's axes are the model frame's
 
 
-def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entries:
+def enter_box(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> BoxPath:
     """Rays to grid coordinates, each moved to where it enters the box (slabs; t >= 0).
 
     A ray parallel to a face is inside that slab, faces included, or misses.
+
+    Args:
+        grid: the sparse grid.
+        rays_o: [n, 3] float32 origins, model frame.
+        rays_d: [n, 3] float32 unit directions, model frame.
+        bounds: optional [n] float32 `near` and `far`: t outside which the caller knows that there is no live
+            cell.
     """
     size = np.float32(grid.resolution)
     t_in = np.zeros(len(rays_o), np.float32)
@@ -63,4 +100,11 @@ def enter_box(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Entri
         t_out[outside] = -np.inf
     with np.errstate(over="ignore", invalid="ignore"):  # of rays that miss; nobody asks where
         point = np.clip(point + t_in * direction, np.float32(0), size)
-    return Entries(t_in, t_out - t_in, point, direction, grid.step)
+    first = np.zeros(len(rays_o), np.int32)
+    length = np.minimum(t_out - t_in, np.float32(grid.most_samples - 1) * grid.step)
+    if bounds is not None:
+        near, far = bounds
+        ahead = np.maximum(near - t_in, 0) / grid.step - np.float32(0.5)
+        first = np.maximum(np.floor(np.minimum(ahead, np.float32(1e9))), 0).astype(np.int32)
+        length = np.minimum(length, far - t_in)
+    return BoxPath(t_in, first, length, point, direction, grid.step)

@@ -23,18 +23,17 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.grid import SparseGrid
+from player.march.box import SKIP_MARGIN
 from player.march.contraction import contraction_scale, pull_back
 
 MAX_SPEED = np.float32(5**0.5)
 """Contracted units for a unit of phi, at most."""
 MIN_COS = np.float32(1e-3)
 """Rays end where cos(phi) is this: a thousand model units behind the point nearest to the origin."""
-SPARE = 8
-"""Lattice samples behind the last: the numpy march looks at so many at a time."""
 
 
-class ContractedRays(NamedTuple):
-    """n rays, as the lattice wants them."""
+class ContractedPath(NamedTuple):
+    """n rays through contracted space; the methods are those that `player.march.path` describes."""
 
     nearest: np.ndarray
     """[3, n] float32: p."""
@@ -45,63 +44,81 @@ class ContractedRays(NamedTuple):
     width: np.ndarray
     """[n] float32: w."""
     cos: np.ndarray
+    """[n] float32: cos(phi_0)."""
     sin: np.ndarray
-    """[n] float32, both of phi_0."""
+    """[n] float32: sin(phi_0)."""
     length: np.ndarray
     """[n] float32: s where the ray ends."""
     cells: np.float32
     """Cells in a contracted unit."""
     step: np.float32
     """dphi."""
+    table: np.ndarray
+    """[3, n_samples] float32: the `lattice` of `step`."""
 
-    def turned(self, ray: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """cos and sin [n_places] of phi at the places `s` [n_places] on the rays `ray` [n_places]."""
-        return self.lattice_turned(ray, np.cos(s), np.sin(s))
+    @property
+    def first(self) -> np.ndarray:
+        return np.zeros(len(self.length), np.int32)
 
-    def lattice_turned(
-        self, ray: np.ndarray, cos_s: np.ndarray, sin_s: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The same from cos and sin of s."""
+    def sample(self, i: np.ndarray) -> np.ndarray:
+        return self.table[0].take(i, mode="clip")  # the last is behind the end of every ray
+
+    def place(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
+        return self._on_grid(ray, *self._turned_to_sample(ray, i))
+
+    def jump(
+        self, ray: np.ndarray, i: np.ndarray, g: np.ndarray, brick: np.ndarray, reach: np.ndarray
+    ) -> np.ndarray:
+        low, high = ((brick - reach) * 8).astype(np.float32), ((brick + reach + 1) * 8).astype(np.float32)
+        free = np.minimum(g - low, high - g).min(axis=0) - SKIP_MARGIN
+        fastest = MAX_SPEED * self.step * self.cells
+        return i + np.maximum(np.floor(free / fastest), 0).astype(np.int32) + 1
+
+    def way(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
+        return self._way(ray, *self._turned_to_sample(ray, i))
+
+    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        return self._on_grid(ray, *self._turned(ray, np.cos(s), np.sin(s)))
+
+    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        cos, sin = self._turned(ray, np.cos(s), np.sin(s))
+        return self.t_nearest[ray] + self.width[ray] * sin / np.maximum(cos, MIN_COS)
+
+    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        return self._way(ray, *self._turned(ray, np.cos(s), np.sin(s)))
+
+    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
+        cos, sin = self._turned(ray, np.cos(s), np.sin(s))
+        return pull_back(gradients, self._direction(ray, cos, sin), cos)
+
+    def _turned_to_sample(self, ray: np.ndarray, i: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """cos and sin of phi at samples."""
+        _, cos_s, sin_s = self.table.take(i, axis=1, mode="clip")
+        return self._turned(ray, cos_s, sin_s)
+
+    def _turned(self, ray: np.ndarray, cos_s: np.ndarray, sin_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """cos and sin of phi, from those of s."""
         cos, sin = self.cos[ray], self.sin[ray]
         return cos * cos_s - sin * sin_s, sin * cos_s + cos * sin_s
 
-    def directions(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-        """v [3, n_places]: the places are v / cos, model frame."""
+    def _direction(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """v [3, ...]: the places are v / cos, model frame."""
         return cos * self.nearest[:, ray] + sin * self.along[:, ray]
 
-    def on_grid(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-        """Grid coordinates [3, n_places] (cells) of places."""
-        v = self.directions(ray, cos, sin)
+    def _on_grid(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """Grid coordinates [3, ...] (cells) of places."""
+        v = self._direction(ray, cos, sin)
         scale = contraction_scale(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cos) * self.cells
         return v * scale + self.cells * np.float32(2)
 
-    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Grid coordinates [3, n_places] at the places `s` on the rays `ray`."""
-        return self.on_grid(ray, *self.turned(ray, s))
-
-    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """t [n_places], model units."""
-        cos, sin = self.turned(ray, s)
-        return self.t_nearest[ray] + self.width[ray] * sin / np.maximum(cos, MIN_COS)
-
-    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Gradients [3, n_places] with respect to contracted coordinates, as such with respect to the
-        model's."""
-        cos, sin = self.turned(ray, s)
-        return pull_back(gradients, self.directions(ray, cos, sin), cos)
-
-    def ways(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-        """Model units [n_places] that samples at places stand for."""
+    def _way(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
+        """Model units that samples at places stand for."""
         half = self.step * np.float32(0.5)
         a, b = cos * np.cos(half), sin * np.sin(half)
         return self.width[ray] * np.sin(self.step) / (np.maximum(a + b, MIN_COS) * np.maximum(a - b, MIN_COS))
 
-    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Model units [n_places] that the samples at the places `s` on the rays `ray` stand for."""
-        return self.ways(ray, *self.turned(ray, s))
 
-
-def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> ContractedRays:
+def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> ContractedPath:
     """Rays [n, 3] (model frame, unit directions) from where they begin, `grid.near` from their origins, to
     where they end."""
     o, d = rays_o.astype(np.float64), rays_d.astype(np.float64)
@@ -109,7 +126,7 @@ def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Con
     nearest = o + t_nearest[:, None] * d
     width = np.maximum(1.0, np.linalg.norm(nearest, axis=-1))
     start = np.arctan2(grid.near - t_nearest, width)
-    return ContractedRays(
+    return ContractedPath(
         nearest=np.ascontiguousarray(nearest.T, np.float32),
         along=np.ascontiguousarray((width[:, None] * d).T, np.float32),
         t_nearest=t_nearest.astype(np.float32),
@@ -119,17 +136,19 @@ def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Con
         length=(np.arccos(float(MIN_COS)) - start).astype(np.float32),
         cells=grid.cells_per_unit[0],
         step=grid.step,
+        table=lattice(float(grid.step)),
     )
 
 
 @lru_cache(maxsize=4)
 def lattice(step: float) -> np.ndarray:
-    """[3, n] float32: s_n and its cos and sin, for all samples that a ray can have and SPARE more.
+    """s_n and its cos and sin [3, n_samples] float32, for all samples that a ray can have and one more, which
+    is behind the end of every ray.
 
-    >>> lattice(1.0)[0, :4].tolist()
-    [0.5, 1.5, 2.5, 3.5]
+    >>> lattice(1.0)[0].tolist()
+    [0.5, 1.5, 2.5, 3.5, 4.5]
     """
-    s = (np.arange(int(np.pi / step) + 1 + SPARE) + 0.5).astype(np.float32) * np.float32(step)
+    s = (np.arange(int(np.pi / step) + 2) + 0.5).astype(np.float32) * np.float32(step)
     found = np.stack([s, np.cos(s.astype(np.float64)), np.sin(s.astype(np.float64))]).astype(np.float32)
     found.flags.writeable = False  # it is shared
     return found

@@ -13,11 +13,12 @@ MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of equal
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import SparseGrid
+from player.asset.grid import SparseGrid, brick_number, corner_number
+from player.march.path import Path
 
 MIN_TOTAL = np.float32(1e-3)
 """Least share of stored corners with which a place counts as stored."""
@@ -26,35 +27,14 @@ BLOCK = 4096
 """Fetches at a time: what they gather stays in the second-level cache."""
 
 
-class Places(Protocol):
-    """Rays in grid coordinates: `player.march.box.Entries`, `player.march.contracted.ContractedRays`."""
-
-    def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Grid coordinates [3, n_places] at the places `s` [n_places] on the rays `ray` [n_places]."""
-        ...
-
-    def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """t [n_places] of these places, model units."""
-        ...
-
-    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Model units [n_places] that samples at these places stand for."""
-        ...
-
-    def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Gradients [3, n_places] at these places with respect to the grid's axes (model units), as such with
-        respect to the model frame's."""
-        ...
-
-
 class Samples(NamedTuple):
     """Samples with weight, grouped by ray, in the order of the march."""
 
     ray: np.ndarray
     """[n_samples] int64."""
     s: np.ndarray
-    """[n_samples] float32, distance from the entry into the box, model units; in contracted space an
-    angle."""
+    """[n_samples] places on the rays: in a box distances from the entry, model units; in contracted space
+    angles."""
     weights: np.ndarray
     """[n_samples] float32."""
 
@@ -79,13 +59,13 @@ class Bins(NamedTuple):
 
 
 def fetch_features(
-    grid: SparseGrid, entries: Places, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
+    grid: SparseGrid, path: Path, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
 ) -> np.ndarray:
     """Sum of weight times feature over the fetches of each ray in `hits`: [n_hits, n_channels] float32.
 
     Args:
         grid: the sparse grid.
-        entries: all rays where they enter the box.
+        path: the path of all rays.
         samples: all samples with weight.
         opacity: [n] float32 of all rays.
         hits: [n_hits] rays to fetch for, ascending.
@@ -98,15 +78,15 @@ def fetch_features(
     wanted = rows[samples.ray] >= 0
     merged = wanted & (counts[samples.ray] > k) if k else np.zeros(len(wanted), bool)
     own = Samples(*(column[wanted & ~merged] for column in samples))
-    _add(grid, entries, own, rows, out)
+    _add(grid, path, own, rows, out)
     if merged.any():
         samples = Samples(*(column[merged] for column in samples))
         bins = equal_mass_bins(samples, k)
         weights = opacity[bins.ray] / np.float32(k)
-        gaps = _add(grid, entries, Samples(bins.ray, bins.s, weights), rows, out)
+        gaps = _add(grid, path, Samples(bins.ray, bins.s, weights), rows, out)
         if len(gaps):
             s = samples.s[heaviest(bins, gaps)]
-            _add(grid, entries, Samples(bins.ray[gaps], s, weights[gaps]), rows, out)
+            _add(grid, path, Samples(bins.ray[gaps], s, weights[gaps]), rows, out)
     return out
 
 
@@ -177,9 +157,7 @@ def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
     return index[candidates[place]]
 
 
-def _add(
-    grid: SparseGrid, entries: Places, fetches: Samples, rows: np.ndarray, out: np.ndarray
-) -> np.ndarray:
+def _add(grid: SparseGrid, path: Path, fetches: Samples, rows: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Add each fetch to the row of its ray; returns the indices of those where too little is stored."""
     gaps = []
     firsts = np.flatnonzero(np.diff(fetches.ray, prepend=-1))
@@ -189,7 +167,7 @@ def _add(
     edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
     for start, stop in itertools.pairwise(edges):
         ray, s, weights = (column[start:stop] for column in fetches)
-        values, total = stored_features(grid, entries.at(ray, s))
+        values, total = stored_features(grid, path.at(ray, s))
         poor = total < MIN_TOTAL
         scale = np.where(poor, np.float32(0), weights / np.where(poor, np.float32(1), total))
         values *= scale[:, None]
@@ -206,10 +184,8 @@ def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.nda
     g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
     low = np.minimum(g.astype(np.int32), vertices.resolution - 1)
     fraction = g - low.astype(np.float32)
-    n = vertices.n_per_axis
-    held = vertices.bricks.take(((low[0] >> 3) * n + (low[1] >> 3)) * n + (low[2] >> 3))
-    lx, ly, lz = (low & 7).astype(np.int64)
-    at = np.maximum(held, 0) * np.int64(729) + lx * 81 + ly * 9 + lz
+    held = vertices.bricks.take(brick_number(low, vertices.n_per_axis))
+    at = corner_number(held, low)
     share = [(np.float32(1) - side, side) for side in fraction]
     values = np.zeros((g.shape[1], grid.n_channels), np.float32)
     total = np.zeros(g.shape[1], np.float32)

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.asset.grid import SparseGrid
-from player.march.marches import sampled_rays
+from player.asset.grid import SparseGrid, corner_number
+from player.march.march import sample_rays
 
 
 def composited_normals(
@@ -32,9 +32,9 @@ def composited_normals(
     Returns:
         normals: [n, 3] float32, of unit length; 0 where no sample has weight or the gradients cancel.
     """
-    places, samples, _ = sampled_rays(grid, rays_o, rays_d, bounds)
-    slopes = code_gradient(grid, places.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
-    slopes = places.pulled_back(slopes, samples.ray, samples.s)
+    path, samples, _, _ = sample_rays(grid, rays_o, rays_d, bounds)
+    slopes = code_gradient(grid, path.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
+    slopes = path.pulled_back(slopes, samples.ray, samples.s)
     weights = samples.weights.astype(np.float64)
     normals = np.stack([-np.bincount(samples.ray, weights * slope, len(rays_o)) for slope in slopes], axis=-1)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -46,13 +46,9 @@ def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
 
     `g` [3, n] float32: grid coordinates (cells), each in a live cell, as samples of the march are.
     """
-    cell = np.clip(g.astype(np.int32), 0, grid.resolution - 1)
-    fraction = (g - cell).astype(np.float32)
-    n = np.int32(grid.n_per_axis)
-    brick = cell >> 3
-    slot = grid.table.take((brick[0] * n + brick[1]) * n + brick[2]).astype(np.int64)
-    local = cell & 7
-    at = np.maximum(slot, 0) * 729 + local[0] * 81 + local[1] * 9 + local[2]
+    cells = grid.cells(g)
+    fraction = (g - cells).astype(np.float32)
+    at = corner_number(grid.slots(cells), cells)
     share = [(1 - fraction[axis], fraction[axis]) for axis in range(3)]
     slopes = np.zeros((3, g.shape[1]), np.float32)
     for x, y, z in np.ndindex(2, 2, 2):

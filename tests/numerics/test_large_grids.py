@@ -7,7 +7,6 @@ long.
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,13 +14,11 @@ import pytest
 
 from player.asset.asset import GridArrays
 from player.asset.bricks import bricks_per_axis
-from player.asset.grid import SPARE, SparseGrid
+from player.asset.grid import SPARE, SparseGrid, VertexRows
 from player.asset.manifest import MAX_RESOLUTION, Manifest
-from player.asset.vertex_rows import VertexRows
-from player.compiled import contracted_march as contracted_march_compiled
 from player.compiled import march as march_compiled
 from player.errors import FormatError
-from player.march import contracted_march, march
+from player.march import march
 from player.march.contracted import MAX_SPEED
 from player.march.fetches import MIN_TOTAL, stored_features
 from tests.player.march.test_contracted_march import some_rays
@@ -104,17 +101,13 @@ SIZES = pytest.mark.parametrize(
 
 @SIZES
 @pytest.mark.parametrize("k", [0, 3])
-@pytest.mark.parametrize(
-    ("compiled", "plain"),
-    [(march_compiled, march), (contracted_march_compiled, contracted_march)],
-    ids=["box", "space"],
-)
-def test_compiled_marches_reach_the_last_slot(
-    compiled: ModuleType, plain: ModuleType, k: int, n_slots: int, n_rows: int, zeros: Zeros
+@pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
+def test_the_compiled_march_reaches_the_last_slot(
+    contracted: bool, k: int, n_slots: int, n_rows: int, zeros: Zeros
 ) -> None:
-    grid = grid_behind(zeros, n_slots, n_rows, contracted=plain is contracted_march)
+    grid = grid_behind(zeros, n_slots, n_rows, contracted)
     rays = some_rays(40) if grid.contracted else random_rays(40)
-    got, expected = compiled.march(grid, *rays, k), plain.march(grid, *rays, k)
+    got, expected = march_compiled.march(grid, *rays, k), march.march(grid, *rays, k)
     assert len(expected.hits) > 20 and np.abs(expected.features).max() > 20
     np.testing.assert_array_equal(got.n_density_samples, expected.n_density_samples)
     np.testing.assert_array_equal(got.hits, expected.hits)
@@ -124,13 +117,13 @@ def test_compiled_marches_reach_the_last_slot(
 
 
 @pytest.mark.parametrize("n_fetches", [2**31, 10**30])
-@pytest.mark.parametrize("module", [march_compiled, contracted_march_compiled], ids=["box", "space"])
-def test_no_number_of_fetches_is_too_large(module: ModuleType, n_fetches: int, zeros: Zeros) -> None:
+@pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
+def test_no_number_of_fetches_is_too_large(contracted: bool, n_fetches: int, zeros: Zeros) -> None:
     """Nothing is allocated or addressed by it beyond the samples that a ray can have."""
-    grid = grid_behind(zeros, 8, 5000, contracted=module is contracted_march_compiled)
+    grid = grid_behind(zeros, 8, 5000, contracted)
     rays = some_rays(40) if grid.contracted else random_rays(40)
     np.testing.assert_array_equal(
-        module.march(grid, *rays, n_fetches).features, module.march(grid, *rays, 0).features
+        march_compiled.march(grid, *rays, n_fetches).features, march_compiled.march(grid, *rays, 0).features
     )
 
 

@@ -4,6 +4,7 @@ bound that is computed and counted."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from fractions import Fraction
 from types import ModuleType
 
@@ -17,7 +18,7 @@ from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
 from player.errors import FormatError
 from player.march import march
-from player.march.box import enter_box
+from player.march.box import BoxPath, enter_box
 from tests.numerics.fog import fog
 from tests.player.conftest import look_at
 
@@ -152,14 +153,18 @@ def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: Mod
 def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """Counted: each round moves every ray on by one place at least."""
     rounds = 0
-    locate = march._locate
 
-    def counting(*arguments: object) -> object:
-        nonlocal rounds
-        rounds += 1
-        return locate(*arguments)  # type: ignore[arg-type]
+    def counted(function: Callable[..., object]) -> Callable[..., object]:
+        def counting(*arguments: object) -> object:
+            nonlocal rounds
+            rounds += 1
+            return function(*arguments)
 
-    monkeypatch.setattr(march, "_locate", counting)
+        return counting
+
+    # in a round the only ray either jumps or takes a chunk
+    monkeypatch.setattr(BoxPath, "jump", counted(BoxPath.jump))
+    monkeypatch.setattr(march, "_take_chunk", counted(march._take_chunk))
     rays = [np.float32([row]) for row in NAMED["from a corner, inwards"]]
     for size in (1.0, 1e-20, 1e-3):
         rounds = 0

@@ -16,13 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import SparseGrid
-from player.asset.vertex_rows import VertexRows
+from player.asset.grid import SparseGrid, VertexRows
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
-from player.march.march import MIN_OPACITY, MarchResult
-from player.march.marches import sampled_rays
+from player.march.march import MIN_OPACITY, MarchResult, sample_rays
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.kernels.stored_features import compose, corner_rows
@@ -210,7 +208,7 @@ class PlayerFetches(NamedTuple):
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
     `player.march.march` composes them with k = `n_fetches`."""
-    entries, samples, tau = sampled_rays(grid, rays_o, rays_d)
+    entries, samples, tau, _ = sample_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)

@@ -23,8 +23,7 @@ import torch
 from player.asset.asset import GridArrays
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
-from player.asset.grid import SparseGrid, build_grid
-from player.asset.vertex_rows import VertexRows, vertex_rows
+from player.asset.grid import SparseGrid, VertexRows, build_grid, vertex_rows
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.field.networks import Head
 from vfr_bake.training.model_file import Model

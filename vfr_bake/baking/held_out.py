@@ -177,7 +177,7 @@ class HeldOut:
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the rays compose as played."""
-        return choose_march("auto", grid.contracted)[1].march(grid, self.rays_o, self.rays_d, n_fetches)
+        return choose_march("auto")[1].march(grid, self.rays_o, self.rays_d, n_fetches)
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.march.marches import sampled_rays
+from player.march.march import sample_rays
 
 N_WORST = 10
 APART = 8
@@ -74,8 +74,8 @@ def _ray(asset: Asset, camera: Camera, x: int, y: int) -> tuple[int, float, tupl
     """Samples with weight, opacity, and the heaviest samples of one pixel's ray."""
     index = y * camera.width + x
     rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays(index, index + 1)
-    places, samples, tau = sampled_rays(asset.grid, rays_o, rays_d)
+    path, samples, tau, _ = sample_rays(asset.grid, rays_o, rays_d)
     heaviest = np.argsort(-samples.weights, kind="stable")[:N_WEIGHTS]
-    t = places.distances(samples.ray[heaviest], samples.s[heaviest]) * asset.scale
+    t = path.distances(samples.ray[heaviest], samples.s[heaviest]) * asset.scale
     weights = tuple(zip(t.tolist(), samples.weights[heaviest].tolist(), strict=True))
     return len(samples.s), float(-np.expm1(-tau[0])), weights

@@ -20,8 +20,7 @@ from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.volume import Volume, _slope, asset_volume
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
-from player.asset.grid import build_grid
-from player.asset.vertex_rows import vertex_rows
+from player.asset.grid import build_grid, vertex_rows
 from player.errors import ConfigError, FormatError, ParityError, ShapeError
 from tests.exporters.formats import block
 from tests.player import conftest as shells

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from player.asset.asset import Asset
-from player.compiled import contracted_march as contracted_march_compiled
-from player.compiled import march as march_compiled
-from player.compiled import scratch
+from player.compiled import march, scratch
 from player.compiled.compiling import compiled
 from player.compiled.scratch import check_scratch
 from tests.player.march.contracted_scene import contracted_grid
@@ -75,7 +73,7 @@ def arrays_in(argument: Any) -> Iterator[np.ndarray]:
 def test_a_march_looks_beside_every_array_that_it_writes(
     kind: str, asset: Asset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = march_compiled if kind == "box" else contracted_march_compiled
+    module: Any = march
     grid = asset.grid if kind == "box" else contracted_grid(bumps, lambda x: np.linalg.norm(x, axis=-1) < 4)
     rays = random_rays(40) if kind == "box" else some_rays(40)
     inner, handed = module._march_rays, []

@@ -10,7 +10,7 @@ import numpy as np
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, build_grid
-from player.march.contracted import MAX_SPEED, enter_space, lattice
+from player.march.contracted import MAX_SPEED, enter_space
 
 RESOLUTION = 48
 STEP = 4 / RESOLUTION / float(MAX_SPEED)
@@ -55,15 +55,11 @@ def naive(
 
     Every lattice sample is looked at. Which cell it is in is float32, as the format says, the rest float64.
     """
-    rays = enter_space(grid, ray_o[None], ray_d[None])
-    table = lattice(float(grid.step))
-    n = np.flatnonzero(table[0] < rays.length[0])
+    path = enter_space(grid, ray_o[None], ray_d[None])
+    n = np.flatnonzero(path.table[0] < path.length[0])
     ray = np.zeros(len(n), np.int64)
-    cos, sin = rays.lattice_turned(ray, table[1, n], table[2, n])
-    g = rays.on_grid(ray, cos, sin)
-    ways = rays.ways(ray, cos, sin)
     tau, taken, samples = 0.0, 0, []
-    for place, way, s in zip(g.T, ways, table[0, n], strict=True):
+    for place, way, s in zip(path.place(ray, n).T, path.way(ray, n), path.sample(n), strict=True):
         cell = np.clip(place.astype(np.int32), 0, RESOLUTION - 1)
         x, y, z = cell
         around = codes[x : x + 2, y : y + 2, z : z + 2]
@@ -83,7 +79,7 @@ def naive(
     if not total:
         return 0.0, 0.0, taken, np.zeros(4)
     mean = sum(s * weight for s, weight, _ in samples) / total
-    depth = float(rays.distances(np.zeros(1, np.int64), np.float32([mean]))[0])
+    depth = float(path.distances(np.zeros(1, np.int64), np.float32([mean]))[0])
     features = sum(weight * np.append(place * 4 - 96, 50) for _, weight, place in samples)
     return -np.expm1(-tau), depth, taken, np.asarray(features)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from player.asset.grid import SparseGrid, build_grid
-from player.march.contracted import MAX_SPEED, MIN_COS, ContractedRays, enter_space, lattice
+from player.march.contracted import MAX_SPEED, MIN_COS, ContractedPath, enter_space, lattice
 from player.march.contraction import contract, pull_back
 
 BOX = np.array([[-2.0] * 3, [2.0] * 3])
@@ -86,7 +86,7 @@ def rays_of_all_kinds() -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([rays_o, o]).astype(np.float32), np.concatenate([rays_d, d]).astype(np.float32)
 
 
-def places(step: float) -> tuple[np.ndarray, np.ndarray, ContractedRays, np.ndarray, np.ndarray]:
+def places(step: float) -> tuple[np.ndarray, np.ndarray, ContractedPath, np.ndarray, np.ndarray]:
     """Rays, and every lattice sample (ray, s) on them."""
     rays_o, rays_d = rays_of_all_kinds()
     rays = enter_space(empty_grid(512, step), rays_o, rays_d)

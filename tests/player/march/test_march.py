@@ -10,8 +10,7 @@ import pytest
 
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
-from player.asset.grid import SparseGrid, build_grid
-from player.asset.vertex_rows import vertex_rows
+from player.asset.grid import SparseGrid, build_grid, vertex_rows
 from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins, heaviest

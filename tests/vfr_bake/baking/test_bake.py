@@ -18,7 +18,7 @@ from exporters.formats.ply import read_ply
 from exporters.head.onnx_head import head_onnx
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
-from player.asset.vertex_rows import vertex_rows
+from player.asset.grid import vertex_rows
 from player.cameras.camera import orbit
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march.march import march

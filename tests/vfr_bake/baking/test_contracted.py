@@ -12,9 +12,9 @@ import torch
 from exporters.export import export_asset
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
-from player.asset.vertex_rows import vertex_rows
+from player.asset.grid import vertex_rows
 from player.cameras.camera import Camera
-from player.compiled import contracted_march as contracted_march_compiled
+from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
 from player.march.contraction import contract
 from player.render import render
@@ -159,7 +159,7 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
 def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: Path, k: int) -> None:
     grid = Asset.open(folder).grid
     rays_o, rays_d = model.model_cameras()[3].rays()
-    played = contracted_march_compiled.march(grid, rays_o, rays_d, k)
+    played = march_compiled.march(grid, rays_o, rays_d, k)
     nothing = np.zeros((len(rays_o), 3), np.float32)
     teacher_rays = TeacherRays(rays_o, rays_d, nothing, nothing, nothing[:, 0])
     arrays = Asset.open(folder).arrays

@@ -22,7 +22,7 @@ def test_they_are_those_of_a_grid_that_holds_them_all(model: Model, monkeypatch:
     every = evaluate_features(model, layout, np.eye(model.field.config.n_channels), quiet)
     grid = layout.grid(evaluate_densities(model, layout, quiet), np.zeros((len(every), 1), np.float32))
     rays_o, rays_d = model.model_cameras()[0].rays()
-    march = choose_march("numba", contracted=False)[1].march
+    march = choose_march("numba")[1].march
     wanted = march(replace(grid, features=every), rays_o, rays_d, 0)
     assert len(wanted.hits) > 100
     monkeypatch.setattr("vfr_bake.baking.distillation.FIELD_RAYS_AT_ONCE", len(wanted.hits) // 3)

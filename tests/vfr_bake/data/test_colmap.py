@@ -16,8 +16,8 @@ from player.cameras.colmap import read_cameras, read_images, read_points
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_scene
-from vfr_bake.data.folders import load_folder
 from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.folders import load_folder
 
 SIZE = 24
 LENSES = {

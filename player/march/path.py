@@ -1,0 +1,41 @@
+"""The path of rays through a grid: the one difference between an object's box and contracted space.
+
+A path holds n rays. On each lies a lattice of samples that depends on the ray alone, so that skipping what is
+empty never changes a picture; a place on a ray is a number s >= 0 that rises along it. A path has `first`
+[n], the first sample of each ray, `length` [n], the s at which each ray ends, and these methods, where `ray`
+are numbers of rays, `i` numbers of samples and `s` places, of shapes that broadcast:
+
+- `sample(i)`: s of samples.
+- `place(ray, i)`: [3, ...] grid coordinates (cells) of samples.
+- `jump(ray, i, g, brick, reach)`: [n] the sample to look at next, after sample i at g [3, n] in the brick
+  `brick` [3, n], where all bricks within `reach` [n] of that are empty.
+- `way(ray, i)`: the model units that samples stand for.
+- `at(ray, s)`: [3, n] grid coordinates of any places [n].
+- `distances(ray, s)`: [n] t of these, model units.
+- `lengths(ray, s)`: [n] the model units that samples there stand for.
+- `pulled_back(gradients, ray, s)`: [3, n] gradients along the grid's axes, per model unit, as gradients in
+  the model frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+from player.march.box import BoxPath, enter_box
+from player.march.contracted import ContractedPath, enter_space
+
+Path = BoxPath | ContractedPath
+
+
+def path_of(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Path:
+    """The path of rays through a grid of either kind; the arguments are those of `enter_box`. Contracted
+    space has nothing around it that bounds could leave out, and takes none."""
+    if grid.contracted:
+        return enter_space(grid, rays_o, rays_d)
+    return enter_box(grid, rays_o, rays_d, bounds)
