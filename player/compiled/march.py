@@ -233,7 +233,7 @@ def _take_hits(start, work, found, n_hits):
         if work.sums[N_WEIGHTS, lane] == F32(0.0):
             continue
         found.depth[ray] = work.sums[DEPTH, lane]
-        found.opacity[ray] = _opacity_of(work.sums[TAU, lane])
+        found.opacity[ray] = opacity_of(work.sums[TAU, lane])
         if found.opacity[ray] > MIN_OPACITY:
             work.masses[lane], work.into[lane] = found.opacity[ray], n_hits
             found.hits[n_hits] = ray
@@ -242,7 +242,7 @@ def _take_hits(start, work, found, n_hits):
 
 
 @inlined
-def _opacity_of(tau):
+def opacity_of(tau):
     """1 - exp(-tau) to float32 rounding: the difference in float64, or the series where that would cancel."""
     if tau < F32(1e-5):
         return tau - F32(0.5) * tau * tau

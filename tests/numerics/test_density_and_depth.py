@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from player.compiled import grid as grid_compiled
 from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins
@@ -161,7 +160,7 @@ def test_a_nan_pre_activation_stays_one() -> None:
 
 @pytest.mark.parametrize("tau", [0.0, 1e-45, 1e-38, 1e-20, 1e-8, 9.99e-6, 1e-5, 1.01e-5, 1e-3, 0.5, 6.9, 1e6])
 def test_the_players_opacity_is_that_of_50_digits(tau: float) -> None:
-    ours = float(grid_compiled.opacity_of(np.float32(tau)))
+    ours = float(march_compiled.opacity_of(np.float32(tau)))
     wanted = -mpmath.expm1(-mpmath.mpf(float(np.float32(tau))))
     assert abs(mpmath.mpf(ours) - wanted) <= 2**-23 * float(wanted) + 2e-45
     assert 0 <= ours <= 1
