@@ -24,11 +24,12 @@ from player.asset.asset import Asset
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera
 from player.errors import ConfigError, MissingExtraError
+from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.bounds import BLOCK, block_bounds
 from player.march.march import MarchResult
 from player.march.normals import composited_normals
-from player.march.pixels import pixels_of_blocks, rays_of_pixels, write_pixels
+from player.march.pixels import Planes, pixels_of_blocks, rays_of_pixels, write_pixels
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
@@ -89,12 +90,8 @@ class Frame:
     def to_uint8(self) -> np.ndarray:
         """[h, w, 3], or [h, w, 4] with straight alpha if transparent; values rounded to the nearest level."""
         if self.background == "transparent":
-            return _to_bytes(np.concatenate([self.rgb, self.opacity[..., None]], axis=-1))
-        return _to_bytes(self.rgb)
-
-
-def _to_bytes(values: np.ndarray) -> np.ndarray:
-    return np.floor(np.clip(values, 0, 1) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+            return to_8_bit(np.concatenate([self.rgb, self.opacity[..., None]], axis=-1))
+        return to_8_bit(self.rgb)
 
 
 def default_threads() -> int:
@@ -223,12 +220,13 @@ class Renderer:
             normals[index] = self._normals(rays_o, rays_d, bounds)
         rgb = self._head(result.features, rays_d[result.hits])
         self._write_pixels(
-            (frame.rgb, frame.opacity, frame.depth, frame.n_density_samples),
+            Planes(frame.rgb, frame.opacity, frame.depth, frame.n_density_samples),
             index,
             result,
             rgb,
             None if frame.background == "transparent" else frame.background,
-            (view.start, self.asset.scale),
+            view.start,
+            self.asset.scale,
         )
 
 
@@ -263,8 +261,8 @@ class _View(NamedTuple):
     def rays(
         self, blocks: np.ndarray, directions: Callable[..., np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bounds]:
-        """Of the pixels in some blocks: their index in the picture, origins, directions and bounds;
-        `directions` may be a faster way to find the third."""
+        """Each pixel's index in the picture, origin, direction and bounds, for the pixels in some blocks;
+        `directions` may be a faster way to find directions."""
         columns, rows, owner = pixels_of_blocks(self.camera, blocks, self.near.shape[1])
         if directions is None or self.start:
             rays_o, rays_d = rays_of_pixels(self.camera, columns, rows, self.start)

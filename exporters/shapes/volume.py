@@ -22,6 +22,7 @@ from player.asset.bricks import unpack_vertices
 from player.asset.density import decode_density
 from player.asset.grid import SparseGrid, VertexRows, vertex_rows
 from player.errors import ShapeError
+from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.fetches import MIN_TOTAL, stored_features
 from player.render import default_threads
@@ -132,7 +133,7 @@ def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
         dirs = _slope(grid, rows, codes, index[some])
         values, total = stored_features(grid, index[some].T.astype(np.float32))
         rgb = head(values / np.maximum(total, MIN_TOTAL)[:, None], dirs)
-        return np.floor(np.clip(np.nan_to_num(rgb), 0, 1) * 255 + 0.5).astype(np.uint8)
+        return to_8_bit(np.nan_to_num(rgb))
 
     with ThreadPoolExecutor(default_threads()) as pool:
         parts = list(pool.map(part, range(0, len(index), _ROWS)))

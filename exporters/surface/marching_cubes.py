@@ -23,7 +23,7 @@ import numpy as np
 from exporters.extras import needs
 from exporters.progress import silent
 from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
-from player.asset.grid import SparseGrid
+from player.asset.grid import SparseGrid, corner_number
 from player.errors import ConfigError, DataError
 
 BLOCK = 64
@@ -120,16 +120,11 @@ def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int =
 def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The interpolated code [n] at points [n, 3] (grid coordinates), its gradient [n, 3] in codes a voxel,
     and whether the point is in a live cell [n] bool: elsewhere both are 0."""
-    cell = np.clip(np.floor(g).astype(np.int64), 0, grid.resolution - 1)
-    brick, local = cell >> 3, cell & 7
-    n = grid.n_per_axis
-    slot = grid.table.take((brick[:, 0] * n + brick[:, 1]) * n + brick[:, 2]).astype(np.int64)
-    inside = np.all((g >= 0) & (g <= grid.resolution), axis=-1)
-    held = np.maximum(slot, 0)
-    bits = grid.live.take(held * 64 + local[:, 0] * 8 + local[:, 1])
-    known = inside & (slot >= 0) & ((bits >> local[:, 2].astype(np.uint8)) & 1).astype(bool)
-    at = held * 729 + local[:, 0] * 81 + local[:, 1] * 9 + local[:, 2]
-    fraction = g - cell
+    cells = grid.cells(g.T)
+    slots = grid.slots(cells)
+    known = np.all((g >= 0) & (g <= grid.resolution), axis=-1) & grid.are_live(slots, cells)
+    at = corner_number(slots, cells)
+    fraction = g - cells.T
     share = [(1 - fraction[:, axis], fraction[:, axis]) for axis in range(3)]
     codes, slopes = np.zeros(len(g)), np.zeros((len(g), 3))
     for x, y, z in np.ndindex(2, 2, 2):

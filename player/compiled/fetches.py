@@ -119,7 +119,7 @@ chosen [3, k, LANES] float32): rows of `chosen` that were written.
 
 `samples` and `sums` are what a march of `player.compiled.packets` has found, `mass` the opacity of each ray,
 0 where nothing is to be fetched. Into `chosen` go s and weight of each fetch, and another s, where to fetch
-if little is stored at the first, not a number for none. A ray with fewer fetches than others has weight 0
+if little is stored at the first, NaN for none. A ray with fewer fetches than others has weight 0
 there. k is at least 1; of every sample, `samples` are the fetches as they are.
 """
 
@@ -181,5 +181,5 @@ shares [9, LANES] float32): the greatest of the rows.
 
 The corners around LANES places, cells of the densities' grid: their rows, and their shares of the weights.
 Of what is not stored the share is 0, and the row. Behind the shares there is how much of the interpolation
-is stored: where that is 0, shares are not numbers.
+is stored: where that is 0, shares are NaN.
 """

@@ -145,11 +145,11 @@ class Lanes:
         return self._new(low), self._new(high)
 
     def as_float(self) -> Lanes:
-        """The same bits."""
+        """The same bits, taken for float32."""
         return self._new(self.b.bitcast(self.value, vector(FLOAT)))
 
     def exp(self) -> Lanes:
-        """To 2e-7 of it; 0 below, infinite above what float32 holds; of no number, none."""
+        """exp, to a relative 2e-7; 0 below what float32 holds and infinite above it; NaN of NaN."""
         y = choose(self < -104, self.like(-104), self)
         y = choose(y > 89, y.like(89), y)
         power = (y * np.log2(np.e)).call("rint")
@@ -165,7 +165,7 @@ class Lanes:
         return total
 
     def greatest(self) -> Any:
-        """Of the lanes, an int32."""
+        """The greatest of the lanes, one int32."""
         kind = ir.FunctionType(INT, [vector(INT)])
         name = f"llvm.vector.reduce.smax.v{LANES}i32"
         return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), [self.value])

@@ -14,6 +14,7 @@ from player.cameras.camera import Camera
 from player.compiled.compiling import compiled
 from player.compiled.scratch import check_scratch, scratch
 from player.march.march import MarchResult
+from player.march.pixels import Planes
 
 F32 = np.float32
 
@@ -28,18 +29,18 @@ def directions(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> np.ndar
 
 
 def write_pixels(
-    frame: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    planes: Planes,
     index: np.ndarray,
     result: MarchResult,
     rgb: np.ndarray,
     behind: tuple[float, float, float] | None,
-    depth_from: tuple[float, float],
+    start: float,
+    scale: float,
 ) -> None:
     """As `player.march.pixels.write_pixels`."""
-    start, scale = depth_from
     colour = (0.0, 0.0, 0.0) if behind is None else behind
     _write(
-        frame, index, (result.opacity, result.depth, result.n_density_samples), result.hits, rgb,
+        planes, index, result.opacity, result.depth, result.n_density_samples, result.hits, rgb,
         np.array(colour, F32), behind is None, F32(start), F32(scale),
     )  # fmt: skip
 
@@ -60,21 +61,19 @@ def _directions(columns, rows, lens, rotation, rays_d):
 
 
 @compiled
-def _write(frame, index, found, hits, rgb, behind, transparent, start, scale):
-    to_rgb, to_opacity, to_depth, to_samples = frame
-    opacity, depth, n_density_samples = found
+def _write(planes, index, opacity, depth, n_density_samples, hits, rgb, behind, transparent, start, scale):
     hit = 0
     for ray in range(len(index)):
         pixel = index[ray]
-        to_opacity[pixel] = opacity[ray]
-        to_depth[pixel] = (depth[ray] + start) * scale if depth[ray] > F32(0.0) else F32(0.0)
-        to_samples[pixel] = n_density_samples[ray]
+        planes.opacity[pixel] = opacity[ray]
+        planes.depth[pixel] = (depth[ray] + start) * scale if depth[ray] > F32(0.0) else F32(0.0)
+        planes.n_density_samples[pixel] = n_density_samples[ray]
         shaded = hit < len(hits) and hits[hit] == ray
         for c in range(3):
             if not transparent:
                 colour = (F32(1.0) - opacity[ray]) * behind[c]
-                to_rgb[pixel, c] = colour + rgb[hit, c] * opacity[ray] if shaded else colour
+                planes.rgb[pixel, c] = colour + rgb[hit, c] * opacity[ray] if shaded else colour
             elif shaded:
-                to_rgb[pixel, c] = rgb[hit, c]
+                planes.rgb[pixel, c] = rgb[hit, c]
         if shaded:
             hit += 1

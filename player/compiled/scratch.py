@@ -22,7 +22,7 @@ ROOM = 4096
 CANARY = 0xA5
 """What a canary is made of: no number that a march writes by itself."""
 NOTHING = 0xFF
-"""What an array without a value is made of while there are canaries: not a number, or -1."""
+"""What an array without a value is made of while there are canaries: NaN, or -1."""
 
 
 def scratch(shape: int | tuple[int, ...], dtype: DTypeLike, fill: Any = None) -> np.ndarray:

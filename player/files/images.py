@@ -1,4 +1,4 @@
-"""Pictures to PNG and WebP files, which remember what they show."""
+"""Pictures in 8 bits, and PNG and WebP files of them, which remember what they show."""
 
 from __future__ import annotations
 
@@ -18,6 +18,15 @@ if TYPE_CHECKING:
 
 KEY = "vfr-play"
 """Name of the entry in a picture's metadata that says what was rendered (`player.app.frame_files`)."""
+
+
+def to_8_bit(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] as uint8, rounded to nearest; others are clipped.
+
+    >>> to_8_bit(np.array([0.0, 0.5, 1.0, 7.0])).tolist()
+    [0, 128, 255, 255]
+    """
+    return np.floor(np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def png_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:

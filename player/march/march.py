@@ -31,9 +31,11 @@ from player.asset.grid import SparseGrid, corner_number
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
 
-MAX_TAU = np.float32(-np.log(1e-3))
-"""The march stops behind this optical depth, where a thousandth of the light is left: a quarter of an 8-bit
+OPAQUE_DEPTH = float(-np.log(1e-3))
+"""The optical depth at which a ray stops, where a thousandth of the light is left: a quarter of an 8-bit
 level."""
+MAX_TAU = np.float32(OPAQUE_DEPTH)
+"""OPAQUE_DEPTH as marches compare it."""
 
 MIN_OPACITY = np.float32(1 / 512)
 """Rays below this opacity are not shaded: they could not change an 8-bit value by more than half a

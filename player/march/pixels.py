@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from player.cameras.camera import Camera
@@ -44,33 +46,46 @@ def rays_of_pixels(
     return np.broadcast_to(camera.c2w[:3, 3].astype(np.float32), rays_d.shape), rays_d
 
 
+class Planes(NamedTuple):
+    """What is written of the n pixels of a picture."""
+
+    rgb: np.ndarray
+    """[n, 3] float32."""
+    opacity: np.ndarray
+    """[n] float32."""
+    depth: np.ndarray
+    """[n] float32, world units."""
+    n_density_samples: np.ndarray
+    """[n] int32."""
+
+
 def write_pixels(
-    frame: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    planes: Planes,
     index: np.ndarray,
     result: MarchResult,
     rgb: np.ndarray,
     behind: tuple[float, float, float] | None,
-    depth_from: tuple[float, float],
+    start: float,
+    scale: float,
 ) -> None:
     """Write what the march and the head have found for some pixels.
 
     Args:
-        frame: rgb [n, 3], opacity, depth and number of samples [n] of the whole picture.
+        planes: of the whole picture.
         index: [n_rays] which pixels.
         result: of the march.
         rgb: [n_hits, 3] the head's colours.
         behind: the background's colour; None leaves colours as the head gives them.
-        depth_from: way before the rays' origins, model units, and world units in a model unit.
+        start: distance from the camera to the rays' origins, model units.
+        scale: world units in a model unit.
     """
-    start, scale = depth_from
-    to_rgb, to_opacity, to_depth, to_samples = frame
     depth = result.depth if start == 0 else np.where(result.depth > 0, result.depth + np.float32(start), 0)
-    to_opacity[index] = result.opacity
-    to_depth[index] = depth * np.float32(scale)
-    to_samples[index] = result.n_density_samples
+    planes.opacity[index] = result.opacity
+    planes.depth[index] = depth * np.float32(scale)
+    planes.n_density_samples[index] = result.n_density_samples
     if behind is None:
-        to_rgb[index[result.hits]] = rgb
+        planes.rgb[index[result.hits]] = rgb
         return
     colours = (1 - result.opacity)[:, None] * np.asarray(behind, np.float32)
     colours[result.hits] += rgb * result.opacity[result.hits][:, None]
-    to_rgb[index] = colours
+    planes.rgb[index] = colours

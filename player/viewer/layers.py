@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from player.files.images import to_8_bit
 from player.render import Frame
 
 LAYERS = ("colour", "depth", "normals", "opacity", "samples")
@@ -34,7 +35,7 @@ def layer_picture(frame: Frame, layer: str) -> np.ndarray:
         values = np.where(met[..., None], frame.normals / 2 + 0.5, 0)
     else:
         values = coloured(frame.n_density_samples / max(float(frame.n_density_samples.max(initial=0)), 1.0))
-    return np.floor(np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return to_8_bit(values)
 
 
 def coloured(values: np.ndarray) -> np.ndarray:

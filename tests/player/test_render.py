@@ -211,8 +211,9 @@ def test_compiled_pixels_are_numpys(behind: tuple[float, float, float] | None, h
     result = MarchResult(opacity, depth.astype(np.float32), counts, np.array(hits, np.int64), none)
     frames = []
     for write in (pixels.write_pixels, pixels_compiled.write_pixels):
-        frame = (*(np.full(shape, 7, np.float32) for shape in ((6, 3), 6, 6)), np.full(6, 7, np.int32))
-        write(frame, np.array([5, 0, 3, 1, 2]), result, rgb.astype(np.float32), behind, (0.5, 2.0))
+        planes = (np.full(shape, 7, np.float32) for shape in ((6, 3), 6, 6))
+        frame = pixels.Planes(*planes, np.full(6, 7, np.int32))
+        write(frame, np.array([5, 0, 3, 1, 2]), result, rgb.astype(np.float32), behind, 0.5, 2.0)
         frames.append(frame)
     for a, b in zip(*frames, strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-7, atol=0)

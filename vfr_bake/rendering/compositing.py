@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from player.march.march import OPAQUE_DEPTH
 from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels import compositing as kernels
 
-OPAQUE_DEPTH = float(-np.log(1e-3))
-"""Optical depth at which a ray stops: what lies behind weighs less than 1e-3 in all."""
 LIMITS = (np.float32(LARGEST_LOGIT), np.float32(OPAQUE_DEPTH))
 """(largest log-density, OPAQUE_DEPTH) as the kernels take them."""
 

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from player.march.march import OPAQUE_DEPTH
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import march as kernels
-from vfr_bake.rendering.compositing import LIMITS, OPAQUE_DEPTH, Samples
+from vfr_bake.rendering.compositing import LIMITS, Samples
 
 if TYPE_CHECKING:
     from vfr_bake.rendering.occupancy import OccupancyGrid

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
+from player.march.march import OPAQUE_DEPTH
+from vfr_bake.rendering.compositing import Samples
 from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels.compositing import sums_before
 

@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from player.march.march import OPAQUE_DEPTH
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
+from vfr_bake.rendering.compositing import Samples
 from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid, ProposalSampler
 from vfr_bake.torch_kernels import fast

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from player.errors import MissingExtraError, ShapeError
+from player.files.images import to_8_bit
 
 SSIM_WINDOW = 11
 """Pixels: the width and height of SSIM's window, and so of the smallest picture that has one."""
@@ -40,15 +41,6 @@ class ViewScore:
     """Of the pictures before they are rounded to 8 bits."""
     lpips: float | None
     """Of 8-bit pictures; 0 where they are equal, None where it was not asked for."""
-
-
-def to_8_bit(rgb: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] as uint8, rounded to nearest.
-
-    >>> to_8_bit(np.array([0.0, 0.5, 1.0, 7.0])).tolist()
-    [0, 128, 255, 255]
-    """
-    return np.floor(np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
