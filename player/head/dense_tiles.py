@@ -6,7 +6,6 @@ and in 8 bits where the processor multiplies bytes. Compiled code alone imports 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -27,13 +26,17 @@ QUAD = 4
 MOST_BYTES = 256
 """Inputs of a layer in 8 bits, at most: bytes from a pixel to the next. A number that the compiler knows
 saves it a register for each row."""
+UNSCALED = -(1 << 40)
+"""A place of scales that says there are none, in every tile of a layer."""
 MULTIPLIES_BYTES = multiplies_bytes(QUAD * LANES)
 """Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
 """Its operands are words of QUAD bytes, as until LLVM 21; later ones take that for what they write."""
 
 
-def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: Any, depth: Any) -> Any:
+def _dense(
+    _: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, scale: Any, out: Any, depth: Any
+) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
@@ -45,55 +48,37 @@ def _dense(_: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, out: A
             at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
             for half in range(2):
                 sums.set(row, half, load(builder, first, builder.add(at, LONG(half * LANES))))
-        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
-        sums.write(here, _pair(builder, arguments[5]), lambda x, _: x)
+        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[7])
+        out, scale_at = _pair(builder, arguments[6]), arguments[5]
+        with builder.if_else(builder.icmp_signed(">=", scale_at, LONG(0))) as (scaled, unscaled):
+            with scaled:
+                sums.write(here, out, _scales(builder, there, scale_at))
+            with unscaled:
+                sums.write(here, out)
         return context.get_dummy_value()
 
-    two, three = types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
-    return types.void(memory, weights, two, two, three, two, types.int64), generate
+    long, two, three = types.int64, types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
+    return types.void(memory, weights, two, two, three, long, two, long), generate
 
 
 dense_tile: Any = intrinsic(_dense)
-"""dense_tile(memory, weights, x, w, start, out, depth): ROWS by WIDTH outputs of one layer.
+"""dense_tile(memory, weights, x, w, start, scale, out, depth): ROWS by WIDTH outputs of one layer.
 
-`memory` and `weights` are flat float32. x, w, out: (index of the first number, numbers from row to row), w in
-`weights`, the others in `memory`. start: the same, and whether it is in `memory` rather than in `weights`;
-what the sums begin with, a bias with 0 from row to row. depth: inputs of the layer.
-"""
+`memory` and `weights` are flat float32. `x`, `w` and `out` are (index of the first number, numbers from row
+to row), `w` in `weights`, the others in `memory`. `start`: the same of what the sums begin with, and whether
+that is in `memory` rather than in `weights`. `scale`: index in `weights` of WIDTH numbers that the sums are
+multiplied by, below 0 for none. `depth`: inputs of the layer.
 
-
-def _dense_codes(_: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, depth: Any) -> Any:
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
-        rows = [
-            [load(builder, there, builder.add(at, LONG(half * LANES))) for half in range(2)]
-            for at in _pair(builder, arguments[4])
-        ]
-        starts, scales = rows
-        sums = _Sums(builder, FLOAT)
-        for row in range(ROWS):
-            for half in range(2):
-                sums.set(row, half, starts[half])
-        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[6])
-        sums.write(here, _pair(builder, arguments[5]), lambda x, half: x * scales[half])
-        return context.get_dummy_value()
-
-    two = types.UniTuple(types.int64, 2)
-    return types.void(memory, weights, two, two, two, two, types.int64), generate
-
-
-dense_codes_tile: Any = intrinsic(_dense_codes)
-"""dense_codes_tile(memory, weights, x, w, places, out, depth): the same of 8-bit codes that are floats.
-
-Sums below 2^24 are then exact, as `dense_bytes_tile` has them. places: (first of what the sums begin with,
-first of what they are multiplied by), both in `weights`, the same for every row.
+Inputs and weights may be 8-bit codes that are floats: sums below 2^24 are then exact, as those of
+`dense_bytes_tile` are.
 """
 
 
 def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, Any], depth: Any) -> None:
-    """Add to `sums` the products of `depth` inputs of each row and their weights; x and w are (array, (index
-    of the first number, numbers from row to row))."""
+    """Add to `sums` the products of `depth` inputs of each row and their weights.
+
+    `x` and `w` are (array, (index of the first number, numbers from row to row)).
+    """
     x_rows = _rows(builder, x[0], *_pair(builder, x[1]))
     w_at, w_pitch = _pair(builder, w[1])
     with cgutils.for_range(builder, depth) as loop:
@@ -142,8 +127,7 @@ def _dense_bytes(
                 for half in range(2):
                     total = builder.call(dot, [sums.get(row, half).value, quad.value, columns[half].value])
                     sums.set(row, half, Lanes(builder, total))
-        halves = [load(builder, scales_there, builder.add(scale_at, LONG(half * LANES))) for half in range(2)]
-        sums.write(here, out, lambda x, half: x.to_float() * halves[half])
+        sums.write(here, out, _scales(builder, scales_there, scale_at))
         return context.get_dummy_value()
 
     long, two = types.int64, types.UniTuple(types.int64, 2)
@@ -151,13 +135,14 @@ def _dense_bytes(
 
 
 dense_bytes_tile: Any = intrinsic(_dense_bytes)
-"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): the same of 8-bit codes, where
-MULTIPLIES_BYTES.
+"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): ROWS by WIDTH outputs of a layer of
+8-bit codes. It computes nothing unless MULTIPLIES_BYTES.
 
-`codes` are flat uint8, `memory` flat float32. `weights`: int8 codes, QUAD inputs of one output beside each
-other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 steps of the sums.
-x: the first code of the first pixel, MOST_BYTES before the next one's; w: the first of the tile's codes;
-places: (first start, first step); out: in `memory`.
+`codes` are flat uint8, `memory` is flat float32. `weights` is (int8 codes: QUAD inputs of one output beside
+each other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 that they are
+multiplied by). `x`: index of the first code of the first pixel, MOST_BYTES before the next pixel's. `w`:
+index of the tile's first code of a weight. `places`: indices of (what the sums begin with, what they are
+multiplied by). `out`: (index of the first output in `memory`, numbers from row to row).
 """
 
 
@@ -180,7 +165,7 @@ The compiler does not do so by itself: it cannot know that the three do not over
 
 
 class _Sums:
-    """ROWS by two vectors that a loop adds to."""
+    """ROWS by two vectors of sums, which a loop adds to."""
 
     def __init__(self, builder: Any, element: Any) -> None:
         self._builder = builder
@@ -194,20 +179,29 @@ class _Sums:
     def set(self, row: int, half: int, value: Lanes) -> None:
         self._builder.store(value.value, self._places[row][half])
 
-    def write(self, array: Any, out: tuple[Any, Any], function: Callable[[Lanes, int], Lanes]) -> None:
-        """To `array`, a row at a time, what `function` makes of a sum and which half it is."""
+    def write(self, array: Any, out: tuple[Any, Any], scales: list[Lanes] | None = None) -> None:
+        """Write the sums to `array`, a row at a time, multiplied by the `scales` of the two halves of a row.
+
+        `out`: (index of the first number, numbers from row to row).
+        """
         at, pitch = out
         for row in range(ROWS):
             start = self._builder.add(at, self._builder.mul(pitch, LONG(row)))
             for half in range(2):
                 place = self._builder.add(start, LONG(half * LANES))
-                store(array, place, function(self.get(row, half), half))
+                total = self.get(row, half)
+                store(array, place, total if scales is None else total.to_float() * scales[half])
 
 
 def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
     return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
 
 
+def _scales(builder: Any, array: Any, at: Any) -> list[Lanes]:
+    """The two vectors of numbers from the index `at` on."""
+    return [load(builder, array, builder.add(at, LONG(half * LANES))) for half in range(2)]
+
+
 def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:
-    """Where each of ROWS rows begins."""
+    """Addresses of ROWS rows, the first at the index `at`."""
     return [builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)]

@@ -31,13 +31,20 @@ class Head:
     """
 
     def __init__(self, path: Path, n_channels: int, compiled: bool = False) -> None:
-        """Open the head; with `compiled`, numba runs it (`player.head.compiled`) instead of onnxruntime.
+        """Open the head.
 
-        Raises FormatError as `read_head_file` does.
+        Args:
+            path: the file of the head.
+            n_channels: features of a pixel.
+            compiled: numba runs the head if it is in 8 bits (`player.head.compiled`). onnxruntime runs any
+                other, and a head in float32 faster.
+
+        Raises:
+            FormatError: as `read_head_file`.
         """
         data, arrays = read_head_file(path, n_channels)
         self._path = path
-        self._run = _compile(arrays) if compiled else _open_session(data, arrays)
+        self._run = _compile(arrays) if compiled and arrays.form.in_8_bits else _open_session(data, arrays)
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         """Colours of n pixels.

@@ -1,36 +1,69 @@
-"""From the numbers of a head to a program: the instructions that `player.head.compiled` runs.
+"""From the numbers of a head in 8 bits to a program: the instructions that `player.head.compiled` runs.
 
-A value of the head is a table in memory of BLOCK pixels by its width, padded to whole tiles. All places and
-sizes follow from the widths that `player.head.graph` has checked. What is rounded to 8 bits is kept in bytes
-where the processor multiplies those (`player.head.dense_tiles`); elsewhere codes are kept as floats, whose
-sums of products are the same integers, added up more slowly.
+Every value of the head is a table in memory of BLOCK pixels by its width, padded to whole tiles. All places
+and sizes follow from the widths that `player.head.graph` has checked. What is rounded to 8 bits is kept in
+bytes where the processor multiplies those (`player.head.dense_tiles`). Elsewhere codes are kept as floats:
+sums of their products are the same integers, added up more slowly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from player.head.activations import GELU, LINEAR, SIGMOID
-from player.head.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, WIDTH
+from player.head.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED, WIDTH
 from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
 BLOCK = 4 * ROWS
 """Pixels at a time: all the numbers of a 64 wide head are then 300 kB."""
-DENSE, DENSE_CODES, DENSE_BYTES, MULTIPLY, MONOMIALS, QUANTIZE, ROUND = range(7)
+DENSE, DENSE_BYTES, MULTIPLY, MONOMIALS, QUANTIZE, ROUND = range(6)
+"""Kinds of steps."""
 
 
-@dataclass(frozen=True)
-class Value:
-    """A table of BLOCK pixels: its first number in memory, numbers from a pixel to the next, and how many of
-    them count. `in_bytes`: it is among the bytes, not the floats."""
+class Value(NamedTuple):
+    """A table of BLOCK pixels in memory."""
 
     place: int
+    """Index of its first number."""
     pitch: int
+    """Numbers from a pixel to the next."""
     width: int
+    """Numbers of a pixel that count; the others are padding."""
     in_bytes: bool = False
+    """Whether it is among the bytes, not the floats."""
+
+
+class Step(NamedTuple):
+    """One instruction: from the table at `x` to the table at `out`. Places are indices of first numbers."""
+
+    kind: int
+    x: int = 0
+    x_pitch: int = 0
+    depth: int = 0
+    """DENSE: inputs of the layer. DENSE_BYTES: QUADs of inputs."""
+    w: int = 0
+    """Place of the layer's weights."""
+    start: int = 0
+    """Place of what the layer's sums begin with."""
+    start_pitch: int = 0
+    """Numbers from that of a pixel to that of the next; 0 where all pixels begin alike."""
+    starts_in_memory: int = 0
+    """1 where the sums begin with a table in memory, 0 where with a bias among the weights."""
+    scale: int = 0
+    """Place of what the layer's sums are multiplied by, or UNSCALED. QUANTIZE, ROUND: of levels in a unit."""
+    zero: int = 0
+    """QUANTIZE, ROUND: the code of 0."""
+    out: int = 0
+    """MULTIPLY: place of the table that is multiplied by `x`."""
+    pitch: int = 0
+    activation: int = LINEAR
+
+
+STEP = np.dtype([(name, np.int64) for name in Step._fields])
+"""A `Step` as compiled code reads it."""
 
 
 @dataclass(frozen=True)
@@ -38,23 +71,26 @@ class Program:
     """Instructions, what they read, and where the head's inputs and its output are in memory."""
 
     steps: np.ndarray
-    """[n, 12] int64; what the numbers mean, `player.head.compiled` knows."""
+    """[n_steps] STEP."""
     weights: np.ndarray
+    """[n] float32 weights, biases and scales."""
     packed: np.ndarray
-    """int8 weights as `dense_bytes_tile` takes them."""
+    """[n] int8 weights as `dense_bytes_tile` takes them."""
     starts: np.ndarray
-    """int32 that its sums begin with."""
+    """[n] int32 that the sums of `dense_bytes_tile` begin with."""
     pairs: np.ndarray
-    """[n_monomials, 2] int64: of which monomial, -1 for 1, and which of x, y and z each is the product."""
+    """[n_monomials, 2] int64: the monomial, -1 for 1, and the axis, 0 to 2, that each is the product of."""
     n_floats: int
+    """Numbers of memory that the tables in floats take."""
     n_bytes: int
+    """Bytes that the tables in bytes take."""
     features: Value
     dirs: Value
     rgb: Value
 
 
 def program_of(head: HeadArrays, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
-    """The program of a head. `in_bytes`: whether the processor multiplies bytes."""
+    """The program of a head in 8 bits. `in_bytes`: whether the processor multiplies bytes."""
     return _Compiler(head, in_bytes).program()
 
 
@@ -66,27 +102,27 @@ class _Compiler:
         self._packed = _Constants(np.int8)
         self._starts = _Constants(np.int32)
         self._n_floats = self._n_bytes = 0
-        self._steps: list[tuple[int, ...]] = []
+        self._steps: list[Step] = []
 
     def program(self) -> Program:
         head = self._head
         features, dirs = self._floats(head.n_channels), self._floats(3)
-        roundings = iter(head.roundings)
         h = features
         for layer in head.spatial:
             h = self._dense(h, layer, GELU)
-        h, of_h = self._rounded(h, next(roundings, None))
-        encoded = self._dense(h, head.to_sh, rounding=of_h)
-        self._multiply(encoded, self._harmonics(dirs))
-        z = self._dense(h, head.bottleneck, rounding=of_h)
+        rounding, *roundings = head.roundings
+        h = self._rounded(h, rounding)
+        encoded = self._dense_rounded(h, head.to_sh, rounding)
+        harmonics = self._harmonics(dirs)
+        self._steps.append(Step(MULTIPLY, x=harmonics.place, out=encoded.place, pitch=encoded.pitch))
+        z = self._dense_rounded(h, head.bottleneck, rounding)
         z = self._dense(encoded, Layer(head.from_sh, np.zeros(0)), GELU, start=z)
-        for layer in head.directional:
-            z, of_z = self._rounded(z, next(roundings, None))
-            z = self._dense(z, layer, GELU, rounding=of_z)
+        for layer, rounding in zip(head.directional, roundings, strict=True):
+            z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, GELU)
         rgb = self._dense(z, head.output, SIGMOID)
         pairs = [pair for order in range(1, head.form.sh_degree) for pair in _pairs(order)]
         return Program(
-            np.array(self._steps, np.int64), self._weights.joined(), self._packed.joined(),
+            np.array(self._steps, STEP), self._weights.joined(), self._packed.joined(),
             self._starts.joined(), np.array(pairs, np.int64).reshape(-1, 2), self._n_floats, self._n_bytes,
             features, dirs, rgb,
         )  # fmt: skip
@@ -96,85 +132,76 @@ class _Compiler:
         self._n_floats += BLOCK * value.pitch
         return value
 
-    def _step(self, *numbers: int) -> None:
-        self._steps.append((*numbers, *[0] * (12 - len(numbers))))
-
-    def _dense(
-        self,
-        x: Value,
-        layer: Layer,
-        activation: int = LINEAR,
-        rounding: Rounding | None = None,
-        start: Value | None = None,
-    ) -> Value:
-        """A layer of `x`; its sums begin with the bias, or with the rows of `start`."""
+    def _dense(self, x: Value, layer: Layer, activation: int = LINEAR, start: Value | None = None) -> Value:
+        """A layer of `x` in float32; its sums begin with the bias, or with the rows of `start`."""
         width = layer.weight.shape[1]
         out = self._floats(width)
-        if rounding is not None:
-            self._dense_rounded(x, layer, rounding, out, activation)
-            return out
-        first = (start.place, start.pitch, 1) if start else (self._weights.add(layer.bias[None]), 0, 0)
-        self._step(
-            DENSE, x.place, x.pitch, self._weights.add(layer.weight), _padded(width), *first,
-            out.place, out.pitch, x.width, activation,
-        )  # fmt: skip
+        self._steps.append(Step(
+            DENSE, x=x.place, x_pitch=x.pitch, depth=x.width, w=self._weights.add(layer.weight),
+            start=start.place if start else self._weights.add(layer.bias[None]),
+            start_pitch=start.pitch if start else 0, starts_in_memory=start is not None,
+            scale=UNSCALED, out=out.place, pitch=out.pitch, activation=activation,
+        ))  # fmt: skip
         return out
 
-    def _dense_rounded(self, x: Value, layer: Layer, rounding: Rounding, out: Value, activation: int) -> None:
-        """A layer of codes: the code of 0 is in what the sums begin with, in bytes, or in `x`, in floats."""
-        codes, bias, width = layer.weight, layer.bias, out.width
+    def _dense_rounded(self, x: Value, layer: Layer, rounding: Rounding, activation: int = LINEAR) -> Value:
+        """A layer of the codes `x`. The code of 0 has been taken off codes in floats; sums of codes in bytes
+        begin without what it adds to them."""
+        codes, bias, width = layer.weight, layer.bias, layer.weight.shape[1]
         assert layer.scale is not None
-        scale = self._weights.add(layer.scale[None])
+        out, scale = self._floats(width), self._weights.add(layer.scale[None])
         if not x.in_bytes:
-            self._step(
-                DENSE_CODES, x.place, x.pitch, self._weights.add(codes), _padded(width),
-                self._weights.add(bias[None]), 0, scale, out.place, out.pitch, x.width, activation,
-            )  # fmt: skip
-            return
+            self._steps.append(Step(
+                DENSE, x=x.place, x_pitch=x.pitch, depth=x.width, w=self._weights.add(codes),
+                start=self._weights.add(bias[None]), scale=scale, out=out.place, pitch=out.pitch,
+                activation=activation,
+            ))  # fmt: skip
+            return out
         starts = bias - rounding.zero * codes.sum(axis=0, dtype=np.int64)
         n_quads, tiles = -(-x.width // QUAD), _padded(width) // WIDTH
         table = np.zeros((n_quads * QUAD, tiles * WIDTH), np.int8)
         table[: x.width, :width] = codes
         table = table.reshape(n_quads, QUAD, tiles, WIDTH).transpose(2, 0, 3, 1)
-        self._step(
-            DENSE_BYTES, x.place, 0, self._packed.add(table.reshape(1, -1)), self._starts.add(starts[None]),
-            scale, 0, 0, out.place, out.pitch, n_quads, activation,
-        )  # fmt: skip
-
-    def _multiply(self, a: Value, b: Value) -> None:
-        """In place, in `a`."""
-        self._step(MULTIPLY, a.place, a.pitch, b.place)
+        self._steps.append(Step(
+            DENSE_BYTES, x=x.place, depth=n_quads, w=self._packed.add(table.reshape(1, -1)),
+            start=self._starts.add(starts[None]), scale=scale, out=out.place, pitch=out.pitch,
+            activation=activation,
+        ))  # fmt: skip
+        return out
 
     def _harmonics(self, dirs: Value) -> Value:
+        """The spherical harmonics of directions."""
         weight = self._head.harmonics.weight
         terms = self._floats(len(weight))
-        self._step(MONOMIALS, dirs.place, dirs.pitch, 0, 0, 0, 0, 0, terms.place, terms.pitch)
+        self._steps.append(
+            Step(MONOMIALS, x=dirs.place, x_pitch=dirs.pitch, out=terms.place, pitch=terms.pitch)
+        )
         return self._dense(terms, self._head.harmonics)
 
-    def _rounded(self, x: Value, rounding: Rounding | None) -> tuple[Value, Rounding | None]:
-        """`x` as codes, in bytes or in floats, from which the code of 0 is taken off."""
-        if rounding is None:
-            return x, None
-        numbers = self._weights.add(np.array([[1 / rounding.scale]], np.float32))
+    def _rounded(self, x: Value, rounding: Rounding) -> Value:
+        """`x` as codes: in bytes, or in floats from which the code of 0 is taken off."""
         if self._in_bytes and x.width <= MOST_BYTES:
             out = Value(self._n_bytes, MOST_BYTES, x.width, in_bytes=True)
             self._n_bytes += BLOCK * MOST_BYTES
         else:
             out = self._floats(x.width)
-        kind = QUANTIZE if out.in_bytes else ROUND
-        self._step(kind, x.place, x.pitch, numbers, rounding.zero, 0, 0, 0, out.place)
-        return out, rounding
+        self._steps.append(Step(
+            QUANTIZE if out.in_bytes else ROUND, x=x.place, x_pitch=x.pitch, zero=rounding.zero,
+            scale=self._weights.add(np.array([[1 / rounding.scale]], np.float32)), out=out.place,
+            pitch=out.pitch,
+        ))  # fmt: skip
+        return out
 
 
 def _pairs(order: int) -> list[tuple[int, int]]:
-    """What the monomials of an order are products of, by their places among those of all orders from 1 on."""
+    """The monomial, by its place among all from order 1 on, and the axis that each of an order multiplies."""
     _, parents, axes = monomials(order)
     below = sum(k * (k + 1) // 2 for k in range(2, order))  # monomials of the orders before the one below
     return [(below + parent if order > 1 else -1, axis) for parent, axis in zip(parents, axes, strict=True)]
 
 
 class _Constants:
-    """Numbers of one kind after one another, rows padded with zeros to whole tiles."""
+    """Tables of one type after one another, their rows padded with zeros to whole tiles."""
 
     def __init__(self, kind: Any) -> None:
         self._kind = kind
@@ -182,7 +209,7 @@ class _Constants:
         self._size = 0
 
     def add(self, rows: np.ndarray) -> int:
-        """Where they begin."""
+        """Append the rows [n_rows, width]; returns the place of the first number."""
         padded = np.zeros((len(rows), _padded(rows.shape[1])), self._kind)
         padded[:, : rows.shape[1]] = rows
         self._parts.append(padded.reshape(-1))

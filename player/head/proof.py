@@ -32,8 +32,10 @@ def wrong() -> str | None:
     w = numbers.uniform(-1, 1, (DEPTH, WIDTH)).astype(F32)
     memory = np.zeros(x.size + ROWS * WIDTH, F32)
     memory[: x.size] = x.reshape(-1)
-    _floats(memory, np.append(w, np.zeros(WIDTH, F32)), DEPTH)
-    if not np.allclose(memory[x.size :].reshape(ROWS, WIDTH), x.astype(np.float64) @ w, rtol=0, atol=1e-5):
+    weights = np.concatenate([w.reshape(-1), np.zeros(WIDTH, F32), np.full(WIDTH, 0.5, F32)])
+    _floats(memory, weights, DEPTH)
+    expected = 0.5 * x.astype(np.float64) @ w
+    if not np.allclose(memory[x.size :].reshape(ROWS, WIDTH), expected, rtol=0, atol=1e-5):
         return "a layer gives other sums than numpy"
     y = np.linspace(-6, 6, 4 * LANES, dtype=F32)
     gelu, sigmoid, codes = y.copy(), y.copy(), np.zeros(y.size, np.uint8)
@@ -67,8 +69,10 @@ def _wrong_bytes(numbers: np.random.Generator) -> str | None:
 
 @compiled
 def _floats(memory, weights, depth):
-    out = len(memory) - ROWS * WIDTH
-    dense_tile(memory, weights, (0, depth), (0, WIDTH), (depth * WIDTH, 0, 0), (out, WIDTH), depth)
+    out, start = len(memory) - ROWS * WIDTH, depth * WIDTH
+    dense_tile(
+        memory, weights, (0, depth), (0, WIDTH), (start, 0, 0), start + WIDTH, (out, WIDTH), depth
+    )  # fmt: skip
 
 
 @compiled
