@@ -1,4 +1,4 @@
-"""How another Python process is started, so that it takes no code from the current folder.
+"""Starting another Python process so that it takes no code from the current folder.
 
 An interpreter that is started with `-c` or `-m` looks for every module in the current folder first: a
 `json.py` there, in an asset that was downloaded, would be executed. Every process is started with this.

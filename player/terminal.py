@@ -1,5 +1,5 @@
-"""What is shown in a terminal: text from files without its control characters, and a picture where there are
-16 million colours, two pixels a character, as upper half blocks."""
+"""Showing in a terminal: text from files without its control characters, and an asset's picture of two pixels
+a character (upper half blocks) where the terminal has 16 million colours."""
 
 from __future__ import annotations
 

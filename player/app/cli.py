@@ -1,4 +1,4 @@
-"""`vfr-play`: an asset in a browser, to pictures, or to words."""
+"""The command `vfr-play`: it shows an asset in a browser, renders it to files, or says what is in it."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def run(name: str, command: Callable[[], int]) -> int:
 
 
 def _described(error: OSError) -> str:
-    """With the file if there is one.
+    """What the system says of an error, with the file that it is about if there is one.
 
     >>> _described(OSError(errno.ENAMETOOLONG, "File name too long", "a" * 3))
     'aaa: File name too long'
@@ -63,7 +63,7 @@ def _described(error: OSError) -> str:
 
 
 def _printable(text: str) -> str:
-    """In one line, without what a file may have made a message say to a terminal."""
+    """The text in one line, without the control characters that a file may have put into a message."""
     from player.terminal import printable  # only now: `--help` needs no numpy
 
     return printable(text)
@@ -75,7 +75,7 @@ def _streams() -> list[tuple[str, TextIO]]:
 
 
 def _flush() -> None:
-    """Here, because at the end of the interpreter an error would be told in its own words."""
+    """Write out what is buffered. The interpreter would do so at its end, with its own words for an error."""
     for name, stream in _streams():
         try:
             stream.flush()
@@ -85,8 +85,10 @@ def _flush() -> None:
 
 
 def _nobody_reads() -> bool:
-    """Whether one of our streams is a pipe with nobody at its other end; where the system does not tell,
-    what broke is taken for one."""
+    """Whether one of our streams is a pipe with nobody at its other end.
+
+    Called where a stream is broken: where the system does not tell, it is taken for such a pipe.
+    """
     if not hasattr(select, "poll"):
         return True
     asked = select.poll()
@@ -97,7 +99,7 @@ def _nobody_reads() -> bool:
 
 
 def _give_up_broken_streams() -> None:
-    """Let go nowhere what a stream cannot get rid of: the interpreter would try again at its end."""
+    """Drop what a broken stream still holds: the interpreter would try to write it again at its end."""
     for _, stream in _streams():
         try:
             stream.flush()

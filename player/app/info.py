@@ -1,4 +1,4 @@
-"""`vfr-play --info` and `--check`: what is in an asset, in words and as numbers."""
+"""What is in an asset, in words and as numbers, for `vfr-play --info`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CONTENT = {
 
 
 def facts(asset: Asset) -> dict[str, Any]:
-    """Everything that `--info` knows, as JSON has it."""
+    """What `vfr-play --info --json` writes."""
     m = asset.manifest
     _, head = read_head_file(asset.path("head.onnx"), m.n_channels)
     return {
@@ -54,7 +54,10 @@ def facts(asset: Asset) -> dict[str, Any]:
 
 
 def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
-    """The lines of a page for people, without control characters, whatever the manifest holds."""
+    """The lines of a page for people, without control characters, whatever the manifest holds.
+
+    `known`: what `facts` has returned.
+    """
     low, high = known["world_box"]
     scale = known["world_units_per_model_unit"]
     total = known["bytes_total"]
@@ -103,7 +106,7 @@ def _section(title: str, rows: list[tuple[str, str]]) -> list[str]:
 
 
 def _flat(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """One row a number: objects inside objects get their names joined by dots."""
+    """Names and values of nested objects, one row each; the names of inner ones are joined by dots."""
     for key, value in sorted(values.items()):
         name = f"{above}{key}"
         if isinstance(value, dict) and value:
@@ -137,8 +140,10 @@ def _step(m: Manifest, scale: float) -> str:
 
 
 def _world_box(asset: Asset) -> list[list[float]]:
-    """Least and greatest world coordinates of the box's corners; in contracted space of the cube around what
-    is not contracted."""
+    """Least and greatest world coordinates of the box's corners.
+
+    In contracted space the box is the cube around what is not contracted.
+    """
     box = np.array(asset.manifest.aabb) / (2 if asset.manifest.contracted else 1)
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2], 1] for i, j, k in np.ndindex(2, 2, 2)])
     world = (corners @ asset.world_from_model.T)[:, :3]

@@ -1,4 +1,4 @@
-"""What an option must be: readers for argparse, whose errors say what is expected, with an example."""
+"""Readers of options for argparse; their errors say what is expected, with an example."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
 def wrong(expected: str, example: str, text: str) -> argparse.ArgumentTypeError:
-    """The error of a reader.
+    """The error that a reader raises for a wrong `text`.
 
     >>> str(wrong("a whole number", "3", "x"))
     "expected a whole number, such as 3, got 'x'"

@@ -118,11 +118,11 @@ USED_BY = {
     "host": ("viewer",),
     "port": ("viewer",),
 }
-"""Where an option does something, for every one of them."""
+"""The modes in which each option does something."""
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    """The options; leaves by SystemExit as argparse does."""
+    """Read the command line. Wrong usage ends in SystemExit, as argparse has it."""
     parser = make_parser()
     arguments = parser.parse_args(argv)
     _check_together(parser, arguments)
@@ -141,7 +141,7 @@ def settings_of(kind: type[Settings], arguments: argparse.Namespace) -> Settings
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """What is not given is None, False or an empty list."""
+    """The parser of the command line; an option that is not given is None, False or an empty list."""
     parser = argparse.ArgumentParser(
         prog="vfr-play",
         description="Look at a baked asset in a browser, or render it to files, on the CPU.",

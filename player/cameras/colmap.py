@@ -69,7 +69,7 @@ def read_views(model: Path) -> list[Camera]:
     """The registered pictures of a COLMAP model as pinhole cameras, in the order of their names.
 
     `model`: the folder of `cameras.bin` and `images.bin`, or of `cameras.txt` and `images.txt`. What lenses
-    do beyond a pinhole is left away, as in pictures that were undistorted. Raises FormatError, DataError (a
+    do beyond a pinhole is left out, as in pictures that were undistorted. Raises FormatError, DataError (a
     camera model that is no pinhole).
     """
     suffix = "bin" if (model / "images.bin").exists() else "txt"
@@ -90,7 +90,7 @@ def read_views(model: Path) -> list[Camera]:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """The lenses of `cameras.bin` by camera number. Raises FormatError, DataError (an unknown model)."""
+    """The lenses in `cameras.bin` by camera number. Raises FormatError, DataError (an unknown model)."""
     file = _Reader(path)
     lenses = {}
     for _ in range(file.count(24)):
@@ -123,7 +123,7 @@ def _lens(model: int, width: float, height: float, parameters: Sequence[float], 
 
 
 def read_images(path: Path) -> list[RegisteredImage]:
-    """The pictures of `images.bin`. Raises FormatError."""
+    """The pictures in `images.bin`, in the file's order. Raises FormatError."""
     file = _Reader(path)
     images = []
     for _ in range(file.count(73)):
@@ -195,7 +195,7 @@ def _text_images(path: Path) -> list[RegisteredImage]:
 
 
 def _lines(path: Path, empty: bool = False) -> list[tuple[int, str]]:
-    """Lines that are no comments, with their numbers."""
+    """The numbers and texts of lines that are no comments; `empty`: also of empty ones."""
     try:
         text = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES).decode()
     except UnicodeDecodeError as error:

@@ -49,7 +49,7 @@ def _spline(points: np.ndarray, share: float) -> np.ndarray:
 
 
 def _continuous(turns: list[np.ndarray]) -> list[np.ndarray]:
-    """The same rotations with signs that take the short way from each to the next."""
+    """The quaternions with signs chosen so that the way from each to the next is the short one."""
     for index in range(1, len(turns)):
         if turns[index] @ turns[index - 1] < 0:
             turns[index] = -turns[index]

@@ -1,4 +1,4 @@
-"""nerfstudio's `camera_path.json`: cameras out of it, cameras into it.
+"""Reading and writing nerfstudio's `camera_path.json`.
 
 The axes are those of `player.cameras.camera`. `fov` is the whole vertical field of view in degrees; a path
 has one size for all pictures. nerfstudio moves and scales a scene before it trains:
@@ -112,7 +112,7 @@ def _size(document: dict[str, Any], key: str, path: Path) -> int:
 
 
 def _matrix(values: Any, where: str) -> np.ndarray:
-    """16 numbers row by row, or 4 rows of 4."""
+    """[4, 4] float64 of 16 numbers row by row, or of 4 rows of 4."""
     if isinstance(values, list) and values and all(isinstance(row, list) for row in values):
         values = [value for row in values for value in row]
     if not isinstance(values, list) or len(values) != 16 or any(as_float(value) is None for value in values):
@@ -121,7 +121,7 @@ def _matrix(values: Any, where: str) -> np.ndarray:
 
 
 def _placement(path: Path) -> np.ndarray | None:
-    """[4, 4] world from path, out of nerfstudio's `dataparser_transforms.json`, if there is one."""
+    """[4, 4] from the path's frame to the world's, out of a `dataparser_transforms.json`, if there is one."""
     if not path.exists():
         return None
     document = parse_json(read_json(path, "nerfstudio's placement of the scene"), str(path))

@@ -1,4 +1,4 @@
-"""transforms.json: cameras out of it, cameras into it, and its frames' paths as file names.
+"""Reading and writing the cameras of a transforms.json, and file names for its frames.
 
 The axes and pixel conventions of the file are those of `player.cameras.camera`.
 """
@@ -33,7 +33,9 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
 
 
 def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
-    """The same from the bytes of the file; `where` names them in the messages.
+    """The JSON of a transforms.json from the file's bytes, checked as `load_transforms` does.
+
+    `where` names the file in messages.
 
     >>> parse_transforms(b'{"frames": []}', "cameras")
     Traceback (most recent call last):
@@ -208,7 +210,7 @@ def _frame_camera(
 def _focal(
     document: dict[str, Any], frame: dict[str, Any], axis: str, n_pixels: int, where: str
 ) -> float | None:
-    """The focal length in pixels along `axis`: the frame's own, as length or angle, before the top's."""
+    """The focal length along `axis` in pixels, given or from an angle; the frame's wins over the top's."""
     for level in (frame, document):
         focal = transforms_number({}, level, f"fl_{axis}", where)
         if focal is not None:
@@ -233,7 +235,7 @@ def _pixels(document: dict[str, Any], frame: dict[str, Any], key: str, where: st
 
 
 def _matrix(rows: Any) -> np.ndarray:
-    """`transform_matrix` as [4, 4] float64; three rows of four are completed."""
+    """The rows of a `transform_matrix` as [4, 4] float64; three rows are completed."""
     expected = "camera matrix: expected 4 rows of 4 numbers"
     if not isinstance(rows, list):
         raise FormatError(f"{expected}, got {brief(rows)}")
@@ -246,7 +248,7 @@ def _matrix(rows: Any) -> np.ndarray:
 
 
 def _unwritable(character: str) -> bool:
-    """Whether no file name has it: a control character, a line's end, half a surrogate pair."""
+    """Whether no file name has this character: it controls, ends a line, or is half a surrogate pair."""
     return character < " " or character in "\x7f\x85\u2028\u2029" or "\ud800" <= character <= "\udfff"
 
 

@@ -71,7 +71,7 @@ def file_size(path: Path, what: str, inside: Path | None = None) -> int:
 
 @contextmanager
 def _told(path: Path, what: str) -> Iterator[None]:
-    """Failures of the system as one FormatError."""
+    """Failures of the system in the block become one FormatError."""
     try:
         yield
     except FormatError:

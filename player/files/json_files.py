@@ -11,9 +11,9 @@ from player.errors import FormatError
 from player.files.files import read_bytes
 
 MAX_FILE_BYTES = 64 * 2**20
-"""Sixty thousand cameras: each takes a kilobyte."""
+"""Bytes of a JSON file, at most: enough for sixty thousand cameras of a kilobyte each."""
 MOST_VALUES = 8 << 20
-"""In JSON: each takes a hundred bytes of memory at most, and a camera has thirty."""
+"""Values in a JSON file, at most: each takes a hundred bytes of memory or less, and a camera has thirty."""
 
 
 def read_json(path: str | Path, what: str) -> bytes:

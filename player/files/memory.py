@@ -1,4 +1,4 @@
-"""How much memory a command may take: what was asked for, or a share of what there is."""
+"""The memory that a command may take: as much as was asked for, or a share of what there is."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SHARE = 0.5
 """A share of the machine's memory, or of a lower limit of the process, where no other number is asked for:
 the rest is for the program itself, for pictures and for other programs."""
 UNKNOWN = 4 << 30
-"""Bytes of a machine that does not tell how many it has."""
+"""Bytes of memory that are assumed where the machine does not tell."""
 
 
 def allowed_bytes(max_memory: float | None = None) -> int:

@@ -1,7 +1,8 @@
-"""What follows a layer, on vectors of numbers in registers. Compiled code alone imports this.
+"""Activations and roundings of a layer's outputs, on vectors of numbers in registers. Compiled code alone
+imports this.
 
-A pass of its own over numbers that are still in cache: dozens of dependent operations on each, which the
-processor does for many vectors at once if they follow one another in a short loop.
+They are a pass of their own over numbers that are still in cache. Each takes dozens of operations that depend
+on one another, which the processor does for many vectors at once if these follow one another in a short loop.
 
     gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
     sigmoid(x) = 1 / (1 + exp(-x))
@@ -40,13 +41,13 @@ def _gelu(x: Lanes) -> Lanes:
 
 
 def _within(x: Lanes, most: float) -> Lanes:
-    """What is no number stays none, which the processor's own least and most do as well."""
+    """The numbers, held between -most and most; NaN stays NaN."""
     x = choose(x < -most, x.like(-most), x)
     return choose(x > most, x.like(most), x)
 
 
 def _sigmoid(x: Lanes) -> Lanes:
-    """What is no number stays none."""
+    """1 / (1 + exp(-x)); NaN stays NaN."""
     y = (-x).most(-87).least(87)
     return choose(Lanes(x.b, x.b.fcmp_unordered("uno", x.value, x.value)), x, 1.0 / (y.exp() + 1))
 
@@ -59,8 +60,10 @@ def _polynomial(coefficients: tuple[float, ...], x: Lanes) -> Lanes:
 
 
 def _inverse(x: Lanes) -> Lanes:
-    """1 / x of ordinary numbers, in half the time of a division: a guess from the bits, 5 % wrong, and three
-    steps of Newton, each of which squares what is wrong."""
+    """1 / x of ordinary numbers, in half the time of a division.
+
+    The bits give a guess that is 5 % wrong; each of three steps of Newton squares the relative error.
+    """
     bits = Lanes(x.b, x.b.bitcast(x.value, vector(INT)))
     guess = (0x7EF311C7 - bits).as_float()
     for _ in range(3):
@@ -83,9 +86,9 @@ def _in_place(function: Callable[[Lanes], Lanes]) -> Any:
 
 
 gelu_lanes: Any = _in_place(_gelu)
-"""gelu_lanes(memory, at): of LANES numbers in `memory` [n] float32, in place."""
+"""gelu_lanes(memory, at): LANES numbers of `memory` [n] float32, from index `at` on, become their GELU."""
 sigmoid_lanes: Any = _in_place(_sigmoid)
-"""sigmoid_lanes(memory, at): the same."""
+"""sigmoid_lanes(memory, at): LANES numbers of `memory`, from index `at` on, become their sigmoid."""
 
 
 def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
@@ -103,7 +106,8 @@ def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_
 
 
 quantize_lanes: Any = intrinsic(_quantize)
-"""quantize_lanes(codes, memory, out, x, zero, per_step): 8-bit codes, at `out`, of LANES numbers at `x`."""
+"""quantize_lanes(codes, memory, out, x, zero, per_step): LANES numbers of `memory` from index `x` on become
+8-bit codes in `codes` [n] uint8 from index `out` on. `zero`: the code of 0; `per_step`: levels in a unit."""
 
 
 def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
@@ -120,10 +124,11 @@ def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> A
 
 
 round_lanes: Any = intrinsic(_round)
-"""round_lanes(memory, out, x, zero, per_step): the codes of `quantize_lanes` less `zero`, as floats."""
+"""round_lanes(memory, out, x, zero, per_step): as `quantize_lanes`, but the codes less `zero` are written as
+floats, to `memory` from index `out` on."""
 
 
 def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:
-    """The nearest of 256 levels, as a float."""
+    """The code of each number, 0 to 255, as a float."""
     shift = splat(x.b, x.b.sitofp(zero, FLOAT))
     return ((x * splat(x.b, per_step)).call("rint") + shift).most(0).least(255)

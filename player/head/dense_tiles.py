@@ -1,4 +1,4 @@
-"""A tile of a dense layer in registers: what `player.head.compiled` is made of.
+"""Tiles of dense layers in registers, which `player.head.compiled` puts together.
 
 A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold; in float32,
 and in 8 bits where the processor multiplies bytes. Compiled code alone imports this.
@@ -17,21 +17,23 @@ from player.compiled.lanes import FLOAT, INT, LANES, LONG, Lanes, address, load,
 from player.compiled.processor import multiplies_bytes
 
 ROWS = 12 if LANES == 16 else 6
-"""32 registers of 16 numbers, or half as many of half as many: two vectors a row, and some to spare."""
+"""Pixels of a tile. A processor has 32 registers of 16 numbers, or 16 of 8: two vectors of sums for each
+pixel leave some for inputs and weights."""
 WIDTH = 2 * LANES
 """Outputs of a tile."""
 
 QUAD = 4
-"""Products of bytes that the processor adds up at once."""
+"""Products of bytes that the processor adds up in one instruction."""
 MOST_BYTES = 256
-"""Inputs of a layer in 8 bits, at most: bytes from a pixel to the next. A number that the compiler knows
-saves it a register for each row."""
+"""Inputs of a layer of bytes, at most, and bytes from a pixel to the next. The compiler knows this number,
+and needs no register for each row."""
 UNSCALED = -(1 << 40)
 """A place of scales that says there are none, in every tile of a layer."""
 MULTIPLIES_BYTES = multiplies_bytes(QUAD * LANES)
-"""Whether it does: VNNI, of Intel since 2019, of AMD since 2022."""
+"""Whether the processor adds up products of bytes: Intel's do since 2019, AMD's since 2022 (VNNI)."""
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
-"""Its operands are words of QUAD bytes, as until LLVM 21; later ones take that for what they write."""
+"""The instruction by LLVM's name. Its operands are words of QUAD bytes, as LLVM had them up to version 21;
+later versions turn them into theirs."""
 
 
 def _dense(

@@ -37,15 +37,15 @@ MAX_DEGREE = 8
 MAX_LAYERS = 16
 MAX_WIDTH = 4096
 LARGEST_SUM = 2**31 - 1
-"""What a sum of products of codes may reach: it is kept in an int32."""
+"""Largest sum of products of codes: it is kept in an int32."""
 PAIR_LIMIT = 128
-"""What the magnitudes of the codes of weights 2i and 2i + 1 of an output may add up to: where a processor
-adds up two products at a time in 16 bits, 255 times as much still fits."""
+"""Largest sum of the magnitudes of two neighbouring codes of weights, 2i and 2i + 1, of an output. Where a
+processor adds up two products at a time in 16 bits, 255 times as much still fits."""
 
 
 @dataclass(frozen=True)
 class HeadForm:
-    """What tells one head's graph from another's, but for the widths of its layers."""
+    """The nodes that a head's graph has: everything but the widths of its layers."""
 
     n_spatial: int
     n_directional: int
@@ -56,19 +56,23 @@ class HeadForm:
 
 
 class Layer(NamedTuple):
-    """A dense layer in float32: `weight` [n_in, n_out] and `bias` [n_out]; in 8 bits the codes of both, int8
-    and int32, and `scale` [n_out] float32, what a sum of products of codes counts."""
+    """A dense layer, in float32 or in 8 bits."""
 
     weight: np.ndarray
+    """[n_in, n_out] float32, or int8 codes."""
     bias: np.ndarray
+    """[n_out] float32, or int32 codes."""
     scale: np.ndarray | None = None
+    """[n_out] float32 that a sum of products of codes is multiplied by; None in float32."""
 
 
 class Rounding(NamedTuple):
-    """How an activation is rounded to 8 bits: the step between levels, and the code of 0."""
+    """How an activation is rounded to 8 bits."""
 
     scale: np.float32
+    """Step from one level to the next."""
     zero: int
+    """The code of 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +82,7 @@ class HeadArrays:
     form: HeadForm
     spatial: list[Layer]
     roundings: list[Rounding]
-    """Those of h, and of each z that another directional layer takes; empty in float32."""
+    """Roundings of h, and of each z that another directional layer takes; none in float32."""
     to_sh: Layer
     harmonics: Layer
     """C [n_monomials, n_encoded] and c, the monomials in the order of `monomials`."""
@@ -115,8 +119,10 @@ def pair_sums(weight: np.ndarray) -> np.ndarray:
 
 
 def monomials(order: int) -> tuple[list[tuple[int, int, int]], list[int], list[int]]:
-    """The monomials of one order: powers of x, y and z, and of what each is the product: which monomial of
-    the order below, and which of x, y and z.
+    """The monomials of one order.
+
+    Returns, for each of them: its powers of x, y and z; the monomial of the order below, by its place there,
+    and the axis, 0 to 2, that it is the product of.
 
     >>> monomials(1)[0]
     [(1, 0, 0), (0, 1, 0), (0, 0, 1)]

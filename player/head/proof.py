@@ -1,5 +1,5 @@
-"""The proof of what heads are made of: tiles of layers, in float32 and in 8 bits, and what follows a layer.
-`player.proof` asks for it; compiled code alone imports this."""
+"""Whether what compiled heads are made of computes what numpy does: tiles of layers in float32 and in 8 bits,
+activations, roundings. `player.proof` asks; compiled code alone imports this."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DEPTH = 24
 
 
 def wrong() -> str | None:
-    """What is wrong, if anything is."""
+    """What is wrong, in words; None if nothing is."""
     numbers = np.random.default_rng(0)
     x = numbers.uniform(-1, 1, (ROWS, DEPTH)).astype(F32)
     w = numbers.uniform(-1, 1, (DEPTH, WIDTH)).astype(F32)
@@ -60,11 +60,8 @@ def _wrong_bytes(numbers: np.random.Generator) -> str | None:
     memory = np.zeros(ROWS * WIDTH, F32)
     _bytes(codes.reshape(-1), memory, packed, starts, np.full(WIDTH, 0.5, F32), DEPTH // QUAD)
     expected = (codes[:, :DEPTH].astype(np.int64) @ w + starts) * 0.5
-    return (
-        None
-        if (memory.reshape(ROWS, WIDTH) == expected).all()
-        else "products of bytes are others than numpy's"
-    )
+    right = (memory.reshape(ROWS, WIDTH) == expected).all()
+    return None if right else "products of bytes are others than numpy's"
 
 
 @compiled

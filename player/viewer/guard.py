@@ -1,4 +1,4 @@
-"""Who is let in to the viewer, and how much he may say.
+"""Who may connect to the viewer, and how much of what a client sends is read.
 
 Any page that a browser has open can send requests to an address of this machine, and by a name that it lets
 point here (DNS rebinding) it can even read the answers. A browser says in the header Host which name it
@@ -35,29 +35,30 @@ MOST_CLIENTS = 24
 MOST_SOCKETS = 128
 """Open connections, with those that have not yet asked for anything."""
 CAMERA_SECONDS = 1 / 60
-"""The camera moves once in that time at most: of several messages the newest counts."""
+"""Seconds between two moves of a camera, at least: of the messages in between the newest counts."""
 RATE = 200.0
-"""Messages a second that are read of one client; a window that is dragged about sends 50."""
+"""Messages of one client that are read in a second; a window that is dragged about sends 50."""
 FIRST_SECONDS = 60.0
-"""Until then a client has told its camera, or is dropped."""
+"""Seconds after which a client that has not told its camera is dropped."""
 MOST_FRAGMENTS = 16
+"""Parts that a message may come in."""
 MOST_PINGS = 20
-"""In PING_SECONDS; browsers send none."""
+"""Pings of a connection in PING_SECONDS; browsers send none."""
 PING_SECONDS = 20.0
 MOST_UNREAD_BYTES = 64 << 20
-"""Answers that a client has not taken."""
+"""Bytes of answers that a client may leave unread."""
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 CONNECTION: ContextVar[GuardedConnection] = ContextVar("CONNECTION")
-"""Whose message is being handled."""
+"""The connection whose message is being handled."""
 
 
 class Guard:
-    """What all connections to one server share."""
+    """The rules of one server, and its open connections."""
 
     def __init__(self, host: str, version: str) -> None:
-        """`host`: the address that is served at. `version`: of viser, which a page has to be of as well."""
+        """`host`: the address that is served at. `version`: viser's, which its pages have to have as well."""
         self._host = host.lower()
         self.version = version
         self.sockets: set[GuardedConnection] = set()
@@ -65,7 +66,7 @@ class Guard:
         self.installed = False
 
     def serve_options(self, answer: Callable[..., Any]) -> dict[str, Any]:
-        """Settings of `websockets.asyncio.server.serve`; `answer` is who answers requests that are let in."""
+        """Settings of `websockets.asyncio.server.serve`; `answer` answers the requests that are let in."""
 
         def admit(connection: GuardedConnection, request: Request) -> Any:
             refused = self.refusal(request.path, request.headers)
@@ -131,9 +132,9 @@ class GuardedConnection(ServerConnection):
         super().__init__(*args, **kwargs)
         self._guard = guard
         self.controls: dict[str, Check] = {}
-        """The client's own, by their name on the wire."""
+        """The checks of values that the client sends, by the names that its controls have in messages."""
         self.n_sending = 0
-        """Messages that the client has yet to take."""
+        """Messages that are on their way to the client."""
         self._ready: list[bytes] = []
         self._camera: bytes | None = None
         self._camera_due = 0.0
@@ -175,7 +176,10 @@ class GuardedConnection(ServerConnection):
             self.n_sending -= 1
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that may be heeded; of cameras the newest, CAMERA_SECONDS apart."""
+        """Wait for the next message that passes its check, written anew.
+
+        Of messages about the camera the newest is returned, CAMERA_SECONDS after the one before.
+        """
         CONNECTION.set(self)
         now = self.loop.time
         if self._first_due is None:
@@ -212,7 +216,7 @@ class GuardedConnection(ServerConnection):
         return data
 
     async def _pause(self, now: float) -> None:
-        """Wait until the next message may be read: meanwhile the client's pile up on his own side."""
+        """Wait until the next message may be read; meanwhile messages pile up on the client's side."""
         self._may_read = min(self._may_read + (now - self._read_at) * RATE, RATE) - 1
         self._read_at = now
         if self._may_read < 0:
@@ -271,7 +275,7 @@ def _only(headers: Headers, name: str) -> str | None:
 
 
 def _name(host: str) -> str | None:
-    """The name in a Host header, in small letters; None if it is none.
+    """The name in a Host header, in lower case; None if there is none.
 
     >>> _name("localhost:8080"), _name("[::1]:8080"), _name("[::1]"), _name("a:b"), _name("")
     ('localhost', '::1', '::1', None, None)

@@ -1,4 +1,4 @@
-"""What the viewer shows of a frame, as a picture."""
+"""The layers of a frame as pictures: colour, depth, normals, opacity, number of samples."""
 
 from __future__ import annotations
 
@@ -45,6 +45,6 @@ def coloured(values: np.ndarray) -> np.ndarray:
 
 
 def _spread(depth: np.ndarray, met: np.ndarray) -> np.ndarray:
-    """Depth as 0..1 between what is nearest and farthest, but for a hundredth of the pixels at each end."""
+    """Depth as 0..1, from the nearest hundredth of the pixels that met something to the farthest."""
     near, far = np.percentile(depth[met], [1, 99]) if met.any() else (0.0, 1.0)
     return np.clip((depth - near) / max(far - near, 1e-12), 0, 1)

@@ -14,13 +14,13 @@ import msgspec
 from msgspec import Meta
 
 MAX_BYTES = 4096
-"""A message of a browser has some 250."""
+"""Bytes of a message, at most; a browser's has some 250."""
 
 FAR = 1e9
-"""Coordinates of a camera, world units: further away float32 rays say nothing."""
+"""Largest coordinate of a camera, world units; float32 rays from further away are too coarse."""
 
 Check = Callable[[Any], Any]
-"""Gives the value that a control takes for what a client sent, or None if it takes none."""
+"""A function from what a client sent to the value that a control takes, or to None if it takes none."""
 
 _Side = Annotated[int, Meta(ge=0, le=1 << 20)]
 _Place = tuple[float, float, float]
@@ -58,7 +58,7 @@ _decoder = msgspec.msgpack.Decoder(_Camera | _Update)
 def cleaned(raw: bytes | str, controls: Mapping[str, Check]) -> tuple[bool, bytes] | None:
     """A message as viser may see it, and whether it tells the camera; None if it is to be ignored.
 
-    `controls`: the client's own, by their name on the wire.
+    `controls`: the checks of values for the client's controls, by the names that these have in messages.
 
     >>> import msgspec
     >>> sent = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 900}})
@@ -101,7 +101,7 @@ def _is_camera(camera: _Camera) -> bool:
 
 
 def within(bounds: Callable[[], tuple[float, float]], whole: bool) -> Check:
-    """For a slider: the nearest number between its bounds, which are asked for each time."""
+    """The check of a slider: the nearest number between its bounds, which are asked for each time."""
 
     def check(value: Any) -> float | None:
         if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
@@ -114,17 +114,17 @@ def within(bounds: Callable[[], tuple[float, float]], whole: bool) -> Check:
 
 
 def one_of(options: Sequence[str]) -> Check:
-    """For a dropdown."""
+    """The check of a dropdown: it takes one of its options."""
     return lambda value: value if isinstance(value, str) and value in options else None
 
 
 def colour(value: Any) -> list[int] | None:
-    """For a colour: three bytes."""
+    """The check of a colour: it takes a list of three bytes."""
     take = within(lambda: (0, 255), whole=True)
     levels = [take(part) for part in value] if isinstance(value, list) else []
     return None if len(levels) != 3 or None in levels else levels
 
 
 def pressed(value: Any) -> bool | None:
-    """For a button."""
+    """The check of a button."""
     return True if value is True else None

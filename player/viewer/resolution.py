@@ -10,19 +10,19 @@ from __future__ import annotations
 import math
 
 FRAME_SECONDS = 1 / 15
-"""A picture while moving may take this long."""
+"""Seconds that a picture may take while the camera moves."""
 
 SHARE = 0.8
-"""Of that, what rendering may take; the rest is for encoding and sending."""
+"""Share of FRAME_SECONDS that rendering may take; the rest is for encoding and sending."""
 
 STILL_SECONDS = 0.15
-"""Without a move for this long, the camera counts as standing still."""
+"""Seconds without a move after which the camera counts as standing still."""
 
 SHARP_SECONDS = 0.5
-"""Of rendering, for the first picture after that: it is on the screen within a second."""
+"""Seconds that the first picture after a move may render: it is on the screen within a second."""
 
 LEAST = 64 * 48
-"""Pixels of the smallest picture: with less nobody knows where he is."""
+"""Pixels of the smallest picture: in a smaller one nothing is recognised."""
 
 MOST = 1920 * 1080
 """Pixels of the largest picture while moving, however fast they come."""
@@ -41,7 +41,7 @@ class Pace:
         self._pixels = 20_000.0
 
     def measured(self, pixels: int, seconds: float) -> None:
-        """Learn from a picture that was rendered while moving."""
+        """Learn from the time that a picture of so many pixels took while the camera moved."""
         wanted = pixels * SHARE * FRAME_SECONDS / max(seconds, 1e-4)
         # At most twice or half of it at a time: one hiccup of the machine does not blur the next ten.
         self._pixels = min(max(min(wanted, 2 * self._pixels), self._pixels / 2, LEAST), MOST)
@@ -56,7 +56,7 @@ class Pace:
 
 
 def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
-    """The window's size, made smaller to at most about so many pixels, in its proportions.
+    """A window's size, made smaller in proportion until it has about so many `pixels` at most.
 
     >>> fitted(800, 600, 120_000), fitted(800, 600, 1e9)
     ((400, 300), (800, 600))

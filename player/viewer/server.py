@@ -189,7 +189,7 @@ def _title(asset: Asset) -> str:
 
 
 def _shown(host: str) -> str:
-    """The host as a browser on this machine reaches it."""
+    """The host in an address by which a browser on this machine reaches it."""
     if host in ("0.0.0.0", "::"):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host

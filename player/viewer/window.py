@@ -31,12 +31,13 @@ PATH_FPS = 30
 STRIP_PIXELS = 50_000
 """The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
 MOST_PIXELS = 3840 * 2160
-"""The largest whole picture, whatever size a window says it has."""
+"""Pixels of the largest whole picture, whatever size a window says it has."""
 MOST_SIDE = 8192
+"""Pixels of a window's width or height that are believed."""
 MOST_VIEWS = 200
 """Views that a recorded path may have."""
 HANDED_OVER_SECONDS = 0.2
-"""By then viser has given a file to the connection."""
+"""Seconds after which viser has given a file to the connection."""
 
 
 class Window:
@@ -53,7 +54,7 @@ class Window:
         background: tuple[float, float, float] | None,
         whole: threading.Lock,
     ) -> None:
-        """`whole` is held by the one window that makes a whole picture: memory for many is not needed."""
+        """`whole` is held by the one window that makes a whole picture: memory is needed for one alone."""
         self._client = client
         self._connection = connection
         self._whole = whole
@@ -159,7 +160,7 @@ class Window:
         self._connection.controls[control._impl.uuid] = check
 
     def _switch(self) -> None:
-        """To another asset, with the fetches that it was baked for."""
+        """Show another asset, with the number of fetches that it was baked for."""
         self._renderer = self._renderers[self._asset.value]
         n_fetches = self._renderer.asset.manifest.n_samples
         self._samples.max = max(self._samples.max, n_fetches)
@@ -258,7 +259,7 @@ class Window:
                 self._state.value = "failed: the terminal of vfr-play says why"
 
     def _wait(self, version: int, seconds: float | None) -> bool:
-        """Wait for something newer than `version`; whether there is, and the window still open."""
+        """Wait for a change after `version`; returns whether there is one and the window is still open."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._version != version, seconds)
             return self._version != version and not self._closed
@@ -273,8 +274,8 @@ class Window:
         self._send(picture, 75, f"{small.width}x{small.height}, {seconds * 1000:.0f} ms")
 
     def _sharpen(self, version: int) -> None:
-        """After a moment of standing still: a picture that half a second allows, then the whole one; given
-        up as soon as something changes."""
+        """Once the camera has stood still for a moment, show a picture that half a second allows, then the
+        whole one; both are given up as soon as something changes."""
         if self._wait(version, STILL_SECONDS) or self._closed:
             return
         camera = self._camera()
@@ -301,7 +302,7 @@ class Window:
         return True
 
     def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
-        """The picture, or None if something changed meanwhile."""
+        """[h, w, 3] uint8 of the chosen layer, or None if something changed meanwhile."""
         layer = self._layer.value
         rows = max(1, STRIP_PIXELS // camera.width)
         frames = []
@@ -318,7 +319,7 @@ class Window:
 
 
 def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
-    """By the name of the asset's folder, or by its path where two have the same."""
+    """Renderers by the names of their assets' folders, or by the paths where two names are the same."""
     folders = [renderer.asset.folder.resolve() for renderer in renderers]
     names = [printable(folder.name) for folder in folders]
     if len(set(names)) < len(names):
@@ -327,7 +328,7 @@ def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
 
 
 def _joined(frames: Sequence[Frame], layer: str) -> Frame:
-    """Strips, the uppermost first, as one frame."""
+    """One frame of strips, the uppermost first; its normals are found if `layer` shows them."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(frame, name) for frame in frames])
