@@ -6,9 +6,9 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, TextIO
 
-import numpy as np
+if TYPE_CHECKING:  # commands import this before they answer `--help`, which needs no numpy
+    import numpy as np
 
-if TYPE_CHECKING:
     from player.asset.asset import Asset
 
 ROWS = 16
@@ -32,6 +32,8 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
     if not (stream.isatty() and encoding == "utf8" and os.environ.get("COLORTERM") in ("truecolor", "24bit")):
         return []
+    import numpy as np
+
     from player.cameras.views import asset_cameras
     from player.render import render
 
@@ -48,6 +50,7 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
 def half_blocks(pixels: np.ndarray) -> list[str]:
     """Lines of upper half blocks: [2 n, columns, 3] uint8 to n lines.
 
+    >>> import numpy as np
     >>> half_blocks(np.uint8([[[1, 2, 3]], [[4, 5, 6]]]))
     ['\\x1b[38;2;1;2;3;48;2;4;5;6m▀\\x1b[0m']
     """

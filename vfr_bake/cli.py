@@ -6,7 +6,6 @@ Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C, 141 output t
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -15,10 +14,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from player.app.commands import run
+from player.app.commands import run, write_result
 from player.errors import DataError, MissingExtraError
 from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
+from player.terminal import printable
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
@@ -47,12 +47,6 @@ def eval_main(argv: Sequence[str] | None = None) -> int:
 def bench_main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `vfr-bench`."""
     return run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
-
-
-def _printable(text: object) -> str:
-    from player.terminal import printable  # only now: `--help` needs no numpy
-
-    return printable(str(text))
 
 
 def _need_train_extra() -> None:
@@ -122,7 +116,7 @@ def _with_cameras(data: str) -> str:
         return data
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count)
-    print(f"vfr-train: {_printable(report.summary())}", file=sys.stderr)
+    print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
     return str(report.folder)
 
 
@@ -134,9 +128,9 @@ def _warn_of_folds(scene: Scene) -> None:
     except MissingExtraError:
         return
     if torn:
-        named = _printable(", ".join(f"{first} and {second}" for first, second in torn))
+        named = printable(", ".join(f"{first} and {second}" for first, second in torn))
         print(
-            f"vfr-train: {_printable(scene.name)}: {named} match, but their cameras are far apart: the "
+            f"vfr-train: {printable(str(scene.name))}: {named} match, but their cameras are far apart: the "
             "subject seems to look the same from several sides, and its cameras are folded. Train on a "
             "folder of the pictures alone to have the cameras estimated anew",
             file=sys.stderr,
@@ -189,7 +183,7 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
         else ""
     )
     skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
-    _result(
+    write_result(
         options.json,
         figures | {"model": str(options.model)},
         f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{skipped}{tested}"
@@ -248,7 +242,7 @@ def _bake(options: Any) -> int:
         "megabytes": megabytes,
         "seconds": result.seconds,
     } | result.figures
-    _result(
+    write_result(
         options.json,
         figures,
         f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
@@ -297,7 +291,7 @@ def _eval(options: Any) -> int:
         "lpips_network": options.lpips,
     }
     perceptual = "" if lpips is None else f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
-    _result(
+    write_result(
         options.json,
         figures,
         f"{options.model}: {means['psnr']:.2f} dB mean PSNR, SSIM {means['ssim']:.4f}{perceptual} "
@@ -320,7 +314,7 @@ def _bench(options: Any) -> int:
         trade = measure_trade(options, lpips, bars.count)
     if options.html is not None:
         write_bytes(options.html, trade_page(trade))
-    _result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))
+    write_result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))
     return 0
 
 
@@ -335,14 +329,3 @@ def _inverse(matrix: Any) -> Any:
     import numpy as np
 
     return np.linalg.inv(matrix)
-
-
-def _result(target: Path | None, figures: dict[str, Any], sentence: str) -> None:
-    """The result on stdout, as a sentence or as JSON; or the sentence there and the JSON in a file."""
-    text = json.dumps(figures, indent=1, sort_keys=True) + "\n"
-    if target is not None and str(target) == "-":
-        sys.stdout.write(text)
-        return
-    if target is not None:
-        write_bytes(target, text.encode())
-    print(sentence)

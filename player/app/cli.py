@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from player.app.commands import run
+from player.app.commands import run, write_result
 from player.app.options import PlaySettings, parse, settings_of
 from player.errors import ConfigError, VfrError
 from player.progress import Bar, duration
+from player.terminal import picture_lines, printable
 
 if TYPE_CHECKING:  # `--help` answers without numpy
     from player.app.frame_files import Target
@@ -80,9 +80,7 @@ def _play(arguments: argparse.Namespace) -> int:
         raise KeyboardInterrupt(
             f"the frames that were finished are kept in {target.folder}; --resume goes on"
         ) from None
-    _write_json(arguments.json, played.figures)
-    if arguments.json != "-":
-        print(_sentence(target.path, played))
+    write_result(arguments.json, played.figures, _sentence(target.path, played))
     return 0
 
 
@@ -143,24 +141,11 @@ def _say(text: str) -> None:
     print(f"vfr-play: {text}", file=sys.stderr)
 
 
-def _write_json(target: str | None, document: dict[str, Any]) -> None:
-    if target is None:
-        return
-    text = json.dumps(document, indent=1, sort_keys=True) + "\n"
-    if target == "-":
-        sys.stdout.write(text)
-        return
-    from player.files.files import write_bytes
-
-    write_bytes(Path(target), text.encode())
-
-
 def _check(arguments: argparse.Namespace) -> int:
     from player.asset.asset import Asset, checksums, read_manifest
     from player.asset.unpacking import check_total
     from player.files.memory import allowed_bytes
     from player.head.head import read_head_file
-    from player.terminal import printable
 
     manifest = read_manifest(arguments.asset)
     check_total(arguments.asset, manifest, allowed_bytes(arguments.max_memory))
@@ -171,7 +156,7 @@ def _check(arguments: argparse.Namespace) -> int:
             found = "" if error is None else f"  {printable(str(error))}"
             print(f"{'ok    ' if error is None else 'FAILED'}  {name}{found}")
     failed = sum(result != "ok" for result in results.values())
-    _write_json(arguments.json, {"ok": not failed, "files": results})
+    write_result(arguments.json, {"ok": not failed, "files": results}, None)
     if failed:
         raise VfrError(f"{arguments.asset}: {failed} of {len(results)} files failed")
     # the checksums hold; now the content
@@ -186,12 +171,9 @@ def _info(arguments: argparse.Namespace) -> int:
 
     asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
     known = facts(asset)
-    if arguments.json is not None:
-        _write_json(arguments.json, known)
-    if arguments.json != "-":
-        from player.terminal import picture_lines
-
-        print("\n".join([*picture_lines(asset, sys.stdout), *page(arguments.asset, asset.manifest, known)]))
+    lines = [] if arguments.json == "-" else picture_lines(asset, sys.stdout)
+    text = "\n".join([*lines, *page(arguments.asset, asset.manifest, known)])
+    write_result(arguments.json, known, text)
     return 0
 
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import select
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TextIO
+from pathlib import Path
+from typing import Any, TextIO
 
 from player.errors import VfrError
+from player.files.files import write_bytes
+from player.terminal import printable
 
 READER_GONE = 141
 """Exit code where nobody reads the output any more (`| head`): what a shell reports of other programs."""
@@ -35,7 +39,7 @@ def run(name: str, command: Callable[[], int]) -> int:
         finally:
             _flush()
     except VfrError as error:
-        _say(f"{name}: error: {_printable(str(error))}")
+        _say(f"{name}: error: {printable(str(error))}")
         return 1
     except OSError as error:
         broken = isinstance(error, BrokenPipeError) or (os.name == "nt" and error.errno == errno.EINVAL)
@@ -45,11 +49,34 @@ def run(name: str, command: Callable[[], int]) -> int:
             return READER_GONE
         if error.errno is None:  # no disk's: a library's, or ours
             raise
-        _say(f"{name}: error: {_printable(_described(error))}")
+        _say(f"{name}: error: {printable(_described(error))}")
         return 1
     except KeyboardInterrupt as stop:
         _say(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}")
         return 130
+
+
+def write_result(target: str | Path | None, figures: dict[str, Any], sentence: str | None) -> None:
+    """Write what a command has done.
+
+    Args:
+        target: a file for the figures as JSON, or "-" for standard output; None for no JSON.
+        figures: what JSON can hold.
+        sentence: lines for people, on standard output unless the JSON is there; None for no lines.
+
+    Raises OutputError: the file cannot be written.
+
+    >>> write_result(None, {"frames": 1}, "one picture")
+    one picture
+    """
+    text = json.dumps(figures, indent=1, sort_keys=True) + "\n"
+    if str(target) == "-":
+        sys.stdout.write(text)
+        return
+    if target is not None:
+        write_bytes(Path(target), text.encode())
+    if sentence is not None:
+        sys.stdout.write(f"{sentence}\n")
 
 
 def _described(error: OSError) -> str:
@@ -60,13 +87,6 @@ def _described(error: OSError) -> str:
     """
     where = "" if error.filename is None else f"{error.filename}: "
     return f"{where}{error.strerror or error}"
-
-
-def _printable(text: str) -> str:
-    """The text in one line, without the control characters that a file may have put into a message."""
-    from player.terminal import printable  # only now: `--help` needs no numpy
-
-    return printable(text)
 
 
 def _streams() -> list[tuple[str, TextIO]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,8 +116,8 @@ def _flat(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
             yield name, text if len(text) < 90 else f"{text[:87]}..."
 
 
-def _numbers(values: Any, form: Callable[[float], str] = "{:.4g}".format) -> str:
-    return ", ".join(form(value) for value in values)
+def _numbers(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
 
 
 def _megabytes(n_bytes: int) -> str:
@@ -128,12 +128,9 @@ def _bar(share: float) -> str:
     return ("#" * round(20 * share)).ljust(20, ".")
 
 
-def _edge(m: Manifest) -> float:
-    return max(high - low for low, high in zip(*m.aabb, strict=True))
-
-
 def _step(m: Manifest, scale: float) -> str:
-    cells = m.step * m.resolution / _edge(m)
+    edge = max(high - low for low, high in zip(*m.aabb, strict=True))
+    cells = m.step * m.resolution / edge
     if m.contracted:
         return f"an angle of {m.step:.5g}, {cells * MAX_SPEED:.2g} of a cell at most"
     return f"{m.step * scale:.5g} world units, {cells:.2g} of a cell"

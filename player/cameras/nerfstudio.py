@@ -12,17 +12,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from player.cameras.camera import Camera
+from player.cameras.transforms import MAX_PIXELS_A_SIDE
 from player.errors import FormatError
 from player.files.json_files import as_float, brief, parse_json, read_json
 
 PLACEMENT = "dataparser_transforms.json"
-MAX_PIXELS_A_SIDE = 65536
 
 
 def is_camera_path(document: Any) -> bool:
@@ -57,7 +58,7 @@ def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
         c2w = _matrix(frame.get("camera_to_world"), where)
         camera = Camera(where, c2w, width, height, focal, focal, width / 2, height / 2)
         placed = camera if world_from_path is None else camera.transformed(world_from_path)
-        cameras.append(Camera(f"frame_{index:05d}", placed.c2w, *_lens(placed)))
+        cameras.append(replace(placed, name=f"frame_{index:05d}"))
     return cameras
 
 
@@ -96,10 +97,6 @@ def write_camera_path(cameras: Sequence[Camera], fps: float) -> bytes:
         "camera_path": frames,
     }
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _lens(camera: Camera) -> tuple[int, int, float, float, float, float]:
-    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def _size(document: dict[str, Any], key: str, path: Path) -> int:

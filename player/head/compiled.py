@@ -29,7 +29,6 @@ from player.head.dense_tiles import (
     dense_tile,
     multiply_lanes,
 )
-from player.head.graph import HeadArrays
 from player.head.program import (
     BLOCK,
     DENSE,
@@ -39,7 +38,6 @@ from player.head.program import (
     QUANTIZE,
     ROUND,
     Program,
-    program_of,
 )
 
 
@@ -62,11 +60,6 @@ class CompiledHead:
         _run(p.steps, p.weights, (p.packed, p.starts), p.pairs, memory, codes, *inputs, rgb, self._places)
         check_scratch(memory, codes)
         return rgb
-
-
-def compile_head(head: HeadArrays) -> CompiledHead:
-    """A head in 8 bits, ready to run."""
-    return CompiledHead(program_of(head))
 
 
 @compiled

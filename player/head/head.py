@@ -82,9 +82,10 @@ def read_head_file(path: Path, n_channels: int) -> tuple[bytes, HeadArrays]:
 
 
 def _compile(arrays: HeadArrays) -> Run:
-    from player.head.compiled import compile_head
+    from player.head.compiled import CompiledHead
+    from player.head.program import program_of
 
-    return compile_head(arrays)
+    return CompiledHead(program_of(arrays))
 
 
 def _open_session(data: bytes, arrays: HeadArrays) -> Run:

@@ -85,7 +85,8 @@ def serve(
         renderers = [
             stack.enter_context(Renderer(asset, settings.threads, settings.march)) for asset in assets
         ]
-        server = guarded_server(settings.host, port, _title(assets[0]))
+        title = f"{printable(assets[0].folder.resolve().name)} - vfr-play"
+        server = guarded_server(settings.host, port, title)
         windows: dict[int, Window] = {}
         try:
             windows = open_windows(server, renderers, settings.samples, settings.background)
@@ -182,10 +183,6 @@ def _need_viser(asset: Asset) -> None:
             "viewer: expected the package viser, which is not installed: pip install 'vfr-bake[viewer]'; "
             f"or render files: vfr-play {asset.folder} --orbit 60 --output frames/"
         ) from error
-
-
-def _title(asset: Asset) -> str:
-    return f"{printable(asset.folder.resolve().name)} - vfr-play"
 
 
 def _shown(host: str) -> str:
