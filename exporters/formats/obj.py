@@ -34,8 +34,8 @@ def obj_bytes(mesh: TriangleMesh) -> bytes:
     >>> print(obj_bytes(mesh).decode().splitlines()[-1])
     f 1//1 2//2 3//3
     """
-    vertices = _rows("v ", (mesh.vertices, _decimals(mesh)), (mesh.colours[:, :3] / 255, 4))
-    return b"".join([_PLAIN, *vertices, *_rows("vn ", (mesh.normals, 6)), *_faces(mesh.faces, "//", 2)])
+    vertices = _rows("v", (mesh.vertices, _decimals(mesh)), (mesh.colours[:, :3] / 255, 4))
+    return b"".join([_PLAIN, *vertices, *_rows("vn", (mesh.normals, 6)), *_faces(mesh.faces, "//", 2)])
 
 
 def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[str, bytes]:
@@ -60,9 +60,9 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
         [
             _TEXTURED,
             f"mtllib {stem}.mtl\nusemtl surface\n".encode(),
-            *_rows("v ", (mesh.vertices, _decimals(mesh))),
-            *_rows("vt ", (flipped, 7)),
-            *_rows("vn ", (mesh.normals, 6)),
+            *_rows("v", (mesh.vertices, _decimals(mesh))),
+            *_rows("vt", (flipped, 7)),
+            *_rows("vn", (mesh.normals, 6)),
             *_faces(mesh.faces, "/", 3),
         ]
     )
@@ -111,7 +111,7 @@ def _rows(word: str, *columns: tuple[np.ndarray, int]) -> list[bytes]:
     lines = []
     for start in range(0, len(columns[0][0]), _CHUNK):
         rows = [_fixed(values[start : start + _CHUNK], decimals) for values, decimals in columns]
-        lines.append(_lines([word, *_joined([number for row in rows for number in row], " "), "\n"]))
+        lines.append(_lines([word, *(part for row in rows for number in row for part in (" ", number))]))
     return lines
 
 
@@ -120,8 +120,8 @@ def _faces(faces: np.ndarray, separator: str, n_times: int) -> list[bytes]:
     lines = []
     for start in range(0, len(faces), _CHUNK):
         corners = _fixed(faces[start : start + _CHUNK] + 1, 0)
-        words = [word for c in corners for word in [*([c, separator] * (n_times - 1)), c]]
-        lines.append(_lines(["f ", *_joined(words, " ", every=2 * n_times - 1), "\n"]))
+        words = [[" ", *([corner, separator] * (n_times - 1)), corner] for corner in corners]
+        lines.append(_lines(["f", *(part for word in words for part in word)]))
     return lines
 
 
@@ -150,24 +150,14 @@ def _fixed(values: np.ndarray, decimals: int) -> list[np.ndarray]:
     return columns
 
 
-def _joined(parts: list, separator: str, every: int = 1) -> list:
-    """`parts` with `separator` between each group of `every`."""
-    joined: list = []
-    for index, part in enumerate(parts):
-        if index and index % every == 0:
-            joined.append(separator)
-        joined.append(part)
-    return joined
-
-
-def _lines(parts: list) -> bytes:
+def _lines(parts: list[np.ndarray | str]) -> bytes:
     """One line per row: arrays [n, width] of ASCII codes (0 is nothing) and constant strings side by side."""
     n_rows = next(len(part) for part in parts if isinstance(part, np.ndarray))
     columns = [
         part
         if isinstance(part, np.ndarray)
         else np.broadcast_to(np.frombuffer(part.encode(), np.uint8), (n_rows, len(part)))
-        for part in parts
+        for part in [*parts, "\n"]
     ]
     text = np.concatenate(columns, axis=1)
     return text[text != 0].tobytes()

@@ -74,16 +74,21 @@ def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
     inside = box.holds(mesh.vertices.astype(np.float64))
     keep = np.all(inside[mesh.faces], axis=-1)
     if not keep.any():
-        raise nothing_inside("mesh", f"{len(mesh.faces)} faces", mesh.bounds)
+        raise nothing_inside("mesh", f"{len(mesh.faces)} faces; the mesh is", mesh.bounds)
     return (mesh if keep.all() else take_faces(mesh, keep)), 1 - float(keep.mean())
 
 
 def nothing_inside(what: str, parts: str, bounds: np.ndarray) -> ConfigError:
-    """The error that none of the `parts` of a mesh or volume are in the box, but between `bounds` [2, 3]."""
+    """The error that a crop leaves nothing.
+
+    Args:
+        what: what was cropped: "mesh".
+        parts: what it has, and the words before where it is: "12 faces; the mesh is".
+        bounds: [2, 3] where it is, from and to.
+    """
     low, high = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in bounds)
     return ConfigError(
-        f"--crop: expected a box with some of the {what} in it, got none of its {parts}; "
-        f"they are from {low} to {high}"
+        f"--crop: expected a box with some of the {what} in it, got none of its {parts} from {low} to {high}"
     )
 
 

@@ -109,7 +109,7 @@ def asset_volume(
         keep = np.flatnonzero(box.holds(points))
         if not len(keep):
             bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-            raise nothing_inside("volume", f"{len(index)} vertices", bounds)
+            raise nothing_inside("volume", f"{len(index)} vertices; they are", bounds)
     scale = np.cbrt(np.linalg.det((frame_from_world @ asset.world_from_model)[:3, :3]))
     densities = decode_density(arrays.density[keep], (manifest.density_range[0], manifest.density_range[1]))
     volume = Volume(
@@ -144,9 +144,7 @@ def _slope(grid: SparseGrid, rows: VertexRows, codes: np.ndarray, index: np.ndar
     """[n, 3] float32 unit directions up the density, which is how a surface is looked at; down where it is
     flat, inside a solid, which nobody sees."""
     slope = np.empty((len(index), 3))
-    for axis in range(3):
-        step = np.zeros(3, np.int64)
-        step[axis] = 1
+    for axis, step in enumerate(np.eye(3, dtype=np.int64)):
         rise = _codes_at(rows, codes, index + step) - _codes_at(rows, codes, index - step)
         slope[:, axis] = rise * grid.cells_per_unit[axis]
     return unit(slope, [0.0, 0.0, -1.0]).astype(np.float32)

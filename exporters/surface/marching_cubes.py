@@ -224,14 +224,9 @@ def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: flo
         for axis in range(3):
             sides = []
             for sign in (-1, 1):
-                at = g[rows].copy()
-                at[:, axis] += sign * 0.5
-                codes, _, known = code_and_slope(grid, at)
-                sides.append(
-                    np.where(known, sign * (np.clip(codes - code_level, -limit, limit) - here), np.nan)
-                )
-            both = np.stack(sides)
-            counted = np.isfinite(both)
-            total = np.where(counted, both, 0).sum(axis=0)
-            normals[rows, axis] = -total / np.maximum(counted.sum(axis=0), 1)
+                codes, _, known = code_and_slope(grid, g[rows] + sign * 0.5 * np.eye(3)[axis])
+                rise = sign * (np.clip(codes - code_level, -limit, limit) - here)
+                sides.append(np.where(known, rise, np.nan))
+            n_known = np.isfinite(sides).sum(axis=0)
+            normals[rows, axis] = -np.nansum(sides, axis=0) / np.maximum(n_known, 1)
     return unit_normals(normals, g, faces, 0.1)
