@@ -11,7 +11,7 @@ from exporters.progress import Progress, silent
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
-from player.files.files import check_target, new_folder
+from player.files.files import new_folder
 from player.render import Renderer, check_size
 
 
@@ -47,7 +47,6 @@ def export_pictures(
         raise ConfigError("--views: expected at least one view, got none")
     for camera in cameras:
         check_size(camera.width, camera.height)
-    check_target(target, force)
     n_bytes, written = 0, []
     with new_folder(target, force) as folder, Renderer(asset) as renderer:
         for done, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):

@@ -77,8 +77,10 @@ def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None
     """Start the other process and wait until it has written atlas.npz into `folder`."""
     begin = time.monotonic()
     command = python_command("exporters.mesh.unwrap", str(folder))
-    with (folder / "errors").open("wb") as errors:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=errors, stderr=errors)
+    with (
+        (folder / "errors").open("wb") as errors,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=errors, stderr=errors) as process,
+    ):
         try:
             shown = 0
             while process.poll() is None:
@@ -93,9 +95,7 @@ def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None
                     progress(shown, max(int(seconds), shown + 1))
                 time.sleep(_POLL)
         finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+            process.kill()  # nothing where it has ended
     if process.returncode:
         last = (folder / "errors").read_text(errors="replace").strip().splitlines() or ["no message"]
         raise DataError(

@@ -66,13 +66,14 @@ def fit_colours(
 
 def _smoothness(faces: np.ndarray, n: int) -> Any:
     """[n, n] sparse: sum over edges |c_i - c_j|^2 as a quadratic form."""
-    from scipy.sparse import csr_matrix, diags
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import laplacian
 
     start, end = faces[:, [0, 1, 2]].T.reshape(-1), faces[:, [1, 2, 0]].T.reshape(-1)
     half = csr_matrix((np.ones(len(start)), (start, end)), (n, n))
     edges = half + half.T
     edges.data[:] = 1  # an edge of two faces is one edge
-    return (diags(np.asarray(edges.sum(axis=1)).reshape(-1)) - edges).tocsr()
+    return laplacian(edges).tocsr()
 
 
 def _solved(square: Any, right: np.ndarray, count: np.ndarray) -> KnownColours:
