@@ -27,7 +27,7 @@ Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 def coordinates_from_world(
     coordinates: str, world_from_model: np.ndarray, file_format: str = ""
 ) -> np.ndarray:
-    """What takes world coordinates to those that a writer is given.
+    """The matrix from world coordinates to those that a writer is given.
 
     Args:
         coordinates: one of COORDINATES.

@@ -131,7 +131,7 @@ def parse_glb(data: bytes, where: str) -> tuple[dict, bytes]:
 
 
 def glb_content(data: bytes, where: str) -> dict[str, Any]:
-    """What a file that `glb_bytes` wrote holds, Y up.
+    """The arrays in a file that `glb_bytes` wrote, Y up.
 
     Returns:
         `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 4] linear, 0..1, or, of a mesh with a

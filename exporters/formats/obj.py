@@ -71,7 +71,7 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
 
 
 def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:
-    """What a file that `obj_bytes` or `textured_obj_files` wrote holds.
+    """The arrays in a file that `obj_bytes` or `textured_obj_files` wrote.
 
     Returns:
         `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 3] sRGB, 0..1, or, of a mesh with a

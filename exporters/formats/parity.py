@@ -122,7 +122,7 @@ def _sorted(index: np.ndarray) -> np.ndarray:
 
 
 def _rounding(mesh: TriangleMesh) -> float:
-    """What float32, and nine digits, may move the largest coordinate."""
+    """How far float32, or nine digits, may move the largest coordinate."""
     return 2e-7 * max(float(np.abs(mesh.vertices).max(initial=0)), 1e-30)
 
 
@@ -148,7 +148,7 @@ def _check_picture(where: str, texture: Texture, png: bytes) -> None:
 
 
 def _content(suffix: str, data: bytes, where: str) -> dict[str, Any]:
-    """What a file holds, in the file's own axes: `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours`
+    """The arrays in a file, in its own axes: `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours`
     [n, 3 or 4] in 0..1, sRGB, in GLB and USD linear, or `uvs` [n, 2] with the origin at the upper left."""
     if suffix == ".obj":
         return parse_obj(data, where)

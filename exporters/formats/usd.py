@@ -63,8 +63,9 @@ def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
 
 
 def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
-    """What a file holds: `vertices`, `normals` [n, 3], `colours` [n, 4] linear, `faces` [m, 3], `up`,
-    `metres`, by another reading of the library; FormatError if it is no such mesh."""
+    """The arrays of a file, read by the library: `vertices`, `normals` [n, 3], `colours` [n, 4] linear and
+    `faces` [m, 3], and besides `up` ("Y" or "Z") and `metres` (a unit). Raises FormatError for another
+    file."""
     Usd, UsdGeom, _ = _pxr()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mesh{suffix}"

@@ -26,7 +26,7 @@ from player.errors import FormatError, ParityError
 from player.head.head import Head, read_head_file
 
 TOLERANCE = 1e-6
-"""Most that rgb may differ from the asset's own head: it is the same graph, on numbers that are exact in
+"""The most that rgb may differ from the asset's own head. It is the same graph, on numbers that are exact in
 float32, so that only another order of float32 additions is allowed for."""
 
 N_FETCHES = 5

@@ -146,7 +146,7 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
 
 
 def levels(limits: Range) -> tuple[float, int]:
-    """What a step between the 256 levels of a range counts, and the code of 0.
+    """The step between the 256 levels of a range, and the code of 0.
 
     >>> levels((-0.1, 25.4))
     (0.1, 1)
@@ -156,7 +156,7 @@ def levels(limits: Range) -> tuple[float, int]:
 
 
 def weight_scales(weight: np.ndarray) -> np.ndarray:
-    """What a code of the weights [n_in, n_out] counts, for each output: [n_out] float32.
+    """The step between two codes of the weights [n_in, n_out], for each output: [n_out] float32.
 
     No two neighbouring codes then exceed `player.head.graph.PAIR_LIMIT`: their sum before rounding is one
     less at most, and each may be rounded up by a half.

@@ -1,1 +1,1 @@
-"""What is done to a mesh: fewer faces, a flat layout for its texture, rays onto it."""
+"""What is done to a mesh: fewer faces, a flat layout and a texture, rays onto it."""

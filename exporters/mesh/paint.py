@@ -18,7 +18,7 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from player.errors import DataError
 
-_AT_ONCE = 1 << 22  # candidate texels looked at together
+_AT_ONCE = 1 << 22  # how many candidate texels are looked at together
 
 ColourPoints = Callable[[np.ndarray, np.ndarray], KnownColours]
 """The colours of points [n, 3] with unit normals [n, 3]."""

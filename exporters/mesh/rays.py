@@ -1,7 +1,7 @@
 """Which face of a mesh each pixel of a camera sees: rays cast by Open3D (Embree).
 
-Letters: t, the distance along a ray of unit direction; b, the shares of a face's three corners in the place
-that is hit, of sum 1.
+Letters: t, the distance along a ray of unit direction; b, what each of a face's three corners counts at the
+place that a ray meets, of sum 1.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from player.cameras.camera import Camera
 
 
 class Hits(NamedTuple):
-    """What the pixels of a camera hit, row by row of the picture."""
+    """The places where rays through the pixels of a camera meet a mesh."""
 
     pixels: np.ndarray
-    """[n] int64 the pixels that hit something, ascending."""
+    """[n] int64, the pixels whose ray meets the mesh, ascending; pixels are numbered row by row."""
     distance: np.ndarray
-    """[n] float32 along the ray, world units."""
+    """[n] float32, distance along the ray, world units."""
     faces: np.ndarray
-    """[n] int64 the first face there."""
+    """[n] int64, the first face that the ray meets."""
     shares: np.ndarray
-    """[n, 3] float64 of its corners."""
+    """[n, 3] float64, the shares b of that face's corners."""
 
 
 class MeshRays:
@@ -43,7 +43,7 @@ class MeshRays:
         )
 
     def seen_by(self, camera: Camera) -> Hits:
-        """What the centres of the pixels of a camera (world frame) hit."""
+        """Where the rays through the pixel centres of a camera (world frame) meet the mesh."""
         rays = np.concatenate(camera.rays(), axis=1)
         answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)))
         distance = answer["t_hit"].numpy()

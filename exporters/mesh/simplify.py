@@ -1,12 +1,12 @@
 """Fewer faces: quadric edge collapse (Garland and Heckbert 1997) by Open3D, colours and normals kept.
 
-Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha: that
+Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha, which
 is taken from the nearest vertex of the source. It stops early where every edge that is left would fold the
 surface: a mesh with many thin parts keeps more faces than were asked for (lego, 380,541 faces: 20,000 are
 reached, of 5,000 remain 11,721). The command says so.
 
-Of millions of faces that takes minutes, so that vertices in the same small cube are made one first, until
-FIRST times as many faces are left as are asked for.
+That takes minutes for millions of faces. There, vertices in the same small cube are made one first, until
+about FIRST times as many faces are left as are asked for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
 from player.errors import ConfigError, DataError
 
 FIRST = 12
-"""Faces for each that is asked for, from which edges are collapsed."""
+"""Edges are collapsed from this many times the faces that are asked for; what is finer is clustered first."""
 
 
 def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:

@@ -1,7 +1,7 @@
 """A mesh laid out flat: charts and their places in a square, by xatlas.
 
-xatlas has no way to be stopped and says nothing while it works, so it runs in a process of its own: that
-one is ended when the time is over, or with Ctrl-C. Its time grows faster than the number of faces that it
+xatlas has no way to be stopped and says nothing while it works, so it runs in a process of its own, which is
+ended when the time is over, or with Ctrl-C. Its time grows faster than the number of faces that it
 is given at once (1,500 faces: a tenth of a millisecond each; 6,000: over three), so the mesh is cut into
 small parts.
 """
@@ -23,11 +23,13 @@ from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
 
 GUTTER = 2
-"""Texels between two charts."""
+"""Texels that are left free between two charts."""
 PART = 1000
-"""Faces of a part of the mesh at most; parts share no chart."""
-_FILLED = 0.8  # of the picture's edge, for charts alone: what xatlas packs is three quarters full
-_POLL = 0.1  # seconds
+"""The most faces that a part of the mesh has; parts share no chart."""
+_FILLED = (
+    0.8  # the share of the picture's edge that charts are scaled to: xatlas fills three quarters of the area
+)
+_POLL = 0.1  # seconds between two looks at the other process
 
 
 def unwrap(

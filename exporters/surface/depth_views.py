@@ -1,8 +1,8 @@
-"""What the training cameras see of an asset: their pictures of depth, played, and which points are in view.
+"""What the training cameras see of an asset: pictures of depth, which are rendered, and the points in view.
 
-Letters: t, the distance from a camera along a ray, world units; c, the cosine between a point's normal and
-the direction to the camera. A point is seen where c > 0 and t is at most what the picture of depth has there,
-plus a tolerance; where the picture is less than half opaque nothing is in the way.
+Letters: t, the distance from a camera to a point, world units; c, the cosine between the point's normal and
+the direction to the camera. The camera sees the point if c > 0 and t is at most the depth that the picture
+has there, plus a tolerance; where the picture is less than half opaque nothing is in the way.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from player.cameras.views import asset_cameras
 from player.render import Renderer
 
 MAX_VIEWS = 100
-"""Views that are played, spread over all of the training cameras."""
+"""The most views that are played; they are spread over all of the training cameras."""
 SMALL_PIXELS = 90_000
-"""Pixels of a played view at most, where it tells what is seen and in which colour."""
+"""The most pixels of a view that is played to tell what is seen, and in which colour."""
 FULL_PIXELS = 1 << 18
-"""Pixels of a played view at most, where its depth becomes a surface."""
+"""The most pixels of a view that is played for its depth, which becomes a surface."""
 SOLID = 0.5
-"""Opacity from which on there is something at the depth of a pixel."""
+"""Least opacity of a pixel that has something at its depth."""
 TOLERANCE = 2.0
-"""Voxels behind the depth of a pixel at which a point still counts as seen: that depth is a mean."""
+"""How many voxels behind the depth of a pixel a point still counts as seen: that depth is a mean."""
 
 
 @dataclass(frozen=True, eq=False)

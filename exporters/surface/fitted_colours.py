@@ -23,8 +23,8 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.depth_views import DepthView
 
 SMOOTH = 0.03
-"""What an edge counts, in pixels."""
-_ROUNDS = 40  # of conjugate gradients; the bytes of the colours settle in about twenty
+"""The weight of an edge beside that of a pixel, which is 1."""
+_ROUNDS = 40  # steps of the conjugate gradients; colours in 8 bits settle in about twenty
 
 
 def fit_colours(
@@ -65,7 +65,7 @@ def fit_colours(
 
 
 def _smoothness(faces: np.ndarray, n: int) -> Any:
-    """[n, n] sparse: sum over edges |c_i - c_j|^2 as a quadratic form."""
+    """The sparse matrix L [n, n] for which c^T L c is the sum over edges |c_i - c_j|^2."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import laplacian
 

@@ -16,7 +16,7 @@ from player.asset.bricks import pack_vertices, unpack_vertices
 from player.errors import DataError
 
 REACH = 2.0
-"""Cells of features that are kept around the ball: the diagonal of one."""
+"""How many cells around the ball keep their features; the diagonal of a cell is shorter."""
 
 
 def inner_region(asset: Asset) -> Asset:
@@ -42,9 +42,12 @@ def inner_region(asset: Asset) -> Asset:
 def _inside(
     coords: np.ndarray, masks: np.ndarray, codes: np.ndarray, resolution: int, reach: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of bricks and their codes what lies in the unit ball, or within `reach` cells of it."""
+    """The bricks' coordinates, masks and codes of the vertices in the unit ball, or within `reach` cells of
+    it."""
     index = unpack_vertices(coords, masks)
-    edge = resolution / 4  # cells of a model unit; the middle is at two of them
+    edge = (
+        resolution / 4
+    )  # cells along a model unit; the middle of the ball is two model units from the corner
     inside = np.linalg.norm(index / edge - 2, axis=-1) <= 1 + reach / edge
     kept_coords, kept_masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
     return kept_coords, kept_masks, np.asarray(codes)[inside]

@@ -27,12 +27,16 @@ from player.asset.grid import SparseGrid, corner_number
 from player.errors import ConfigError, DataError
 
 BLOCK = 64
-"""Cells along each side of a block: 1 MB of codes."""
-_CLIP = math.log(50.0)  # |log(sigma / level)| counts as this at most: nothing empty pulls the surface to it
-_NUDGE = 1e-2  # codes: no corner of a cell is nearer to the level, so that no vertex of the mesh is on one
-_ROUNDS = 4  # of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
-_REACH = 0.5  # voxels that a vertex is moved by at most
-_AT_ONCE = 1 << 18
+"""Cells along each side of a block, whose codes take 1 MB."""
+_CLIP = math.log(
+    50.0
+)  # |log(sigma / level)| is clipped to this: what is empty does not pull the surface to it
+_NUDGE = (
+    1e-2  # least distance of a cell's corner from the level, in codes: no vertex of the mesh is on a corner
+)
+_ROUNDS = 4  # steps of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
+_REACH = 0.5  # the most voxels that a vertex is moved by
+_AT_ONCE = 1 << 18  # points looked at together
 
 
 def extract_asset_surface(
@@ -104,7 +108,7 @@ def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int =
             codes, slopes, known = code_and_slope(grid, here)
             square = np.sum(slopes**2, axis=-1)
             apart = code_level - codes
-            usable = known & (square > 1.0) & ~settled  # below a code a voxel the direction is noise
+            usable = known & (square > 1.0) & ~settled  # a slope below a code a voxel points anywhere
             step = np.where(usable, apart / np.where(usable, square, 1), 0)[:, None] * slopes
             candidate = here + step
             near = np.linalg.norm(candidate - first, axis=-1) <= _REACH * stride
@@ -214,8 +218,11 @@ def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: float) -> np.ndarray:
-    """Differences of the clipped code over half a voxel to both sides; over one side where the other is not
-    stored; and where they vanish, the mean of the faces around, by area."""
+    """Unit normals [n, 3] at points `g` [n, 3] along the falling code.
+
+    They are differences of the clipped code over half a voxel to both sides, or to the one side that is
+    stored; where the differences vanish, the mean of the faces around, by area.
+    """
     limit = _CLIP / float(grid.density_slope)
     normals = np.zeros_like(g)
     for start in range(0, len(g), _AT_ONCE):

@@ -1,9 +1,9 @@
 """The colour of a surface: what the asset's head says of short rays onto it.
 
 A ray starts a few voxels above the point and is marched as the player marches, so that a point that is a
-little beside the surface still gets the surface's colour. One number a point has to stand for all directions:
-it is the mean over the directions of training cameras that see the point, or, where none does, the view along
-the normal. docs/exports.md has the measurement that chose between them.
+little beside the surface still gets the surface's colour. A point has one colour for all directions: it is
+the mean over the directions of training cameras that see the point, or, where none does, the view along the
+normal. docs/exports.md has the measurement that chose between them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from player.head.head import Head
 from player.render import choose_march, default_threads
 
 STAND_OFF = 3.0
-"""Voxels above the surface at which a ray starts."""
+"""How many voxels above the surface a ray starts."""
 MAX_DIRECTIONS = 4
-"""Cameras that count for a point, at most: eight are no nearer to the player's pictures (docs/exports.md)."""
-_RAYS = 1 << 14
-_LEAST = 0.1  # opacity below which a ray has met too little to have a colour
+"""The most cameras that count for a point: eight are no nearer to the player's pictures (docs/exports.md)."""
+_RAYS = 1 << 14  # rays that a thread marches at a time
+_LEAST = 0.1  # a ray of less opacity has met too little to have a colour
 
 
 def surface_colours(

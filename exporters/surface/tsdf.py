@@ -1,8 +1,8 @@
 """A second way to a surface: training cameras' depth pictures, fused by Open3D (Curless and Levoy 1996).
 
-Where marching cubes asks what the density is at a place, this asks how far the cameras see: fog in front of a
-surface counts for less, thin parts that few pixels hit for nothing. Pixels of less than half opacity are left
-out, and so are those beside a jump in depth, whose mean lies between two surfaces.
+Marching cubes asks what the density is at a place; this asks how far the cameras see. Fog in front of a
+surface then counts for less, and thin parts that few pixels hit for nothing. Pixels of less than half opacity
+are left out, and so are those beside a jump in depth, whose mean lies between two surfaces.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
 
 TRUNCATION = 3.0
-"""Voxels on both sides of a surface that a depth is believed for."""
+"""How many voxels before and behind a depth it is believed for."""
 JUMP = 5.0
-"""Voxels between neighbouring pixels that make two surfaces of them; one seen at 80 degrees stays below."""
-_BLOCKS = 50_000  # of 8^3 voxels, made room for at once; it grows
-_LEAST_WEIGHT = 1.0  # views that must have seen a voxel
+"""Neighbouring pixels whose depths differ by more voxels see two surfaces; a surface seen at 80 degrees stays
+below."""
+_BLOCKS = 50_000  # blocks of 8^3 voxels that room is made for at first; Open3D makes more when it needs them
+_LEAST_WEIGHT = 1.0  # how many views must have seen a voxel
 
 
 def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent) -> Surface:
