@@ -42,13 +42,10 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     >>> colmap_files([camera], empty)["images.txt"].decode().splitlines()[-2]
     '1 0.0 1.0 0.0 0.0 0.0 0.0 0.0 1 a.png'
     """
-    lenses: dict[tuple[int, int, float, float, float, float], int] = {}
+    lenses: dict[tuple[float, ...], int] = {}
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)"]
     for number, camera in enumerate(cameras, start=1):
-        lens = (
-            int(camera.width), int(camera.height),
-            float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy),
-        )  # fmt: skip
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         lens_id = lenses.setdefault(lens, len(lenses) + 1)
         w2c = np.linalg.inv(_rigid(camera).c2w @ OPENGL_FROM_OPENCV)
         pose = _numbers([*quaternion(w2c[:3, :3]), *w2c[:3, 3]])
