@@ -27,7 +27,7 @@ GUTTER = 2
 PART = 1000
 """The most faces that a part of the mesh has; parts share no chart."""
 _FILLED = (
-    0.8  # the share of the picture's edge that charts are scaled to: xatlas fills three quarters of the area
+    0.8  # charts are scaled to this share of the picture's edge: xatlas fills three quarters of the area
 )
 _POLL = 0.1  # seconds between two looks at the other process
 

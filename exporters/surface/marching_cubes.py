@@ -31,9 +31,7 @@ BLOCK = 64
 _CLIP = math.log(
     50.0
 )  # |log(sigma / level)| is clipped to this: what is empty does not pull the surface to it
-_NUDGE = (
-    1e-2  # least distance of a cell's corner from the level, in codes: no vertex of the mesh is on a corner
-)
+_NUDGE = 1e-2  # least distance of a cell's corner from the level, codes: no vertex of the mesh is on one
 _ROUNDS = 4  # steps of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
 _REACH = 0.5  # the most voxels that a vertex is moved by
 _AT_ONCE = 1 << 18  # points looked at together
