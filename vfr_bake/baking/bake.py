@@ -41,7 +41,7 @@ from vfr_bake.baking.grids import (
     project,
 )
 from vfr_bake.baking.head import fold_head, runner, small_head
-from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
+from vfr_bake.baking.held_out import BETWEEN, HeldOut, views_between
 from vfr_bake.baking.limits import (
     bytes_beside_features,
     channels_that_fit,
@@ -49,7 +49,6 @@ from vfr_bake.baking.limits import (
     file_sizes,
     frame_ms,
     keep_to_time,
-    measured_in_memory,
     unwritten_asset,
 )
 from vfr_bake.baking.mesh import bake_mesh, mesh_size
@@ -111,19 +110,20 @@ class _Bake:
         self.model, self.config = model, config
         self.choice = config.choice(model.field.config.unbounded)
         self.seconds: dict[str, float] = {}
+        """Wall-clock time of each part."""
         self.left_out: dict[str, str] = {}
+        """What is not in the asset, and what that changed."""
         self.lookups: dict[str, float] = {}
         self.n_fetches = self.choice.n_fetches
         self.plan = make_plan(model, config)
-        self.n_rays: int
         self._report = report
         self._begun = time.monotonic()
         with self._part("teacher"):
             self.held_out = HeldOut(model, config.check_views)
 
     def run(self, folder: Path, force: bool) -> BakeResult:
-        layout = self._cells()
-        stored, teacher = self._store(layout)
+        layout, n_rays = self._cells()
+        stored, teacher = self._store(layout, n_rays)
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
@@ -147,24 +147,26 @@ class _Bake:
             "mesh_floaters_removed": removed.floaters,
             "stages": self.held_out.table(),
         }
-        result: dict[str, Any] = {}
+        missed: list[str] = []
 
         def finish(new: Path) -> dict[str, bytes]:
-            made = self._judge(new, folder.name)
-            result["last"], result["missed"] = self.held_out.stages[-1], made.missed
-            return {"report.json": made.json(), "report.html": made.html()}
+            report = self._judge(new, folder.name)
+            missed.extend(report.missed)
+            return {"report.json": report.json(), "report.html": report.html()}
 
         with self._part("writing and checking"):
-            manifest = self._manifest(layout, arrays.features.shape[1], figures)
+            manifest = self._manifest(layout, arrays, figures)
             cameras = write_cameras(self.model.cameras)
             write_asset(folder, manifest, arrays, head, ply_bytes(mesh), cameras, force, finish)
-        last: Stage = result["last"]
+        last = self.held_out.stages[-1]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
         n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
-        return BakeResult(len(layout.densities), n_bytes, seconds, figures, result["missed"])
+        return BakeResult(len(layout.densities), n_bytes, seconds, figures, missed)
 
-    def _cells(self) -> Layout:
+    def _cells(self) -> tuple[Layout, int]:
+        """Where densities and features are stored, and the number of training rays for which that leaves
+        room."""
         model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = self._progress("visibility")
@@ -181,26 +183,28 @@ class _Bake:
                 f"{plan.resolutions.features**3:,}: is the model "
                 "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
             )
-        self.n_rays = plan.n_rays(n_cells)
         near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
-        return make_layout(visible, step, plan.resolutions, model.field.config.unbounded, near)
+        layout = make_layout(visible, step, plan.resolutions, model.field.config.unbounded, near)
+        return layout, plan.n_rays(n_cells)
 
     def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
         """The mesh of what is about to be written."""
-        manifest = self._manifest(layout, arrays.features.shape[1], {})
-        size = self.choice.mesh_resolution or layout.densities.resolution
+        manifest = self._manifest(layout, arrays, {})
         with self._part("mesh"), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             files = {"head.onnx": head, "cameras.json": write_cameras(self.model.cameras)}
             asset = unwritten_asset(Path(folder), manifest, arrays, files)
-            return bake_mesh(asset, size, self._report)
+            return bake_mesh(asset, self._mesh_resolution(layout), self._report)
 
-    def _store(self, layout: Layout) -> tuple[Stored, TeacherRays]:
+    def _mesh_resolution(self, layout: Layout) -> int:
+        return self.choice.mesh_resolution or layout.densities.resolution
+
+    def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
             views = cameras + views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
-            teacher = render_teacher(model, views, self.n_rays, 0, self._progress("teacher"))
+            teacher = render_teacher(model, views, n_rays, 0, self._progress("teacher"))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
             projection = self._projection(teacher)
@@ -242,8 +246,7 @@ class _Bake:
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
-        size = self.choice.mesh_resolution or layout.densities.resolution
-        mesh = mesh_size(layout.grid(density, features), size)
+        mesh = mesh_size(layout.grid(density, features), self._mesh_resolution(layout))
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
         rest = bytes_beside_features(arrays, mesh, len(write_cameras(self.model.cameras)), head)
@@ -261,12 +264,17 @@ class _Bake:
             any_ranges = [(0.0, 1.0)] * (1 + len(weights.directional)) if self.choice.head_bits == 8 else None
             return head_onnx(weights, any_ranges)
 
-        manifest = self._manifest(layout, arrays.features.shape[1], {})
-        measure = measured_in_memory(manifest, arrays, head, self.model.cameras[0])
+        manifest = self._manifest(layout, arrays, {})
+
+        def measure(width: int, n_fetches: int) -> float:
+            with TemporaryDirectory() as folder:
+                asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head(width)})
+                return frame_ms(asset, self.model.cameras[0], n_fetches)
+
         fixed = self.config.head_width is not None, self.config.k != "auto"
         return keep_to_time(self.choice, target_ms, measure, *fixed)
 
-    def _manifest(self, layout: Layout, n_channels: int, figures: dict[str, Any]) -> Manifest:
+    def _manifest(self, layout: Layout, arrays: GridArrays, figures: dict[str, Any]) -> Manifest:
         model = self.model
         camera = model.cameras[0]
         return Manifest(
@@ -278,7 +286,7 @@ class _Bake:
             contracted=layout.contracted,
             near=layout.near,
             density_range=layout.density_range,
-            n_channels=n_channels,
+            n_channels=arrays.features.shape[1],
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
             n_samples=self.n_fetches,
@@ -304,9 +312,8 @@ class _Bake:
                 "--weight-floor"
             )
         megabytes = sum(n_bytes.values()) / 1e6
-        ms = None
-        if self.config.target_ms is not None:
-            ms = frame_ms(asset, self.model.cameras[0], self.n_fetches)
+        timed = self.config.target_ms is not None
+        ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
         check_budget(self.config, last.loss_db, megabytes, ms)
         missed = []
         if last.loss_db > self.choice.target_loss_db:

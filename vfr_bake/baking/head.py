@@ -1,10 +1,9 @@
-"""The head's weights as the exported graph takes them, with everything linear folded together.
+"""The head as the exported graph takes it, with everything linear folded together, and the same graph in
+torch, which can be trained: in float32, or as it is played in 8 bits.
 
-The exported head in torch, to be tuned: in float32, or as it is played in 8 bits.
-
-Letters as in `player.head.graph`. What 8 bits round, activations to 256 levels of a fixed range and weights
-as `exporters.head.onnx_head.weight_scales` says, is rounded in the same places, and learns as if it were not
-(straight through).
+Letters as in `player.head.graph`. In 8 bits, activations are rounded to 256 levels of a fixed range, and
+weights as `exporters.head.onnx_head.weight_scales` says. Both are rounded in the same places here, and are
+trained as if they were not (straight through).
 """
 
 from __future__ import annotations
@@ -19,6 +18,9 @@ from torch.nn.functional import gelu
 from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
 from vfr_bake.field.networks import Head, SphericalHarmonics
+
+ROWS_AT_ONCE = 8192
+"""Rays whose colours are computed at once."""
 
 
 def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
@@ -56,7 +58,7 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
 def small_head(
     like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: np.ndarray
 ) -> HeadWeights:
-    """A head of `like`'s form with random weights, which has everything to learn.
+    """A head of `like`'s form with random weights, still to be trained.
 
     It is `width` wide, has `n_layers` directional layers after the first and `n_bands` bands of spherical
     harmonics; `code_scale` [n_channels] is the size of the features that it will be given, in codes.
@@ -83,11 +85,11 @@ class FoldedHead(nn.Module):
     """The exported graph in torch.
 
     Args:
-        weights: what it begins with.
-        units: [n_channels] what composites are counted in, so that channels of small codes are learned as
-            fast as those of large ones.
-        ranges: of the hidden activations, as `exporters.head.ranges` finds them, where the wide layers are to
-            be multiplied in 8 bits.
+        weights: the weights before training.
+        units: [n_channels] units that composites are counted in, so that channels of small codes are trained
+            as fast as those of large ones.
+        ranges: ranges of the hidden activations, as `exporters.head.ranges` finds them, where the wide layers
+            are to be multiplied in 8 bits.
     """
 
     def __init__(
@@ -174,10 +176,10 @@ def runner(
 
     @torch.no_grad()
     def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-        parts = [
-            head(torch.from_numpy(features[i : i + 8192]), torch.from_numpy(dirs[i : i + 8192])).numpy()
-            for i in range(0, len(features), 8192)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+        rgb = np.empty((len(features), 3), np.float32)
+        for first in range(0, len(features), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            rgb[rows] = head(torch.from_numpy(features[rows]), torch.from_numpy(dirs[rows])).numpy()
+        return rgb
 
     return colours

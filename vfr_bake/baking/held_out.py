@@ -1,10 +1,10 @@
-"""Views between the training cameras: what the bake learns from and is measured on without a data set.
+"""Views between the training cameras, which a bake is trained and measured on without a data set, and what
+each of its steps loses on some of them that nothing else looks at.
 
-What each step of the bake loses, on views that nothing else in the bake looks at.
-
-The model is the teacher, so that what is measured is the mean square difference e to its pictures. Against
-photographs the model itself is off by E (its PSNR from training). The two errors have little to do with each
-other, so that the baked pictures are off by e + E, which is 10 log10(1 + e / E) dB worse: the expected loss.
+The full model is the teacher, so that what is measured is the mean square difference e to its pictures.
+Against photographs the model itself is off by E (its PSNR from training). The two errors have little to do
+with each other, so that the baked pictures are off by e + E, which is 10 log10(1 + e / E) dB worse: the
+expected loss.
 """
 
 from __future__ import annotations
@@ -25,26 +25,41 @@ from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
 LARGEST_TURN = np.deg2rad(15.0)
-"""Farther from a training camera than this nobody has taught the model anything."""
+"""Largest angle between a view and a training camera: farther away the model is not trained."""
 BETWEEN = 4
 """Views between for each training camera, where the number of rays does not depend on that of the views."""
 NEIGHBOURS = 3
 """Training cameras that count as beside one: on a walk the next, the last and one more."""
 PLACES = 64
-"""On the way between two cameras, one of which is taken."""
+"""Places on the way between two cameras, one of which is taken."""
 MARGIN = 0.1
-"""Of a picture of an unbounded scene, on every side: what the bake looks at beyond its border. Fox's held-out
-views see there, and what was not stored cost them a decibel and more."""
+"""Border that the bake adds on every side of a picture of an unbounded scene, as a share of its size. Fox's
+held-out views see there, and what was not stored cost them a decibel and more."""
 ASIDE = 1.0
-"""Of the way between two cameras: up to so far aside of it stand views of an unbounded scene. A held-out view
-of can, which stands that far from the others, lost 5 dB to cells that came into sight and were not stored."""
+"""Views of an unbounded scene stand aside of the way between two cameras, by up to this share of its length.
+A held-out view of can, which stands that far from the others, lost 5 dB to cells that came into sight and
+were not stored."""
+RAYS_OF_A_VIEW = 20_000
+"""Most rays of a view that is measured."""
+N_DIRECTIONS = 6
+"""Other directions from which a colour is looked at, to see whether it depends on them."""
+SEED = 2
+"""Seed of the views that are kept for measuring; training uses others."""
+DEFAULT_PSNR = 30.0
+"""PSNR that is assumed for a model whose training has measured nothing."""
+
+Head = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Composited features [n, n_channels] and unit dirs [n, 3] to colours [n, 3]."""
 
 
 def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> list[Camera]:
-    """`n_views` cameras (model frame), each between a training camera, of which all have their turn, and one
-    of its nearest: a quarter to half of the way there, and turned around what all cameras look at by up to a
-    quarter of the angle between the two. `wide` ones also stand aside of that way and see beyond their
-    borders (`widened`). The same seed gives the same views, another one others."""
+    """`n_views` cameras (model frame) between the training cameras.
+
+    Each stands a quarter to half of the way from a training camera, of which all have their turn, to one of
+    its nearest, and is turned around what all cameras look at by up to a quarter of the angle between the
+    two. With `wide` they also stand aside of that way and see beyond their borders (`widened`). The views
+    follow from the seed.
+    """
     cameras = model.model_cameras()
     random = np.random.default_rng(seed)
     focus = focus_point(cameras)
@@ -92,30 +107,19 @@ def widened(camera: Camera) -> Camera:
     return replace(camera, **size, cx=camera.cx + x, cy=camera.cy + y)
 
 
-RAYS_OF_A_VIEW = 20_000
-N_DIRECTIONS = 6
-"""Other directions from which a colour is looked at, to see whether it depends on them."""
-SEED = 2
-"""Of the views that are kept for measuring; learning uses others."""
-DEFAULT_PSNR = 30.0
-"""Taken for the model where training has measured nothing."""
-
-Head = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Composited features [n, n_channels] and unit dirs [n, 3] to colours [n, 3]."""
-
-
 @dataclass(frozen=True)
 class Stage:
     """The pictures after a step of the bake, compared with the model's."""
 
     name: str
     psnr: float
-    """dB to the model's pictures, not rounded to 8 bits."""
+    """PSNR in dB against the model's pictures, not rounded to 8 bits."""
     loss_db: float
-    """Expected loss against photographs since the trained model."""
+    """Expected loss in dB against photographs, compared with the trained model."""
     samples_median: float
-    """Density samples of a ray that hits."""
+    """Median number of density samples of a ray that hits."""
     samples_p95: float
+    """95th percentile of the same."""
 
 
 class HeldOut:
@@ -151,29 +155,36 @@ class HeldOut:
     def channel_loss(self, kept: np.ndarray) -> float:
         """Expected loss in dB if the model's own rendered features x went through `kept` [n_channels,
         n_channels], a projection of them."""
-        shown = self._colours((self._features @ kept.T).astype(np.float32))
-        off = self._opacity * (shown - self._colours(self._features))
-        return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
-
-    def loss_of(self, features: np.ndarray, opacity: np.ndarray) -> float:
-        """Expected loss in dB if every ray had composited `features` [n, n_channels] and `opacity` [n], and
-        the model's own head."""
-        rgb = (1 - opacity[:, None]) * self.background
-        met = np.flatnonzero(opacity > 0)
-        rgb[met] += opacity[met, None] * head_colours(self._field, features[met], self.rays_d[met])
-        return expected_loss(float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2)), self.model_psnr)
+        return self._loss_of_colours(self._colours((self._features @ kept.T).astype(np.float32)))
 
     def direction_loss(self) -> float:
         """Expected loss in dB if every colour were the mean of those seen from N_DIRECTIONS other rays'
         directions."""
         random = np.random.default_rng(SEED)
-        own = self._colours(self._features)
-        mean = np.zeros_like(own)
+        mean = np.zeros((len(self._hits), 3), np.float32)
         for _ in range(N_DIRECTIONS):
             others = self.rays_d[random.permutation(self._hits)]
             mean += head_colours(self._field, self._features, others) / N_DIRECTIONS
-        off = self._opacity * (mean - own)
-        return expected_loss(float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size, self.model_psnr)
+        return self._loss_of_colours(mean)
+
+    def _loss_of_colours(self, colours: np.ndarray) -> float:
+        """Expected loss in dB if the rays that hit had these colours [n_hits, 3] instead of the model's."""
+        off = self._opacity * (colours - self._colours(self._features))
+        error = float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size
+        return expected_loss(error, self.model_psnr)
+
+    def loss_of(self, features: np.ndarray, opacity: np.ndarray) -> float:
+        """Expected loss in dB if every ray had composited `features` [n, n_channels] and `opacity` [n], and
+        the model's own head."""
+        met = np.flatnonzero(opacity > 0)
+        colours = head_colours(self._field, features[met], self.rays_d[met])
+        return expected_loss(self._error(met, colours, opacity), self.model_psnr)
+
+    def _error(self, hits: np.ndarray, colours: np.ndarray, opacity: np.ndarray) -> float:
+        """Mean square error of pictures with `colours` [n_hits, 3] at the rays `hits`, and `opacity` [n]."""
+        rgb = (1 - opacity[:, None]) * self.background
+        rgb[hits] += colours * opacity[hits, None]
+        return float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the rays compose as played."""
@@ -185,26 +196,23 @@ class HeldOut:
 
     def measure_march(self, name: str, played: MarchResult, head: Head) -> Stage:
         """Show what was composed, and keep the result under `name`."""
-        stage = self._stage(name, played, head)
-        self.stages.append(stage)
-        return stage
+        self.stages.append(self._stage(name, played, head))
+        return self.stages[-1]
 
     def look(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, without keeping the result."""
         return self._stage(name, self.march(grid, n_fetches), head)
 
     def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
-        rgb = (1 - played.opacity[:, None]) * self.background
         hits = played.hits
-        rgb[hits] += head(played.features, self.rays_d[hits]) * played.opacity[hits, None]
-        samples = played.n_density_samples[hits]
-        error = float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
+        error = self._error(hits, head(played.features, self.rays_d[hits]), played.opacity)
+        samples = played.n_density_samples[hits] if len(hits) else np.zeros(1)
         return Stage(
             name,
             -10 * float(np.log10(max(error, 1e-12))),
             expected_loss(error, self.model_psnr),
-            float(np.median(samples)) if len(samples) else 0.0,
-            float(np.percentile(samples, 95)) if len(samples) else 0.0,
+            float(np.median(samples)),
+            float(np.percentile(samples, 95)),
         )
 
     def table(self) -> list[dict[str, Any]]:

@@ -1,16 +1,12 @@
-"""Limits on the asset's size and loss: what fits, and whether they were met.
+"""What a bake was told to keep to, size, loss and the time of a frame: what fits, and whether it was met.
 
-How long a frame takes to play on this machine, and the widest head and the most lookups that keep to a
-time.
-
-An asset that plays before it is written.
+The time of a frame is measured by the player on this machine, with an asset that is not written yet.
 """
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,11 +24,24 @@ from vfr_bake.presets import BakeChoice
 SMALL_FILES = 200_000
 """Bytes kept for a small head and the manifest where the asset has to fit into a budget."""
 REFINED_GROWTH = 1.1
-"""Refined codes are rougher than the field's, and pack less well."""
+"""How many times larger features are packed after refinement: their codes are rougher than the field's."""
+SIZE = 800
+"""Pixels along each side of the frame that is measured."""
+N_FRAMES = 3
+"""Frames of which the median counts; one before them warms up."""
+WIDTHS = (64, 48, 32, 16)
+"""Widths of smaller heads that are tried."""
+LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
+"""Numbers of lookups a ray that are tried."""
+RESERVE = 0.9
+"""Share of the time asked for that a choice may take before refinement."""
+
+Measure = Callable[[int, int], float]
+"""Milliseconds of a frame by (width of the head, 0 for the model's own; lookups a ray, 0 for all)."""
 
 
 def bytes_beside_features(arrays: GridArrays, mesh: int, cameras: int, head: int) -> int:
-    """Of an asset of these arrays, with a mesh, cameras and a head of so many bytes."""
+    """Bytes of an asset of these arrays without its features; mesh, cameras and head are given in bytes."""
     masks = (len(pack_masks(words)) for words in (arrays.brick_masks, arrays.feature_masks))
     coords = arrays.brick_coords.nbytes + arrays.feature_coords.nbytes
     return coords + sum(masks) + len(pack_codes(arrays.density)) + mesh + cameras + head
@@ -64,8 +73,8 @@ def file_sizes(folder: Path) -> dict[str, int]:
 
 
 def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float | None) -> None:
-    """Raise TrainingError where the written files miss what was asked; it says what came nearest. `ms` is the
-    time of a frame, where that was asked."""
+    """Raises TrainingError where the written files miss what was asked; it says what they reach. `ms` is the
+    time of a frame, or None where that was not asked."""
     limits = (
         ("loss", config.max_loss_db, loss_db, "dB"),
         ("size", config.max_mb, megabytes, "MB"),
@@ -79,21 +88,6 @@ def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float
             )
 
 
-SIZE = 800
-"""Pixels along each side of the frame that is measured."""
-N_FRAMES = 3
-"""Frames of which the median counts; one before them warms up."""
-WIDTHS = (64, 48, 32, 16)
-"""Widths of smaller heads that are tried."""
-LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
-"""Lookups a ray that are tried."""
-RESERVE = 0.9
-"""Of the time that is asked for, what a choice may take before refinement."""
-
-Measure = Callable[[int, int], float]
-"""Milliseconds of a frame by (head's width, 0 the model's own; lookups a ray, 0 all)."""
-
-
 def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:
     """Milliseconds of a frame of SIZE x SIZE seen by `camera` (WORLD frame), as the player plays it here."""
     times = []
@@ -105,26 +99,13 @@ def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:
     return float(np.median(times[1:]))
 
 
-def measured_in_memory(
-    manifest: Manifest, arrays: GridArrays, head: Callable[[int], bytes], camera: Camera
-) -> Measure:
-    """How long an asset that is not written yet would take; `head` gives `head.onnx` by its width."""
-
-    def measure(width: int, n_fetches: int) -> float:
-        with tempfile.TemporaryDirectory() as folder:
-            asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head(width)})
-            return frame_ms(asset, camera, n_fetches)
-
-    return measure
-
-
 def keep_to_time(
     choice: BakeChoice, target_ms: float, measure: Measure, same_head: bool, same_lookups: bool
 ) -> BakeChoice:
     """`choice` with the widest head, and then the most lookups, whose frames take no longer than `target_ms`.
 
-    What was asked for by number, head or lookups, stays the same. Raises TrainingError where the least takes
-    longer; it says how long.
+    `same_head` and `same_lookups` say what stays because it was asked for by number. Raises TrainingError
+    where even the least takes longer; it says how long.
 
     >>> from vfr_bake.presets import PRESETS
     >>> chosen = keep_to_time(PRESETS["balanced"], 100, lambda width, k: width + 6 * k, False, False)
@@ -133,12 +114,12 @@ def keep_to_time(
     """
     fewest = choice.n_fetches if same_lookups else min(LOOKUPS)
     least = np.inf
-    for width in (choice.head_width,) if same_head else _widths(choice.head_width):
+    for width in (choice.head_width,) if same_head else _downwards(choice.head_width, WIDTHS):
         took = measure(width, fewest)
         least = min(least, took)
         if took > RESERVE * target_ms:
             continue
-        for k in (fewest,) if same_lookups else _most_first(choice.n_fetches):
+        for k in (fewest,) if same_lookups else _downwards(choice.n_fetches, LOOKUPS[::-1]):
             if k == fewest or measure(width, k) <= RESERVE * target_ms:
                 return replace(choice, head_width=width, n_fetches=k)
     raise TrainingError(
@@ -148,14 +129,9 @@ def keep_to_time(
     )
 
 
-def _widths(widest: int) -> Iterator[int]:
-    yield widest
-    yield from (width for width in WIDTHS if width < widest or not widest)
-
-
-def _most_first(most: int) -> Iterator[int]:
-    yield most
-    yield from (k for k in reversed(LOOKUPS) if k < most or not most)
+def _downwards(most: int, tried: Sequence[int]) -> list[int]:
+    """`most` and those of `tried`, in falling order, that are less; 0 is more than any number."""
+    return [most, *(n for n in tried if n < most or not most)]
 
 
 def unwritten_asset(folder: Path, manifest: Manifest, arrays: GridArrays, files: dict[str, bytes]) -> Asset:

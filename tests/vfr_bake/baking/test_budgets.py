@@ -11,7 +11,6 @@ import pytest
 
 from player.asset.asset import Asset
 from player.errors import TrainingError
-from vfr_bake.baking import limits
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.limits import keep_to_time
 from vfr_bake.baking.plan import MESH_SECONDS, N_RAYS, expected_seconds, make_plan
@@ -66,7 +65,6 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
         bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), quiet)
     # The files are measured again: what takes longer than it did before refinement is refused as well.
     times = iter([1.0, 1.0, 9.0])
-    monkeypatch.setattr(limits, "frame_ms", lambda *_: next(times))
     monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda *_: next(times))
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
         bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), quiet)
