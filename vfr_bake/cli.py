@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C, 141 output t
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 EVAL_VIEWS = {False: 10, True: 3}
-"""Test views rendered at the end by whether the scene is unbounded, where no number is asked for."""
+"""Number of test views rendered at the end, by whether the scene is unbounded, where none is asked for."""
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
@@ -49,16 +50,12 @@ def bench_main(argv: Sequence[str] | None = None) -> int:
     return run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
 
 
-def _need_train_extra() -> None:
+def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
     for package in ("torch", "numba", "tyro"):
         if find_spec(package) is None:
             raise MissingExtraError(
                 f"{package} is not installed: training and baking need: pip install vfr-bake[train]"
             )
-
-
-def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
-    _need_train_extra()
     import tyro
 
     from vfr_bake import options as classes
@@ -66,9 +63,7 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
 
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
     with registry():
-        return tyro.cli(
-            getattr(classes, options), prog=name, args=None if argv is None else list(argv), config=config
-        )
+        return tyro.cli(getattr(classes, options), prog=name, args=argv, config=config)
 
 
 def _train(options: Any) -> int:
@@ -108,7 +103,7 @@ def _train(options: Any) -> int:
 
 
 def _with_cameras(data: str) -> str:
-    """The folder to load: photographs or a video without cameras have them estimated first."""
+    """The folder to load; for photographs or a video without cameras, these are estimated first."""
     from vfr_bake.data import needs_cameras
     from vfr_bake.data.poses import estimate_cameras
 
@@ -138,7 +133,7 @@ def _warn_of_folds(scene: Scene) -> None:
 
 
 def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
-    """Train to the end or to Ctrl-C, with a checkpoint now and then; what it came to."""
+    """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
 
     last = None
@@ -177,11 +172,9 @@ def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
 
 
 def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
-    tested = (
-        f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
-        if "test_psnr" in figures
-        else ""
-    )
+    tested = ""
+    if "test_psnr" in figures:
+        tested = f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
     skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
     write_result(
         options.json,
@@ -192,9 +185,8 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
 
 
 def _decibels(error: float) -> float:
-    from math import log10
-
-    return -10 * log10(error) if error > 0 else float("inf")
+    """The PSNR of a mean square error."""
+    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
@@ -237,14 +229,10 @@ def _bake(options: Any) -> int:
     with Bars() as bars:
         result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6
-    figures = {
-        "asset": str(options.asset),
-        "megabytes": megabytes,
-        "seconds": result.seconds,
-    } | result.figures
+    written = {"asset": str(options.asset), "megabytes": megabytes, "seconds": result.seconds}
     write_result(
         options.json,
-        figures,
+        written | result.figures,
         f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
         f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; as played it agrees "
         f"with the full model to {result.figures['psnr_to_full_model']:.1f} dB, an expected loss of "
@@ -256,6 +244,8 @@ def _bake(options: Any) -> int:
 
 
 def _eval(options: Any) -> int:
+    import numpy as np
+
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
     from vfr_bake.data import load_scene
@@ -270,9 +260,9 @@ def _eval(options: Any) -> int:
         scene = load_scene(options.data, bar.count, downscale=model.train.get("downscale", 1))
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
-    cameras = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
-    to_model = _inverse(model.world_from_model)
-    views = type(scene.test)([c.transformed(to_model) for c in cameras], scene.test.images)
+    to_model = np.linalg.inv(model.world_from_model)
+    world = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
+    views = replace(scene.test, cameras=[c.transformed(to_model) for c in world])
     names = frame_names(views.cameras)
     scores = []
     with Bar("test views") as bar:
@@ -281,7 +271,7 @@ def _eval(options: Any) -> int:
                 picture = comparison(view.photograph, view.rgb)
                 write_png(options.pictures / f"{names[len(scores)]}.png", picture)
             scores.append(score_view(view.name, view.rgb, view.photograph, lpips))
-            bar.count(len(scores), len(cameras))
+            bar.count(len(scores), len(world))
     means = mean_scores(scores)
     figures = _finite(means) | {
         "per_view": [_finite(asdict(score)) for score in scores],
@@ -319,13 +309,5 @@ def _bench(options: Any) -> int:
 
 
 def _finite(figures: dict[str, Any]) -> dict[str, Any]:
-    """None for infinite figures: the PSNR of equal pictures has no number in JSON."""
-    from math import inf
-
-    return {key: None if value == inf else value for key, value in figures.items()}
-
-
-def _inverse(matrix: Any) -> Any:
-    import numpy as np
-
-    return np.linalg.inv(matrix)
+    """The figures with None for infinite ones: the PSNR of equal pictures has no number in JSON."""
+    return {key: None if value == math.inf else value for key, value in figures.items()}

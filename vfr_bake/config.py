@@ -35,7 +35,8 @@ number of levels: 32 double the time of a step on a CPU, most of which is spent 
 
 
 FIELD_BY_DEVICE = {"cpu": {}, "cuda": {"log2_table_size": 19}}
-"""Settings of the architecture that follow from the device: the paper's batches fill the paper's tables."""
+"""Settings of the architecture that follow from the device: on a GPU, batches as large as the paper's fill
+tables as large as the paper's."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
@@ -176,15 +177,15 @@ GPU_SETTINGS = {
     "grid_rate": 1e-2,
     "network_rate": 1e-2,
 }
-"""The paper's; the most rays are ours: most of an object's meet nothing."""
+"""The paper's settings for a GPU, but for `max_rays`, which is ours: most rays of an object meet nothing."""
 GPU_STEPS = {False: 20_000, True: 40_000}
-"""The paper's, by whether the scene is unbounded."""
+"""The paper's number of steps, by whether the scene is unbounded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of `vfr-train`. What is None follows from the device (`for_device`): the defaults of a CPU are
-    made for two cores, those of a GPU are the paper's."""
+    """Settings of `vfr-train`. What is None follows from the device: the defaults of a CPU are made for two
+    cores, those of a GPU are the paper's."""
 
     kind: SceneKind = "auto"
     """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted, sampled by

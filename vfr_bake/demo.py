@@ -20,9 +20,10 @@ from player.app.option_types import number
 from player.files.files import check_target, write_bytes
 
 TRAIN_MINUTES = 2.0
-"""Leaves room for compiling, baking and playing within five minutes on two cores."""
+"""Training time by default: it leaves room for compiling, baking and playing within five minutes on two
+cores."""
 N_SHOWN = 4
-"""Test views in the side-by-side picture."""
+"""Number of test views in the side-by-side picture."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,14 +76,15 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     }  # fmt: skip
     figures = {name: json.loads((output / f"{name}.json").read_text()) for name in ("train", "bake", "play")}
     background = np.array(Asset.open(asset).manifest.background)
-    picture, played = _side_by_side(scene, background, Path(frames), output / "side_by_side.png")
-    _summary(output, picture, seconds, figures, played, time.monotonic() - begin)
+    played = _side_by_side(scene, background, Path(frames), output / "side_by_side.png")
+    seconds["all"] = time.monotonic() - begin
+    print(_summary(output, seconds, played, **figures))
     return 0
 
 
-def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path) -> tuple[Path, float]:
-    """Photographs over the `background` [3] above, played frames below; and the mean PSNR of all played test
-    frames."""
+def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path) -> float:
+    """Write photographs over the `background` [3] above played frames as one picture; returns the mean PSNR
+    in dB of all played test frames."""
     from PIL import Image
 
     from player.cameras.transforms import frame_names
@@ -96,27 +98,27 @@ def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path
     chosen = np.linspace(0, len(names) - 1, N_SHOWN).round().astype(int)
     rows = [np.concatenate([pictures[i] for i in chosen], axis=1) for pictures in (photographs, played)]
     write_png(target, np.concatenate(rows))
-    return target, mean
+    return mean
 
 
 def _summary(
     output: Path,
-    picture: Path,
     seconds: dict[str, float],
-    figures: dict[str, Any],
     played: float,
-    total: float,
-) -> None:
-    train, bake, play = figures["train"], figures["bake"], figures["play"]
+    train: dict[str, Any],
+    bake: dict[str, Any],
+    play: dict[str, Any],
+) -> str:
+    """Where the results are and how good; `seconds` and figures are those of the commands."""
     full = f", full model {train['test_psnr']:.2f} dB" if "test_psnr" in train else ""
-    print(
+    return (
         f"\npictures   {output / 'frames'} ({play['frames']} frames)\n"
-        f"           {picture} (the scene's own pictures above, played below)\n"
+        f"           {output / 'side_by_side.png'} (the scene's own pictures above, played below)\n"
         f"asset      {output / 'asset'}: {bake['megabytes']:.1f} MB;  mesh {output / 'mesh.glb'}\n"
         f"quality    {played:.2f} dB played against the test pictures{full}\n"
         f"speed      {1000 / play['ms_median']:.1f} frames/s at {play['width']}x{play['height']}, "
         f"{play['threads']} threads, {play['march']} march\n"
-        f"time       {total:.0f} s: train {seconds['train']:.0f}, bake {seconds['bake']:.0f}, "
+        f"time       {seconds['all']:.0f} s: train {seconds['train']:.0f}, bake {seconds['bake']:.0f}, "
         f"play {seconds['play']:.0f}, export {seconds['export']:.0f}"
     )
 

@@ -10,7 +10,7 @@ Preset = Literal["fidelity", "balanced", "fast"]
 
 @dataclass(frozen=True, kw_only=True)
 class BakeChoice:
-    """What a preset decides, with what was given instead in its place."""
+    """What a preset decides; settings that were given replace it."""
 
     cells_per_pixel: float
     """Resolution of the densities where none is given: cells for each pixel that the training pictures see
@@ -83,5 +83,5 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
     },
     "fast": {"refine_steps": 2500},
 }
-"""What they decide otherwise for an unbounded scene: its rays have several times as many fetches, which take
-their time; its features are most of what a grid of so few cells loses."""
+"""What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
+which take their time; its features are most of what a grid of so few cells loses."""
