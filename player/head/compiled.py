@@ -112,7 +112,7 @@ def _dense(memory, weights, step, n):
 
 @compiled
 def _dense_bytes(codes, memory, packed, starts, weights, step, n):
-    """The same of a layer of codes in bytes."""
+    """One layer of n pixels whose inputs and weights are codes in bytes, tile by tile."""
     x, w, start, scale, out, pitch = step.x, step.w, step.start, step.scale, step.out, step.pitch
     depth = step.depth
     for first in range(0, pitch, WIDTH):
