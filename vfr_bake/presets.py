@@ -16,34 +16,39 @@ class BakeChoice:
     """Resolution of the densities where none is given: cells for each pixel that the training pictures see
     across the middle of the box, at most half again the field's finest level."""
     contracted_resolution: int
-    """The same for an unbounded scene: cells over all of contracted space, four model units, of which few
-    hold anything."""
+    """Resolution of the densities of an unbounded scene where none is given: cells along an axis of
+    contracted space, which is four model units wide; few of the cells hold anything."""
     feature_share: float
     """Cells of the features' grid for a cell of the densities', along an axis; at most the field's finest
     level."""
     culled_loss_db: float
-    """Cells are left out whose lack alone loses no more than this, dB."""
+    """Cells are left out where leaving them out, alone, loses no more than this, dB."""
     n_channels: int
-    """Most feature channels."""
+    """Largest number of feature channels."""
     channel_loss_db: float
     """Fewer channels are taken where they lose no more than this, before refinement, dB."""
     n_fetches: int
-    """Most feature lookups per ray, k; 0 for every sample."""
+    """Largest number of feature lookups per ray, k; 0 for every sample."""
     sample_loss_db: float
-    """Fewer are taken where they lose no more than this, dB."""
+    """Fewer lookups are taken where they lose no more than this, dB."""
     code_levels: int
+    """Largest feature code, 7 to 127."""
     head_width: int
+    """Width of a smaller head; 0 keeps the model's own."""
     head_layers: int
     """Directional layers of a smaller head after the first."""
     head_bands: int
     """Bands of spherical harmonics of a smaller head, at most the model's; 1 where nothing depends on the
     direction."""
     head_bits: int
+    """Bits of the head's wide layers, 8 or 32."""
     refine_steps: int
+    """Steps of each round of refinement."""
     minutes: float
     """Wall-clock minutes of a bake, roughly: refinement takes fewer steps where the machine is too slow for
     all of them, unless their number was asked for."""
     mesh_resolution: int
+    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
     target_loss_db: float
     """Expected loss that the preset aims at, dB."""
 

@@ -16,15 +16,15 @@ from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, MissingExtraError
 
 PIXELS = 22_500
-"""Of a view that is played for the mesh, at most: its faces are as large as several pixels of those."""
+"""Most pixels of a view that is played for the mesh, whose faces are as large as several of these pixels."""
 BYTES_A_FACE = 27
-"""Of a PLY: 13 of a face itself, and half a vertex of 28."""
+"""Bytes that a face takes in a PLY file: 13 for the face itself, and half a vertex of 28 bytes."""
 
 
 def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMesh, Removed]:
     """The mesh in the WORLD frame, and what was removed of it.
 
-    Of an unbounded scene it is that of the inner region; an even fog, which has no surface, has an empty one.
+    In an unbounded scene it covers the inner region; an even fog, which has no surface, has an empty mesh.
 
     Args:
         asset: complete but for its mesh; it is played.
@@ -47,7 +47,7 @@ def bake_mesh(asset: Asset, resolution: int, report: Report) -> tuple[TriangleMe
 
 
 def mesh_size(grid: SparseGrid, resolution: int) -> int:
-    """Bytes that the mesh will take at most: for a budget that is shared out before there is one."""
+    """Most bytes that the mesh will take, for a budget that is shared out before there is a mesh."""
     try:
         _, faces, _ = extract_asset_surface(grid, stride=_stride(grid, resolution))
     except (ConfigError, DataError):
@@ -56,10 +56,11 @@ def mesh_size(grid: SparseGrid, resolution: int) -> int:
 
 
 def _stride(grid: SparseGrid, resolution: int) -> int:
-    """Every second vertex is looked at where that makes twice as fine a mesh, along an axis, as is wanted."""
+    """2 where every second vertex of the grid still makes a mesh that is twice as fine along an axis as is
+    wanted, otherwise 1."""
     return 2 if grid.resolution >= 4 * resolution else 1
 
 
 def _share(grid: SparseGrid, resolution: int) -> float:
-    """Of the faces that are made, how many are wanted."""
+    """Share of the extracted faces that is wanted."""
     return min(resolution * _stride(grid, resolution) / grid.resolution, 1.0) ** 2

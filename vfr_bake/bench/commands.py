@@ -10,12 +10,12 @@ from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 
 GIVEN = ("resolution", "max_mb", "max_loss_db")
-"""Settings of `vfr-bake` that no preset decides, and that change the asset."""
+"""Settings of `vfr-bake` that change the asset and that no preset decides."""
 
 
 def bake_command(folder: str, asset: Asset) -> str:
-    """What bakes an asset like this one, out of the settings that it remembers; "" if it remembers none, or
-    something else."""
+    """The command that bakes an asset like this one, from the settings that the asset keeps; "" if it keeps
+    none, or something else."""
     settings = asset.manifest.provenance.get("bake")
     preset = settings.get("preset") if isinstance(settings, dict) else None
     if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
@@ -37,7 +37,7 @@ def bake_command(folder: str, asset: Asset) -> str:
 
 
 def play_command(folder: str, samples: int, size: tuple[int, int]) -> str:
-    """What plays an asset with k = `samples`.
+    """The command that plays an asset with k = `samples`.
 
     >>> play_command("my out", 5, (400, 300))
     "vfr-play 'my out' --samples 5 --size 400x300 --orbit 60 --output frames/"

@@ -17,12 +17,12 @@ class Mark:
     """One point of a plot."""
 
     x: float
-    """More than 0 on a logarithmic axis."""
+    """Value along the logarithmic axis, more than 0."""
     y: float
     size: float
-    """Share 0..1 of the largest mark's area."""
+    """Area as a share 0 to 1 of the largest mark's."""
     label: str
-    """Shown where the mouse rests on the mark."""
+    """Text that is shown where the mouse rests on the mark."""
     filled: bool
     """Whether it is on the front."""
 

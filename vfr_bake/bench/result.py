@@ -11,7 +11,7 @@ from vfr_bake.bench.timing import Size, Times
 from vfr_bake.bench.worst import WorstPixel
 
 MAX_PSNR = 99.0
-"""What the PSNR of equal pictures, which has no bound, counts as in a loss, dB."""
+"""PSNR in dB that equal pictures, whose PSNR is infinite, count as in a loss."""
 
 
 @dataclass(frozen=True)
@@ -19,20 +19,20 @@ class Setting:
     """One row of the trade."""
 
     name: str
-    """The asset's folder and k, or the model's file."""
+    """Folder and k of an asset, or the file of the model."""
     asset: str | None
     """The folder; None for the full model."""
     samples: int | None
-    """k; 0 is every sample. None for the full model."""
+    """Lookups a ray, k; 0 for every sample. None for the full model."""
     what: dict[str, Any]
-    """Preset, head, resolution, channels, number formats: what the asset is made of."""
+    """What the asset is made of: preset, head, resolution, channels and number formats."""
     scores: dict[str, float | None]
     """psnr, ssim, lpips (8-bit pictures), psnr_float, ssim_float: means against the photographs;
     psnr_to_model, ssim_to_model: against the full model's unrounded pictures, None without one; loss_db:
     what is lost against it (without a model, against the best setting)."""
     times: dict[Size, Times]
     n_bytes: int
-    """Of the asset without its reports, or of the model file."""
+    """Bytes of the asset without its reports, or of the model file."""
     peak_mb: float | None
     """Most memory of the process that played it at the photographs' size, all k."""
     first_picture_ms: float | None
@@ -92,7 +92,7 @@ def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setti
 
 
 def _plain(setting: Setting) -> dict[str, Any]:
-    """A row as JSON: a PSNR without bound is null."""
+    """A row as JSON; an infinite PSNR is null."""
     row = asdict(setting)
     row["scores"] = {key: None if value == float("inf") else value for key, value in row["scores"].items()}
     row["times"] = {f"{width}x{height}": asdict(times) for (width, height), times in setting.times.items()}

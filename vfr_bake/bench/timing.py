@@ -21,12 +21,12 @@ Size = tuple[int, int]
 """Width and height of a frame in pixels."""
 Ask = Callable[..., dict[str, Any]]
 SEED = 0
-"""Of the order within the rounds."""
+"""Seed of the order within the rounds."""
 
 
 @dataclass(frozen=True)
 class Times:
-    """A setting's frames of one size; milliseconds."""
+    """Milliseconds of a setting's frames of one size."""
 
     median: float
     p95: float
@@ -37,10 +37,10 @@ class Times:
     round's view and the machine's state in it, which all settings share, are divided out."""
     frames: int
     march: float
-    """Median of a frame, without the lookups."""
+    """Median of the march in a frame, without the lookups."""
     lookups: float | None
-    """Median of a frame; None where only one k was played, so that march and lookups cannot be told apart:
-    they are in `march` then."""
+    """Median of the lookups in a frame; None where only one k was played, so that march and lookups cannot be
+    told apart: `march` holds both then."""
     head: float
     rest: float
 

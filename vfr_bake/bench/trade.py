@@ -34,9 +34,9 @@ from vfr_bake.data import load_scene
 from vfr_bake.training.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
 
 N_FIRST_PICTURES = 3
-"""Times that an asset is opened for its first picture; the median counts."""
+"""Number of times that an asset is opened for its first picture; the median counts."""
 MODEL_FRAMES = 3
-"""Frames of the full model of each size but the photographs' own, of which there is one a view."""
+"""Frames of the full model of each size, but for the photographs' own size, which has one frame a view."""
 
 Progress = Callable[[str, int, int], object]
 
@@ -46,11 +46,11 @@ class Views:
     """Photographs that the quality is measured against."""
 
     cameras: list[Camera]
-    """World frame."""
+    """Cameras of the views, in the world frame."""
     background: np.ndarray
-    """[3] float32 in [0, 1], the assets' own."""
+    """[3] float32 in [0, 1], the colour behind the assets."""
     photographs: list[np.ndarray]
-    """[h, w, 3] float32 in [0, 1], over the background."""
+    """[h, w, 3] float32 in [0, 1] each, over the background."""
 
 
 def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:

@@ -12,10 +12,12 @@ from player.cameras.camera import Camera
 from player.march.march import sample_rays
 
 N_WORST = 10
+"""Number of worst pixels that are listed."""
 APART = 8
-"""Pixels: two of the worst in one view are at least so far apart, so that one wire does not take them all."""
+"""Distance in pixels that two of the worst in one view have at least, so that one wire does not take them
+all."""
 N_WEIGHTS = 6
-"""Heaviest samples of a ray that are listed."""
+"""Number of the heaviest samples of a ray that are listed."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,11 @@ class WorstPixel:
     column: int
     row: int
     error: float
-    """Largest difference of the three channels, 0..1."""
+    """Largest difference of the three colour channels, 0 to 1."""
     wanted: tuple[float, ...]
     played: tuple[float, ...]
     n_density_samples: int
-    """Density samples with weight."""
+    """Number of density samples with weight."""
     opacity: float
     weights: tuple[tuple[float, float], ...]
     """(t in world units, weight) of the heaviest samples, heaviest first."""
