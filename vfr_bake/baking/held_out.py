@@ -187,7 +187,7 @@ class HeldOut:
         return float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
-        """What the rays compose as played."""
+        """What the player composes on the rays."""
         return choose_march("auto")[1].march(grid, self.rays_o, self.rays_d, n_fetches)
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:

@@ -30,9 +30,9 @@ from vfr_bake.training.model_file import Model
 PROGRAM_BYTES = 800_000_000
 """Bytes that Python, torch, numba and the model itself take."""
 N_RAYS = 2_000_000
-"""Rays that head and stored values learn from, where there is memory for them."""
+"""Rays that head and stored values are trained on, where there is memory for them."""
 UNBOUNDED_RAYS = 500_000
-"""The same for an unbounded scene: there all rays meet something, and at many samples each."""
+"""Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
 FEWEST_RAYS = 100_000
 RAY_BYTES = {False: 300, True: 1_900}
 """Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
@@ -59,7 +59,7 @@ MESH_SECONDS = 40.0
 
 @dataclass(frozen=True)
 class Plan:
-    """What follows from the memory allowed, and what is expected."""
+    """Sizes that follow from the memory allowed, and the memory that the bake is expected to take."""
 
     resolutions: Resolutions
     n_cells: float
@@ -94,7 +94,7 @@ class Plan:
 
 
 def make_plan(model: Model, config: BakeConfig) -> Plan:
-    """What to bake within `config.max_memory` gigabytes.
+    """The plan of a bake that takes at most `config.max_memory` gigabytes.
 
     Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
     """

@@ -39,7 +39,7 @@ class Setting:
     """From starting a process to its first picture of the photographs' size, Python included, what numba
     compiles being in its cache."""
     commands: tuple[str, ...]
-    """What bakes it, where the asset remembers, and what plays it."""
+    """The command that bakes it, if the asset keeps its settings, and the command that plays it."""
     on_front: bool = False
 
     @property
