@@ -19,12 +19,12 @@ Answer = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class Process:
-    """A module of this package, run as a program of its own; a context manager."""
+    """`vfr_bake.bench.frames` as a program of its own, with its arguments; a context manager."""
 
-    def __init__(self, module: str, *arguments: str) -> None:
-        self._name = module.rpartition(".")[2]
+    def __init__(self, *arguments: str) -> None:
+        self._name = f"{arguments[0]}_frames"
         self._process = subprocess.Popen(
-            python_command(module, *arguments),
+            python_command("vfr_bake.bench.frames", *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -146,9 +146,7 @@ class _Run:
         self._max_memory = str(config.max_memory or 0)
 
     def player(self, name: str) -> Process:
-        return Process(
-            "vfr_bake.bench.player_frames", name, str(self._cameras), self._threads, self._max_memory
-        )
+        return Process("player", name, str(self._cameras), self._threads, self._max_memory)
 
     def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
         """The full model's row and its pictures, one a view."""
@@ -157,7 +155,7 @@ class _Run:
         frames += [(size, turn % n_views) for size in sizes[1:] for turn in range(MODEL_FRAMES)]
         answers: dict[Size, list[dict[str, Any]]] = {size: [] for size in sizes}
         pictures = []
-        with Process("vfr_bake.bench.model_frames", str(path), str(self._cameras), self._threads) as process:
+        with Process("model", str(path), str(self._cameras), self._threads) as process:
             process.ask(view=0, size=[32, 32], rgb=None)
             for done, (size, view) in enumerate(frames, start=1):
                 kept = str(self._picture) if size == sizes[0] else None

@@ -195,7 +195,7 @@ def test_a_player_that_fails_says_why(shells_folder: Path, tmp_path: Path) -> No
     (broken / "head.onnx").write_bytes(b"")
     arguments = (str(broken), str(broken / "cameras.json"), "1", "0")
     with (
-        Process("vfr_bake.bench.player_frames", *arguments) as process,
+        Process("player", *arguments) as process,
         pytest.raises(Exception, match=r"head\.onnx: size: expected \d+ bytes, got 0"),
     ):
         process.ask(view=0, size=[8, 8], samples=1, rgb=None)

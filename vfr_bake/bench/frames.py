@@ -1,0 +1,98 @@
+"""The processes that render for the bench: one plays an asset, another renders the full model.
+
+    python -m vfr_bake.bench.frames player ASSET CAMERAS THREADS MAX_MEMORY
+    python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS
+
+A request has `view`, `size` [width, height], `samples` (for an asset only), and `rgb`, a file for the picture
+or null. The answer has the milliseconds of the frame and, of them, of march with lookups and of the head
+(time in their tasks over the number of threads), the fetches of all rays that hit, and peak memory. A model's
+frame is not taken apart.
+
+The player's process imports the player alone, as `vfr-play` does; so what either needs is imported where it
+is opened.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from player.app.play import peak_rss_mb
+from player.cameras.transforms import read_cameras
+from vfr_bake.bench.process import Answer, Clock, serve
+
+
+def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Answer:
+    """An asset ready to play; `threads` 0 is one for each core, `max_memory` 0 a share of the machine's."""
+    from player.asset.asset import Asset
+    from player.march.march import MIN_OPACITY
+    from player.render import Renderer
+
+    views = read_cameras(Path(cameras))
+    renderer = Renderer(Asset.open(folder, max_memory=float(max_memory) or None), int(threads) or None)
+    march, head = (Clock(part) for part in (renderer._module.march, renderer._head))
+    renderer._module, renderer._head = SimpleNamespace(march=march), head  # type: ignore[assignment]
+
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        camera = views[request["view"]].resized(*request["size"])
+        march.seconds = head.seconds = 0.0
+        frame, ms = _timed(lambda: renderer.render(camera, request["samples"]))
+        taken = frame.n_density_samples[frame.opacity > MIN_OPACITY]
+        return _kept(request, frame.rgb) | {
+            "ms": ms,
+            "march_ms": 1000 * march.seconds / renderer.n_threads,
+            "head_ms": 1000 * head.seconds / renderer.n_threads,
+            "fetches": int(np.minimum(taken, request["samples"] or taken).sum()),
+            "samples": float(taken.mean()) if len(taken) else 0.0,
+            "march": renderer.march,
+            "threads": renderer.n_threads,
+        }
+
+    return answer
+
+
+def open_model(path: str, cameras: str, threads: str) -> Answer:
+    """A model ready to render; `threads` 0 is one for each core."""
+    import numba
+    import torch
+
+    from vfr_bake.rendering.render import render_image
+    from vfr_bake.training.model_file import load_model
+
+    if int(threads):
+        torch.set_num_threads(int(threads))
+        numba.set_num_threads(min(int(threads), numba.get_num_threads()))
+    model = load_model(Path(path))
+    views = [c.transformed(np.linalg.inv(model.world_from_model)) for c in read_cameras(Path(cameras))]
+
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        camera = views[request["view"]].resized(*request["size"])
+        rgb, ms = _timed(lambda: render_image(model.field, model.sampler, camera, model.background))
+        return _kept(request, rgb) | {"ms": ms, "march_ms": 0.0, "head_ms": 0.0, "fetches": 0}
+
+    return answer
+
+
+def _timed(render: Callable[[], Any]) -> tuple[Any, float]:
+    """What was rendered, and the milliseconds that it took."""
+    start = time.perf_counter()
+    rendered = render()
+    return rendered, 1000 * (time.perf_counter() - start)
+
+
+def _kept(request: dict[str, Any], rgb: np.ndarray) -> dict[str, Any]:
+    """Write the picture if that is asked for; returns the peak memory."""
+    if request["rgb"] is not None:
+        np.save(request["rgb"], rgb)
+    return {"peak_mb": peak_rss_mb()}
+
+
+if __name__ == "__main__":
+    opened = {"player": open_player, "model": open_model}[sys.argv[1]]
+    serve(lambda: opened(*sys.argv[2:]), sys.stdin, sys.stdout)
