@@ -274,10 +274,10 @@ def refine(
 ) -> Stored:
     """Head and codes after `steps` on the squared error of the colours over random backgrounds.
 
-    Codes are rounded wherever they are composed, and returned unrounded. The features of `stored` are changed in
-    place: there may be no room for them twice. With a `grid`, whose lookups and densities `rays` must hold at
-    every sample, the densities are trained too, and the weights of the rays follow them. With `ranges` the head
-    is trained as it is played in 8 bits (`vfr_bake.baking.head`).
+    Codes are rounded wherever they are composed, and returned unrounded. The features of `stored` are changed
+    in place: there may be no room for them twice. With a `grid`, whose lookups and densities `rays` must hold
+    at every sample, the densities are trained too, and the weights of the rays follow them. With `ranges` the
+    head is trained as it is played in 8 bits (`vfr_bake.baking.head`).
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
