@@ -27,13 +27,13 @@ from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.bounds import BLOCK, block_bounds
+from player.march.box import Bounds
 from player.march.march import MarchResult
 from player.march.normals import composited_normals
 from player.march.pixels import Planes, pixels_of_blocks, rays_of_pixels, write_pixels
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
-Bounds = tuple[np.ndarray, np.ndarray]
 
 MAX_PIXELS = 1 << 26
 """Largest picture, 8192 x 8192."""
@@ -283,7 +283,11 @@ def check_size(width: int, height: int) -> None:
 
 
 def choose_march(name: March) -> tuple[str, ModuleType]:
-    """Name and module of a march."""
+    """The name of the march that runs, and the module that has it. With "auto" it is the compiled one, where
+    that is installed and was not found to be wrong.
+
+    Raises MissingExtraError: `name` is "numba", which is not installed or does not run here.
+    """
     if name != "numpy":
         from player import proof
         from player.compiled import compiling

@@ -148,7 +148,7 @@ class Asset:
 
     @cached_property
     def world_from_model(self) -> np.ndarray:
-        """[4, 4] float64."""
+        """The similarity [4, 4] float64 from the model frame to the world."""
         return np.array(self.manifest.world_from_model)
 
     @property

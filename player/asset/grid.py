@@ -1,4 +1,4 @@
-"""The sparse grid as the marches want it: built from the arrays of an asset when it is opened, in numpy.
+"""The sparse grid as the march wants it: built from the arrays of an asset when it is opened, in numpy.
 
 Letters: R cells per axis, nb bricks per axis, C channels; a slot is the number of a brick that has a live
 cell. Everything is flat, so that one integer addresses it, in numpy as in compiled code:
@@ -118,14 +118,13 @@ class SparseGrid:
 
     @property
     def most_samples(self) -> int:
-        """Lattice places on the box's diagonal, and three for rounding: a march ends there, whatever the
-        ray."""
+        """The number of samples on the box's diagonal, and three for rounding: no ray is marched further."""
         diagonal = float(np.linalg.norm(self.resolution / self.cells_per_unit.astype(np.float64)))
         return most_samples(diagonal, float(self.step))
 
 
 def most_samples(diagonal: float, step: float) -> int:
-    """Places of a lattice of `step` on so long a diagonal, and three for rounding."""
+    """The number of samples, `step` apart, on a diagonal of a box, and three for rounding."""
     return int(diagonal / step) + 3
 
 
@@ -215,7 +214,7 @@ def build_grid(
 
 
 def vertex_rows(coords: np.ndarray, masks: np.ndarray, resolution: int) -> VertexRows:
-    """Rows of the vertices of bricks as they are on disk; at least one is stored.
+    """The rows of the vertices of bricks, which are as they are on disk; at least one vertex is stored.
 
     >>> from player.asset.bricks import pack_vertices
     >>> coords, masks, _ = pack_vertices(np.array([[0, 0, 0], [9, 0, 0], [9, 0, 1]]))

@@ -129,13 +129,13 @@ def _per_axis(manifest: Manifest) -> list[tuple[Names, int]]:
 
 
 def _n_bricks(manifest: Manifest, names: Names) -> int:
-    """As many as there are at least, by the size of their coordinates."""
+    """The least number of bricks that a grid can have, by the size of the file of their coordinates."""
     return max(manifest.files[PLACES[names[0]]].bytes - _LONGEST_HEADER, 0) // 6
 
 
 def _most_packed(n_bytes: int) -> int:
-    """Size of a zlib stream of so many bytes, at most: a thousandth on top of what it cannot pack, and more
-    for a few bytes."""
+    """The largest size of a zlib stream of `n_bytes`: it takes a thousandth more where nothing can be packed,
+    and more than that for a few bytes."""
     return n_bytes + n_bytes // 100 + 1000
 
 

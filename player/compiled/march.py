@@ -35,6 +35,7 @@ from player.compiled.packets import (
 )
 from player.compiled.prefetch import prefetch
 from player.compiled.scratch import check_scratch, scratch
+from player.march.box import Bounds
 from player.march.contracted import MAX_SPEED, enter_space
 from player.march.fetches import MIN_TOTAL
 from player.march.march import MIN_OPACITY, MarchResult
@@ -82,7 +83,7 @@ def march(
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     n_fetches: int,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> MarchResult:
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
     if grid.contracted:
@@ -132,7 +133,7 @@ def _enter_box(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray] | None,
+    bounds: Bounds | None,
 ) -> tuple[BoxSteps, np.ndarray]:
     """The packets of rays through a box, [n_packets, BOX_ROWS, LANES] float32."""
     n_rays = len(rays_o)

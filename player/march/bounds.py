@@ -1,4 +1,4 @@
-"""Which part of the picture, and which stretch of the way, can meet a live cell at all.
+"""Which pixels of a picture can meet a live cell at all, and between which distances.
 
 The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick with a live cell is projected; a block
 keeps the least and the greatest distance of the bricks whose projection touches it. Rays of a block without
@@ -57,8 +57,8 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
 
 
 def _range(x: np.ndarray, n_blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """First block and one past the last whose pixel centres can lie between the least and greatest of x [8,
-    n]."""
+    """The first block [n], and the one after the last, whose pixel centres can lie between the least and the
+    greatest of eight coordinates, `x` [8, n] pixels."""
     low = np.floor((x.min(axis=0) - 0.5 - MARGIN_PX) / BLOCK)
     high = np.floor((x.max(axis=0) - 0.5 + MARGIN_PX) / BLOCK) + 1
     return np.clip(low, 0, n_blocks).astype(np.int64), np.clip(high, 0, n_blocks).astype(np.int64)
@@ -67,7 +67,8 @@ def _range(x: np.ndarray, n_blocks: int) -> tuple[np.ndarray, np.ndarray]:
 def _spread(
     box: tuple[np.ndarray, ...], starts: np.ndarray, ends: np.ndarray, near: np.ndarray, far: np.ndarray
 ) -> None:
-    """Take every brick into the blocks of its box (left, right, top, bottom)."""
+    """Widen the bounds `near` and `far` of blocks by the `starts` and `ends` of the n bricks that cover them;
+    `box` is the left, right, top and bottom block [n] of each brick."""
     left, right, top, bottom = box
     wide = np.maximum(right - left, 0)
     counts = wide * np.maximum(bottom - top, 0)

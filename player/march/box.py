@@ -17,6 +17,10 @@ SKIP_MARGIN = np.float32(0.01)
 coordinate."""
 
 
+Bounds = tuple[np.ndarray, np.ndarray]
+"""`near` and `far`, [n] float32: t of n rays outside which the caller knows that there is no live cell."""
+
+
 class BoxPath(NamedTuple):
     """n rays from where they enter the box; the methods are those that `player.march.path` describes."""
 
@@ -71,7 +75,7 @@ def enter_box(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> BoxPath:
     """Rays to grid coordinates, each moved to where it enters the box (slabs; t >= 0).
 
@@ -81,8 +85,7 @@ def enter_box(
         grid: the sparse grid.
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
-        bounds: optional [n] float32 `near` and `far`: t outside which the caller knows that there is no live
-            cell.
+        bounds: where live cells can be, if that is known.
     """
     size = np.float32(grid.resolution)
     t_in = np.zeros(len(rays_o), np.float32)

@@ -17,8 +17,7 @@ def contract(points: np.ndarray, divisor: np.ndarray | float = 1.0) -> np.ndarra
     Args:
         points: [..., 3] float32 or float64, any size; a coordinate may be infinite.
         divisor: [...] >= 0, what the points are to be divided by; 0 is infinitely far away in the direction
-        of the
-            point, which must not be 0 then.
+            of the point, which must not be 0 then.
 
     Returns:
         [..., 3] in the type of `points`, inside the ball of radius 2.
@@ -39,7 +38,7 @@ def contract(points: np.ndarray, divisor: np.ndarray | float = 1.0) -> np.ndarra
 
 
 def contraction_scale(norm: np.ndarray, divisor: np.ndarray) -> np.ndarray:
-    """[n] what v is multiplied by: from q = |v| and the divisor h, both [n] and not both 0."""
+    """The factor [...] by which v is multiplied, from q = |v| and the divisor h, [...] and not both 0."""
     inside = norm <= divisor
     q, h = np.where(inside, 1, norm).astype(norm.dtype), np.where(inside, divisor, 1).astype(norm.dtype)
     return np.where(inside, 1 / h, (2 - divisor / q) / q)

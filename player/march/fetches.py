@@ -31,19 +31,19 @@ class Samples(NamedTuple):
     """Samples with weight, grouped by ray, in the order of the march."""
 
     ray: np.ndarray
-    """[n_samples] int64."""
+    """[n_samples] int64, the ray of each sample."""
     s: np.ndarray
     """[n_samples] places on the rays: in a box distances from the entry, model units; in contracted space
     angles."""
     weights: np.ndarray
-    """[n_samples] float32."""
+    """[n_samples] float32, compositing weights."""
 
 
 class Bins(NamedTuple):
     """The k bins of n rays that have more than k samples each; bin j of ray r is row r * k + j."""
 
     ray: np.ndarray
-    """[n * k] int64."""
+    """[n * k] int64, the ray of each bin."""
     s: np.ndarray
     """[n * k] float32, centroid of the bin's mass."""
     first: np.ndarray
@@ -178,8 +178,17 @@ def _add(grid: SparseGrid, path: Path, fetches: Samples, rows: np.ndarray, out: 
 
 
 def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stored corners' weighted sum of codes [n, n_channels] at g [3, n] float32, cells of the density's grid,
-    and their weights' sum [n]."""
+    """The features that are stored around points, interpolated.
+
+    Args:
+        grid: the sparse grid.
+        g: [3, n] float32, cells of the densities' grid.
+
+    Returns:
+        values: [n, n_channels] float32, the sum of the codes at the corners that are stored, each times its
+            trilinear weight.
+        total: [n] float32, the sum of these weights, 0..1.
+    """
     vertices = grid.rows
     g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
     low = np.minimum(g.astype(np.int32), vertices.resolution - 1)

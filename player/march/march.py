@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.grid import SparseGrid, corner_number
+from player.march.box import Bounds
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
 
@@ -66,7 +67,7 @@ def march(
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     n_fetches: int,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> MarchResult:
     """March rays and fetch their features.
 
@@ -75,8 +76,7 @@ def march(
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
         n_fetches: k, feature fetches a ray; 0 fetches at every sample.
-        bounds: optional [n] float32 `near` and `far` in a box: t outside which the caller knows that there is
-            no live cell.
+        bounds: where live cells of a box can be, if that is known.
     """
     path, samples, tau, counts = sample_rays(grid, rays_o, rays_d, bounds)
     n_rays = len(rays_o)
@@ -108,7 +108,7 @@ def sample_rays(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> SampledRays:
     """The samples of rays; the arguments are those of `march`.
 

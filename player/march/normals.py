@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from player.asset.grid import SparseGrid, corner_number
+from player.march.box import Bounds
 from player.march.march import sample_rays
 
 
@@ -19,7 +20,7 @@ def composited_normals(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> np.ndarray:
     """Normals of rays, in the model frame. The samples are collected again, by the numpy march.
 
@@ -27,7 +28,7 @@ def composited_normals(
         grid: the sparse grid.
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
-        bounds: optional [n] float32 `near` and `far`, as for `player.march.march.march`.
+        bounds: as for `player.march.march.march`.
 
     Returns:
         normals: [n, 3] float32, of unit length; 0 where no sample has weight or the gradients cancel.

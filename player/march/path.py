@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from player.asset.grid import SparseGrid
-from player.march.box import BoxPath, enter_box
+from player.march.box import Bounds, BoxPath, enter_box
 from player.march.contracted import ContractedPath, enter_space
 
 Path = BoxPath | ContractedPath
@@ -32,10 +32,10 @@ def path_of(
     grid: SparseGrid,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    bounds: Bounds | None = None,
 ) -> Path:
-    """The path of rays through a grid of either kind; the arguments are those of `enter_box`. Contracted
-    space has nothing around it that bounds could leave out, and takes none."""
+    """The path of rays through a grid of either kind; the arguments are those of `enter_box`. In contracted
+    space, around which nothing is empty, bounds are ignored."""
     if grid.contracted:
         return enter_space(grid, rays_o, rays_d)
     return enter_box(grid, rays_o, rays_d, bounds)
