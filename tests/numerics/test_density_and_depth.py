@@ -16,14 +16,16 @@ from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins
 from player.march.march import MAX_TAU
-from vfr_bake.field.networks import LARGEST_LOGIT, TruncatedExp
-from vfr_bake.rendering.compositing import composite, composite_reference
+from tests.vfr_bake import twins
+from vfr_bake.field.networks import TruncatedExp
+from vfr_bake.kernels.density import LARGEST_LOGIT
+from vfr_bake.rendering.compositing import composite
 from vfr_bake.torch_kernels.compositing import composite as composite_torch
 
 Composite = Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 COMPOSITES = [
     pytest.param(composite, id="numba"),
-    pytest.param(composite_reference, id="twin"),
+    pytest.param(twins.composite, id="twin"),
     pytest.param(composite_torch, id="torch"),
 ]
 DTYPES = [torch.float32, torch.float64]

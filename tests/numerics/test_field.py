@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import mpmath
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from exporters.head.spherical_harmonics import MAX_DEGREE, sh_monomials
 from tests.reference import hash_grid_feature, spherical_harmonics
+from tests.vfr_bake import twins
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
 from vfr_bake.field.networks import SphericalHarmonics
@@ -121,7 +123,11 @@ def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
     )
     tensor = torch.from_numpy(points).to(dtype)
     unit = torch.finfo(dtype).eps
-    for ours in (grid(tensor), grid.reference(tensor), encode(tensor, grid.table, layout.levels(grid.table))):
+    for ours in (
+        grid(tensor),
+        twins.encode(grid, tensor),
+        encode(tensor, grid.table, layout.levels(grid.table)),
+    ):
         np.testing.assert_allclose(ours.detach().numpy(), wanted, rtol=0, atol=12 * unit * resolution)
 
 
@@ -143,7 +149,11 @@ def test_points_a_rounding_outside_the_cube_are_served_from_its_last_cell() -> N
     inside = torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 0.0]])
     outside = torch.tensor([[-UNIT, 1 + 2 * UNIT, 0.5], [1 + 2 * UNIT, 1.0, -UNIT]])
     table = grid.table
-    for function in (grid, grid.reference, lambda x: encode(x, table, grid.layout.levels(table))):
+    for function in (
+        grid,
+        partial(twins.encode, grid),
+        lambda x: encode(x, table, grid.layout.levels(table)),
+    ):
         off = (function(outside) - function(inside)).detach().abs().max().item()
         assert off <= 2 * 2 * 4096 * 3 * UNIT
 
@@ -155,7 +165,7 @@ def test_gradient_of_the_table_at_borders_is_autograds() -> None:
     upstream = torch.randn(len(points), 6, dtype=torch.float64)
     grads = [
         torch.autograd.grad(values, grid.table, upstream)[0]
-        for values in (grid(points), grid.reference(points))
+        for values in (grid(points), twins.encode(grid, points))
     ]
     torch.testing.assert_close(grads[0], grads[1], rtol=0, atol=1e-12)
 
@@ -169,6 +179,6 @@ def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
     assert grid.layout.hashed[level]
     for x, y, z in vertices:
         wanted = (x ^ (y * 2654435761) ^ (z * 805459861)) % size
-        row = grid._rows(torch.tensor([[x, y, z]]), level) - int(grid.layout.offsets[level])
+        row = twins.rows_of(grid, torch.tensor([[x, y, z]]), level) - int(grid.layout.offsets[level])
         assert row.item() == wanted
         assert max(y * 2654435761, z * 805459861) < 2**63

@@ -25,6 +25,7 @@ from tests.player.march.test_contracted_march import some_rays
 from tests.player.march.test_march import random_rays
 from vfr_bake.baking.distillation import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
+from vfr_bake.kernels.density import Limits
 from vfr_bake.kernels.stored_features import compose, descend, descend_density
 
 F32 = np.float32
@@ -189,25 +190,26 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
         parts = [slice(int(first), int(first) + size) for first, size in zip(offsets, sizes, strict=True)]
         for part, value in zip(parts, values, strict=True):
             table[part] = value
-        levels = SCALES, offsets, HASHED, MASK
+        levels = hash_grid.Levels(SCALES, offsets, HASHED, MASK)
+        grid = hash_grid.GridArrays(table, *levels)
         if n_channels == 1:
-            proposals.scatter_logits(points, gradient[:, 0].copy(), *levels, 2, grad)
+            proposals.scatter_logits(points, gradient[:, 0].copy(), levels, 2, grad)
             edges = np.linspace(0.1, 0.9, 9, dtype=F32)[None].repeat(60, 0)
             arrays = [np.zeros((60, 8, *more), F32) for more in [(), (3,), ()] * 2]
-            rounds = [[edges.copy(), *arrays[3 * i : 3 * i + 3]] for i in range(2)]
+            rounds = [proposals.Round(edges.copy(), *arrays[3 * i : 3 * i + 3]) for i in range(2)]
             proposals.propose(
-                points, points, np.full((60, 3), 0.5, F32), (F32(0.1), F32(0.9)), F32(1), (table, *levels),
-                (table, *levels), (F32(10), F32(10)), *rounds[0], *rounds[1], edges,
+                points, points, np.full((60, 3), 0.5, F32), (F32(0.1), F32(0.9)), F32(1), grid, grid,
+                Limits(F32(10), F32(10)), *rounds, edges,
             )  # fmt: skip
             found.append([edges, *rounds[0][1:], *rounds[1][1:], *(grad[part] for part in parts)])
             continue
         out = np.empty((60, 2 * len(SCALES)), F32)
-        hash_grid.encode(points, table, *levels, out)
-        hash_grid.scatter(points, gradient, *levels, 2, grad)
+        hash_grid.encode(points, grid, out)
+        hash_grid.scatter(points, gradient, levels, 2, grad)
         moments = zeros((n_rows, 4), F32)
         of_level, rows = np.zeros((2, max(sizes), 2), F32), np.empty((2, 8 * len(points) + 1), np.uint32)
-        rates = [F32(x) for x in (0.1, 0.9, 0.99, 1e-8)]
-        adam.scatter_and_step(points, gradient, *levels, of_level, rows, table, moments, *rates)
+        pace = adam.Pace(*map(F32, (0.1, 0.9, 0.99, 1e-8)))
+        adam.scatter_and_step(points, gradient, grid, of_level, rows, moments, pace)
         found.append([out, *(array[part] for array in (grad, table, moments) for part in parts)])
     for ours, expected in zip(found[1], found[0], strict=True):
         np.testing.assert_array_equal(ours, expected)

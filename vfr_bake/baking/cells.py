@@ -22,9 +22,10 @@ from player.errors import TrainingError
 from player.march.contracted import MAX_SPEED
 from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, views_between, widened
 from vfr_bake.config import BakeConfig
+from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
 from vfr_bake.kernels.visibility import mark_visible_cells, mark_weighty_cells
-from vfr_bake.rendering.compositing import LIMITS, composite
+from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.training.model_file import Model
 
@@ -161,7 +162,7 @@ def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
     opacity, depth = np.zeros((2, len(features)), np.float32)
     render_features(
         held_out.rays_o, held_out.rays_d, np.float32(model.occupancy.step), distance,
-        *model.field.kernel_arguments(), LIMITS, features, opacity, depth,
+        model.field.arrays(), LIMITS, features, opacity, depth,
     )  # fmt: skip
     return held_out.loss_of(features, opacity)
 
@@ -186,7 +187,7 @@ def marked_cells(
         rays_o, rays_d = camera.resized(*size).rays()
         mark_visible_cells(
             rays_o, rays_d, np.float32(step), model.occupancy.distance,
-            *model.field.kernel_arguments(), LIMITS, np.array(weight_floors, np.float32), marks,
+            model.field.arrays(), LIMITS, np.array(weight_floors, np.float32), marks,
         )  # fmt: skip
         progress(index + 1, len(cameras))
     return marks

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.field.networks import LARGEST_LOGIT, Head, make_density
-from vfr_bake.kernels import march as kernels
+from vfr_bake.field.networks import DensityNetwork, Head
+from vfr_bake.kernels.density import LARGEST_LOGIT, FieldArrays, density_logits
 
 
 class VfrField(nn.Module):
@@ -19,19 +19,19 @@ class VfrField(nn.Module):
         super().__init__()
         self.config = config
         self.grid = HashGrid(config)
-        self.density = make_density(config)
+        self.density = DensityNetwork(config.n_channels, config.density_width)
         self.head = Head(config)
 
-    def kernel_arguments(self) -> tuple[tuple, tuple]:
-        """(grid, network) as the march kernels take them."""
-        return self.grid.kernel_arguments(), self.density.arrays()
+    def arrays(self) -> FieldArrays:
+        """Grid and density as the kernels take them; of a field on a CPU."""
+        return FieldArrays(*self.grid.layout.grid(self.grid.table), *self.density.arrays())
 
     @torch.no_grad()
     def log_densities(self, points: np.ndarray) -> np.ndarray:
         """Pre-activation densities [n] at `points` [n, 3] of the unit cube (model coordinates x as (x + 1) /
         2)."""
         out = np.empty(len(points), points.dtype)
-        kernels.density_logits(points, *self.kernel_arguments(), out)
+        density_logits(points, self.arrays(), out)
         return np.minimum(out, LARGEST_LOGIT)
 
     def lookup(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.kernels import hash_grid as kernels
-from vfr_bake.torch_kernels.hash_grid import Levels, features_at
+from vfr_bake.kernels.hash_grid import GridArrays, Levels
+from vfr_bake.torch_kernels.hash_grid import features_at
 
 Backend = Literal["numba", "torch"]
 """Whose kernels run: numba's, on a CPU, or torch's, on any device."""
@@ -68,18 +69,23 @@ class GridLayout:
     def n_entries(self) -> int:
         return int(self.offsets[-1])
 
-    def kernel_arguments(self, dtype: np.dtype | type) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """(scales, offsets, hashed, mask) as the kernels take them."""
-        return np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask
+    def arrays(self, dtype: np.dtype | type) -> Levels:
+        """The levels as numba's kernels take them, for a table of type `dtype`."""
+        return Levels(np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask)
+
+    def grid(self, table: Tensor) -> GridArrays:
+        """`table`, which is on a CPU, with its levels, as numba's kernels take them."""
+        array = table.detach().numpy()
+        return GridArrays(array, *self.arrays(array.dtype))
 
     def levels(self, table: Tensor) -> Levels:
-        """The same in torch, beside `table` and in its type; made once for each place."""
+        """The levels as torch's kernels take them, beside `table` and in its type; made once for each
+        place."""
         place = (table.device, table.dtype)
         if place not in self._levels:
             self._levels[place] = Levels(
                 scales=torch.tensor(self.resolutions, dtype=table.dtype, device=table.device),
-                sides=torch.tensor(self.resolutions, device=table.device) + 1,
-                offsets=torch.from_numpy(self.offsets[:-1]).to(table.device),
+                offsets=torch.from_numpy(self.offsets).to(table.device),
                 hashed=torch.from_numpy(self.hashed).to(table.device),
                 mask=self.mask,
             )
@@ -106,11 +112,6 @@ class HashGrid(nn.Module):
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
         self.table = nn.Parameter(zeros(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4))
 
-    def kernel_arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-        """(table, scales, offsets, hashed, mask) as the kernels take them."""
-        table = self.table.detach().numpy()
-        return table, *self.layout.kernel_arguments(table.dtype)
-
     def forward(self, points: Tensor, features: Tensor | None = None) -> Tensor:
         """Features [n_points, n_channels] at `points` [n_points, 3] of the unit cube.
 
@@ -120,31 +121,6 @@ class HashGrid(nn.Module):
         if self.backend == "torch" or points.device.type != "cpu":
             return features_at(points, self.table, self.layout.levels(self.table), features)
         return _Encode.apply(points, self.table, self, features)  # type: ignore[return-value]
-
-    def reference(self, points: Tensor) -> Tensor:
-        """The same as `forward`, level by level in plain torch: slow, readable, differentiable by
-        autograd."""
-        outputs = []
-        for level, n in enumerate(self.layout.resolutions):
-            position = points * n
-            cell = position.floor().clamp(0, n - 1)
-            inside = position - cell
-            total = torch.zeros(len(points), kernels.N_CHANNELS, dtype=self.table.dtype)
-            for corner in range(8):
-                bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
-                weight = torch.where(bits.bool(), inside, 1 - inside).prod(dim=-1)
-                total = total + weight[:, None] * self.table[self._rows(cell.long() + bits, level)]
-            outputs.append(total)
-        return torch.cat(outputs, dim=-1)
-
-    def _rows(self, vertex: Tensor, level: int) -> Tensor:
-        x, y, z = vertex.unbind(-1)
-        if self.layout.hashed[level]:
-            row = (x ^ (y * int(kernels.PRIME_Y)) ^ (z * int(kernels.PRIME_Z))) & self.layout.mask
-        else:
-            side = self.layout.resolutions[level] + 1
-            row = (z * side + y) * side + x
-        return row + int(self.layout.offsets[level])
 
 
 class _Encode(torch.autograd.Function):
@@ -156,7 +132,7 @@ class _Encode(torch.autograd.Function):
             return features
         n_channels = kernels.N_CHANNELS * len(grid.layout.resolutions)
         out = torch.empty(len(points), n_channels, dtype=table.dtype)
-        kernels.encode(points.detach().numpy(), *grid.kernel_arguments(), out.numpy())
+        kernels.encode(points.detach().numpy(), grid.layout.grid(table), out.numpy())
         return out
 
     @staticmethod
@@ -170,9 +146,6 @@ class _Encode(torch.autograd.Function):
         # saved.
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
-        scales, offsets, hashed, mask = ctx.grid.layout.kernel_arguments(gradient.numpy().dtype)
-        kernels.scatter(
-            points.numpy(), gradient.numpy(), scales, offsets, hashed, mask, get_num_threads(),
-            grad_table.numpy(),
-        )  # fmt: skip
+        levels = ctx.grid.layout.arrays(gradient.numpy().dtype)
+        kernels.scatter(points.numpy(), gradient.numpy(), levels, get_num_threads(), grad_table.numpy())
         return None, None if in_place else grad_table, None, None

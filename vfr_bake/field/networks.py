@@ -24,10 +24,7 @@ from torch.nn.functional import gelu, relu
 
 from exporters.head.spherical_harmonics import sh_monomials
 from vfr_bake.config import FieldConfig
-
-LARGEST_LOGIT = 15.0
-"""Pre-activations are clamped here: exp(15) = 3e6 per model unit is opaque in one step at any step length in
-use."""
+from vfr_bake.kernels.density import LARGEST_LOGIT, DensityArrays
 
 
 class TruncatedExp(torch.autograd.Function):
@@ -71,18 +68,14 @@ class DensityNetwork(nn.Module):
         """Density [n] in 1/model unit."""
         return TruncatedExp.apply(self.logits(features))  # type: ignore[return-value]
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.floating]:
-        """(w1 [n_channels, width], b1, w2, b2) as the kernels take them; w1 is empty for a linear map."""
+    def arrays(self) -> DensityArrays:
+        """The weights as the kernels take them."""
         w2 = self.out.weight.detach().numpy()[0]
         b2 = self.out.bias.detach().numpy()[0]
         if self.hidden is None:
-            return np.zeros((0, 0), w2.dtype), np.zeros(0, w2.dtype), w2, b2
+            return DensityArrays(np.zeros((0, 0), w2.dtype), np.zeros(0, w2.dtype), w2, b2)
         w1 = np.ascontiguousarray(self.hidden.weight.detach().numpy().T)
-        return w1, self.hidden.bias.detach().numpy(), w2, b2
-
-
-def make_density(config: FieldConfig) -> DensityNetwork:
-    return DensityNetwork(config.n_channels, config.density_width)
+        return DensityArrays(w1, self.hidden.bias.detach().numpy(), w2, b2)
 
 
 def initialise(layers: Iterable[nn.Module]) -> None:

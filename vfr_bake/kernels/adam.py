@@ -3,6 +3,8 @@ step."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 
@@ -14,10 +16,23 @@ AHEAD = 16
 """Rows asked for before they are stepped: a trip to memory takes about as long as so many steps."""
 
 
+class Pace(NamedTuple):
+    """The numbers of one step."""
+
+    rate: np.float32
+    """The learning rate, corrected for moments that begin at 0."""
+    beta1: np.float32
+    beta2: np.float32
+    """Decay rates of the means of the gradient and of its square."""
+    epsilon: np.float32
+    """Added to the denominator."""
+
+
 @njit(inline="always")
-def _step_row(row, table, moments, grad_row, grad, rate, beta1, beta2, epsilon):
+def _step_row(row, table, moments, grad_row, grad, pace):
     """One step of `table[row]` by `grad[grad_row]`, which is cleared; `moments[row]` holds the means of the
     gradient and behind them those of its square."""
+    rate, beta1, beta2, epsilon = pace
     one = table.dtype.type(1)
     n = table.shape[1]
     for c in range(n):
@@ -31,9 +46,9 @@ def _step_row(row, table, moments, grad_row, grad, rate, beta1, beta2, epsilon):
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def adam_step(table, grad, moments, rate, beta1, beta2, epsilon):
-    """One step in place on all rows of `table` [n_entries, n_channels] with a gradient, which is cleared;
-    `moments` [n_entries, 2 * n_channels], `rate` is bias-corrected.
+def adam_step(table, grad, moments, pace):
+    """Step the rows of `table` [n_entries, n_channels] that have a gradient, in place, and clear that; `grad`
+    is of the table's shape, `moments` [n_entries, 2 * n_channels].
 
     A step touches a few percent of the entries; the others keep their moments, as in instant-ngp.
     """
@@ -43,14 +58,11 @@ def adam_step(table, grad, moments, rate, beta1, beta2, epsilon):
         for c in range(n):
             touched |= grad[row, c] != 0
         if touched:
-            _step_row(row, table, moments, row, grad, rate, beta1, beta2, epsilon)
+            _step_row(row, table, moments, row, grad, pace)
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter_and_step(
-    points, grad_features, scales, offsets, hashed, mask, grad, rows, table, moments, rate, beta1, beta2,
-    epsilon,
-):  # fmt: skip
+def scatter_and_step(points, grad_features, grid, grad, rows, moments, pace):
     """`hash_grid.scatter` and `adam_step` in one, level by level: while a level's rows are stepped, its
     gradient is still in the cache.
 
@@ -58,6 +70,7 @@ def scatter_and_step(
     step moves 24 bytes a row through memory (entry and moments) and not 32. `rows` [n_threads, 8 n_points +
     1] is scratch.
     """
+    table, scales, offsets, hashed, mask = grid
     n_threads, n_levels = grad.shape[0], scales.shape[0]
     for thread in prange(n_threads):
         for level in range(thread, n_levels, n_threads):
@@ -71,4 +84,4 @@ def scatter_and_step(
                 prefetch(table, ahead)
                 prefetch(moments, ahead)
                 row = np.uint64(rows[thread, i])
-                _step_row(first + row, table, moments, row, grad[thread], rate, beta1, beta2, epsilon)
+                _step_row(first + row, table, moments, row, grad[thread], pace)

@@ -28,3 +28,14 @@ def contracted_unit(x, y, z, one):
     half = one / two
     scale *= half * half
     return x * scale + half, y * scale + half, z * scale + half
+
+
+@njit(inline="always")
+def contracted_at(rays_o, rays_d, ray, t):
+    """The point of the unit cube at distance `t` along a ray of `rays_o`, `rays_d` [n_rays, 3]."""
+    return contracted_unit(
+        rays_o[ray, 0] + t * rays_d[ray, 0],
+        rays_o[ray, 1] + t * rays_d[ray, 1],
+        rays_o[ray, 2] + t * rays_d[ray, 2],
+        rays_o.dtype.type(1),
+    )

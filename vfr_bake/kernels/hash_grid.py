@@ -1,12 +1,14 @@
 """Multiresolution hash grid: features at points, and their gradient scattered back (Mueller et al. 2022,
 section 3).
 
-Letters: a level has `scale` cells per axis over the unit cube, its entries start at row `offsets[level]` of
-`table` [n_entries, 2]; `hashed[level]` tells whether vertices share entries through the spatial hash or have
-one each.
+Letters: a level has `scale` cells per axis over the unit cube, and its entries start at row `offset` of
+`table` [n_entries, n_channels]; where a level is `hashed`, vertices share entries through the spatial hash,
+elsewhere they have one each.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -25,9 +27,34 @@ FLAGS = {"contract", "reassoc", "nsz", "arcp"}
 hidden."""
 
 
+class Levels(NamedTuple):
+    """Which entries of a table belong to which level: arrays for numba, tensors for torch."""
+
+    scales: Any
+    """[n_levels] cells per axis, in the table's type."""
+    offsets: Any
+    """[n_levels + 1] int64 first row of each level, and the number of all rows."""
+    hashed: Any
+    """[n_levels] bool: whether vertices share entries through the spatial hash."""
+    mask: int
+    """Entries of a hashed level, less one; a power of two less one."""
+
+
+class GridArrays(NamedTuple):
+    """A hash grid as the kernels take it."""
+
+    table: np.ndarray
+    """[n_entries, n_channels]."""
+    scales: np.ndarray
+    offsets: np.ndarray
+    hashed: np.ndarray
+    mask: int
+    """This and the three before it as in `Levels`: a parallel kernel takes no tuple within a tuple."""
+
+
 @njit(inline="always")
 def cell_of(position, last):
-    """Cell that a position (in cells of the level) lies in, 0 to `last`."""
+    """The cell, 0 to `last`, that a position along one axis lies in; both in cells."""
     return min(max(np.int32(position), np.int32(0)), last)
 
 
@@ -87,24 +114,27 @@ def corners(x, y, z, scale, offset, mask, hashed):
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
-def prefetch_point(x, y, z, table, scales, offsets, hashed, mask):
+def prefetch_point(x, y, z, grid):
     """Ask for the rows around a point of all levels that are too large to be in the cache anyway."""
-    for level in range(scales.shape[0]):
-        if hashed[level]:
-            scale = scales[level]
+    for level in range(grid.scales.shape[0]):
+        if grid.hashed[level]:
+            scale = grid.scales[level]
             last = np.int32(scale) - np.int32(1)
             ix, iy, iz = cell_of(x * scale, last), cell_of(y * scale, last), cell_of(z * scale, last)
-            rows = corner_rows(ix, iy, iz, last, offsets[level], mask, True)
+            rows = corner_rows(ix, iy, iz, last, grid.offsets[level], grid.mask, True)
             for corner in range(8):
-                prefetch(table, rows[corner])
+                prefetch(grid.table, rows[corner])
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
-def encode_point(x, y, z, table, scales, offsets, hashed, mask, out):
+def encode_point(x, y, z, grid, out):
     """Write the features [2 * n_levels] of one point of the unit cube to `out`."""
-    prefetch_point(x, y, z, table, scales, offsets, hashed, mask)
-    for level in range(scales.shape[0]):
-        r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
+    prefetch_point(x, y, z, grid)
+    table = grid.table
+    for level in range(grid.scales.shape[0]):
+        r, w = corners(
+            x, y, z, grid.scales[level], grid.offsets[level], grid.mask, grid.hashed[level]
+        )  # fmt: skip
         for channel in range(2):
             out[2 * level + channel] = (
                 w[0] * table[r[0], channel]
@@ -119,10 +149,10 @@ def encode_point(x, y, z, table, scales, offsets, hashed, mask, out):
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def encode(points, table, scales, offsets, hashed, mask, out):
-    """Features `out` [n_points, 2 * n_levels] at `points` [n_points, 3] of the unit cube."""
+def encode(points, grid, out):
+    """Write the features [n_points, 2 * n_levels] at `points` [n_points, 3] of the unit cube to `out`."""
     for i in prange(points.shape[0]):
-        encode_point(points[i, 0], points[i, 1], points[i, 2], table, scales, offsets, hashed, mask, out[i])
+        encode_point(points[i, 0], points[i, 1], points[i, 2], grid, out[i])
 
 
 @njit(inline="always")
@@ -150,7 +180,7 @@ def scatter_level(points, grad_features, level, scale, offset, mask, hashed, gra
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, grad_table):
+def scatter(points, grad_features, levels, n_threads, grad_table):
     """Add to `grad_table` [n_entries, 2] the gradient of `encode`, given `grad_features` [n_points, 2 *
     n_levels].
 
@@ -158,6 +188,7 @@ def scatter(points, grad_features, scales, offsets, hashed, mask, n_threads, gra
     the same in every run. Fine levels cost more than coarse ones, so neighbouring levels go to different
     threads.
     """
+    scales, offsets, hashed, mask = levels
     n_levels = scales.shape[0]
     for thread in prange(n_threads):
         rows = np.empty(8 * points.shape[0] + 1, np.uint32)

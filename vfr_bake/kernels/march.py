@@ -12,7 +12,8 @@ import numpy as np
 from numba import prange
 
 from vfr_bake.kernels import njit
-from vfr_bake.kernels.hash_grid import FLAGS, encode_point
+from vfr_bake.kernels.density import look_up
+from vfr_bake.kernels.hash_grid import FLAGS, cell_of
 
 
 @njit(inline="always")
@@ -36,10 +37,8 @@ def ray_box(rays_o, rays_d, ray):
 def _empty_length(ux, uy, uz, rays_d, ray, distance, n):
     """Path length that is certainly empty from a point of the unit cube; 0 in an occupied cell."""
     kind = rays_d.dtype.type
-    cells = kind(n)
-    ix = min(max(np.int64(ux * cells), 0), n - 1)
-    iy = min(max(np.int64(uy * cells), 0), n - 1)
-    iz = min(max(np.int64(uz * cells), 0), n - 1)
+    cells, last = kind(n), np.int32(n - 1)
+    ix, iy, iz = cell_of(ux * cells, last), cell_of(uy * cells, last), cell_of(uz * cells, last)
     d = np.int64(distance[ix, iy, iz])
     if d == 0:
         return kind(0)
@@ -77,47 +76,9 @@ def next_sample(rays_o, rays_d, ray, t_near, t_far, i, jitter, step, distance):
         i += max(np.int64(empty / step), 1)
 
 
-@njit(fastmath=FLAGS, error_model="numpy")
-def density_logit(feature, w1, b1, w2, b2, hidden):
-    """Pre-activation of the density, w2 . relu(w1 feature + b1) + b2; without hidden layer (w1 empty) w2 .
-    feature + b2."""
-    kind = feature.dtype.type
-    total = b2
-    if w1.shape[0] == 0:
-        for c in range(feature.shape[0]):
-            total += w2[c] * feature[c]
-        return total
-    for j in range(b1.shape[0]):
-        hidden[j] = b1[j]
-    for c in range(feature.shape[0]):
-        f = feature[c]
-        for j in range(b1.shape[0]):
-            hidden[j] += f * w1[c, j]
-    for j in range(b1.shape[0]):
-        total += w2[j] * max(hidden[j], kind(0))
-    return total
-
-
-@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def density_logits(points, grid, network, out):
-    """Pre-activation densities `out` [n_points] at `points` [n_points, 3] of the unit cube."""
-    table, scales, offsets, hashed, mask = grid
-    w1, b1, w2, b2 = network
-    block = 1024
-    for start in prange((points.shape[0] + block - 1) // block):
-        feature = np.zeros(2 * scales.shape[0], table.dtype)
-        hidden = np.zeros(b1.shape[0], table.dtype)
-        for i in range(start * block, min((start + 1) * block, points.shape[0])):
-            encode_point(
-                points[i, 0], points[i, 1], points[i, 2], table, scales, offsets, hashed, mask, feature
-            )
-            out[i] = density_logit(feature, w1, b1, w2, b2, hidden)
-
-
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def march_samples(
-    rays_o, rays_d, jitter, step, distance, grid, network, limits, counts, starts, t_mid,
-    points, features, sigmas,
+    rays_o, rays_d, jitter, step, distance, field, limits, counts, starts, t_mid, points, features, sigmas
 ):  # fmt: skip
     """Visible samples of as many rays as fit, in one pass: what is counted is what is written.
 
@@ -125,17 +86,14 @@ def march_samples(
     capacity, n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only
     if the most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever
     written past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the
-    first sample within the chunk. `limits` = (largest logit, optical depth at which a ray stops).
+    first sample within the chunk.
     """
-    table, scales, offsets, hashed, mask = grid
-    w1, b1, w2, b2 = network
-    largest_logit, opaque = limits
-    kind = table.dtype.type
+    kind = rays_o.dtype.type
     n_chunks, capacity = t_mid.shape
     n_rays = rays_o.shape[0]
     used = np.zeros(n_chunks, np.int64)
     for chunk in prange(n_chunks):
-        hidden = np.zeros(b1.shape[0], table.dtype)
+        hidden = np.zeros(field.b1.shape[0], rays_o.dtype)
         k = 0
         for ray in range(chunk, n_rays, n_chunks):
             counts[ray] = -1
@@ -150,20 +108,15 @@ def march_samples(
             starts[ray] = k
             tau = kind(0)
             i = 0
-            while tau <= opaque:
+            while tau <= limits.opaque_depth:
                 i, t, ux, uy, uz = next_sample(
                     rays_o, rays_d, ray, t_near, t_far, i, jitter[ray], step, distance
                 )
                 if i < 0:
                     break
-                feature = features[chunk, k]
-                encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
-                logit = density_logit(feature, w1, b1, w2, b2, hidden)
+                sigma = look_up(ux, uy, uz, field, limits, features[chunk, k], hidden)
                 t_mid[chunk, k] = t
-                points[chunk, k, 0] = ux
-                points[chunk, k, 1] = uy
-                points[chunk, k, 2] = uz
-                sigma = np.exp(min(logit, largest_logit))
+                points[chunk, k, 0], points[chunk, k, 1], points[chunk, k, 2] = ux, uy, uz
                 sigmas[chunk, k] = sigma
                 k += 1
                 i += 1
@@ -174,32 +127,28 @@ def march_samples(
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def render_features(rays_o, rays_d, step, distance, grid, network, limits, out, opacity, depth):
+def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity, depth):
     """Composited features without a stored sample: out [n_rays, n_channels], opacity [n_rays], depth
     [n_rays] (mean t)."""
-    table, scales, offsets, hashed, mask = grid
-    w1, b1, w2, b2 = network
-    largest_logit, opaque = limits
-    kind = table.dtype.type
+    kind = rays_o.dtype.type
     half = kind(0.5)
     block = 64
     n_rays = rays_o.shape[0]
     for start in prange((n_rays + block - 1) // block):
-        hidden = np.zeros(b1.shape[0], table.dtype)
-        feature = np.zeros(out.shape[1], table.dtype)
+        hidden = np.zeros(field.b1.shape[0], rays_o.dtype)
+        feature = np.zeros(out.shape[1], rays_o.dtype)
         for ray in range(start * block, min((start + 1) * block, n_rays)):
             t_near, t_far = ray_box(rays_o, rays_d, ray)
             tau = kind(0)
             trans = kind(1)
             t_sum = kind(0)
             i = 0
-            while tau <= opaque:
+            while tau <= limits.opaque_depth:
                 i, t, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
                 if i < 0:
                     break
                 i += 1
-                encode_point(ux, uy, uz, table, scales, offsets, hashed, mask, feature)
-                delta = np.exp(min(density_logit(feature, w1, b1, w2, b2, hidden), largest_logit)) * step
+                delta = look_up(ux, uy, uz, field, limits, feature, hidden) * step
                 weight = -trans * np.expm1(-delta)
                 for c in range(out.shape[1]):
                     out[ray, c] += weight * feature[c]

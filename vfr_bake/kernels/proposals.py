@@ -9,16 +9,31 @@ features, absorbed into the table.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
 
 from vfr_bake.kernels import njit
-from vfr_bake.kernels.contraction import contracted_unit
-from vfr_bake.kernels.hash_grid import FLAGS, corners, encode_point, prefetch_point
-from vfr_bake.kernels.march import density_logit
+from vfr_bake.kernels.contraction import contracted_at
+from vfr_bake.kernels.density import look_up
+from vfr_bake.kernels.hash_grid import FLAGS, corners, prefetch_point
 
 PADDING = 1e-3
 """Weight that every interval gets before it is drawn from, so that no place is out of reach."""
+
+
+class Round(NamedTuple):
+    """What one round of proposals finds on n_rays rays in n intervals each."""
+
+    edges: np.ndarray
+    """[n_rays, n + 1] borders of the intervals, in s."""
+    depths: np.ndarray
+    """[n_rays, n] optical depth of each interval; 0 behind an opaque one."""
+    points: np.ndarray
+    """[n_rays, n, 3] middles of the intervals, in the unit cube; undefined behind an opaque one."""
+    weights: np.ndarray
+    """[n_rays, n], 0 behind an opaque interval."""
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
@@ -42,9 +57,10 @@ def distance(s):
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
-def proposal_logit(x, y, z, table, scales, offsets, hashed, mask):
-    """Log-density of a proposal at a point of the unit cube; `table` [n_entries, 1]."""
-    prefetch_point(x, y, z, table, scales, offsets, hashed, mask)
+def proposal_logit(x, y, z, grid):
+    """Log-density of a proposal at a point of the unit cube; the grid's table is [n_entries, 1]."""
+    prefetch_point(x, y, z, grid)
+    table, scales, offsets, hashed, mask = grid
     total = table.dtype.type(0)
     for level in range(scales.shape[0]):
         r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
@@ -97,29 +113,25 @@ def resample(edges, weights, exponent, jitter, centres, out):
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
-def _proposal_weights(rays_o, rays_d, ray, edges, grid, limits, depths, points, weights):
-    """Fill the optical `depths`, `points` (unit cube) and `weights` of one ray's intervals; nothing is looked
-    up behind an opaque one, where depths and weights are 0."""
-    table, scales, offsets, hashed, mask = grid
-    largest_logit, opaque = limits
+def _proposal_weights(rays_o, rays_d, ray, grid, limits, found):
+    """Fill in what the round `found` has of one ray, whose edges are there; nothing is looked up behind an
+    opaque interval."""
+    edges, depths, points, weights = (
+        found.edges[ray], found.depths[ray], found.points[ray], found.weights[ray]
+    )  # fmt: skip
     kind = edges.dtype.type
-    one, half = kind(1), kind(0.5)
+    half = kind(0.5)
     tau = kind(0)
     t0 = distance(edges[0])
     for j in range(weights.shape[0]):
-        if tau > opaque:
+        if tau > limits.opaque_depth:
             weights[j] = 0
             depths[j] = 0
             continue
         t1 = distance(edges[j + 1])
         t = (t0 + t1) * half
-        x, y, z = contracted_unit(
-            rays_o[ray, 0] + t * rays_d[ray, 0],
-            rays_o[ray, 1] + t * rays_d[ray, 1],
-            rays_o[ray, 2] + t * rays_d[ray, 2],
-            one,
-        )
-        logit = min(proposal_logit(x, y, z, table, scales, offsets, hashed, mask), largest_logit)
+        x, y, z = contracted_at(rays_o, rays_d, ray, t)
+        logit = min(proposal_logit(x, y, z, grid), limits.largest_logit)
         depth = np.exp(logit) * (t1 - t0)
         weights[j] = -np.exp(-tau) * np.expm1(-depth)
         tau += depth
@@ -129,83 +141,68 @@ def _proposal_weights(rays_o, rays_d, ray, edges, grid, limits, depths, points, 
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def propose(
-    rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, edges0, depths0, points0, weights0,
-    edges1, depths1, points1, weights1, edges,
-):  # fmt: skip
+def propose(rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, first, second, edges):
     """Two rounds of importance sampling: `edges` [n_rays, n + 1] of the final intervals in s.
 
     `jitter` [n_rays, 3] in [0, 1) shifts the intervals of each round, 0.5 everywhere leaves them in the
-    middle; `borders` = (least, largest s). What the rounds found stays in their arrays for training.
+    middle; `borders` are the least and the largest s, `grid0` and `grid1` the proposals of the rounds
+    `first` and `second`, which are filled in.
     """
     kind = edges.dtype.type
     near, far = borders
     block = 16
     n_rays = rays_o.shape[0]
     for start in prange((n_rays + block - 1) // block):
-        centres = np.empty(max(edges.shape[1], edges1.shape[1]), edges.dtype)
+        centres = np.empty(max(edges.shape[1], second.edges.shape[1]), edges.dtype)
         whole = np.array([near, far], edges.dtype)
         unit = np.ones(1, edges.dtype)
         for ray in range(start * block, min((start + 1) * block, n_rays)):
-            resample(whole, unit, kind(1), jitter[ray, 0], centres, edges0[ray])
-            _proposal_weights(
-                rays_o, rays_d, ray, edges0[ray], grid0, limits, depths0[ray], points0[ray], weights0[ray]
-            )
-            resample(edges0[ray], weights0[ray], exponent, jitter[ray, 1], centres, edges1[ray])
-            _proposal_weights(
-                rays_o, rays_d, ray, edges1[ray], grid1, limits, depths1[ray], points1[ray], weights1[ray]
-            )
-            resample(edges1[ray], weights1[ray], exponent, jitter[ray, 2], centres, edges[ray])
+            shift = jitter[ray]
+            resample(whole, unit, kind(1), shift[0], centres, first.edges[ray])
+            _proposal_weights(rays_o, rays_d, ray, grid0, limits, first)
+            resample(first.edges[ray], first.weights[ray], exponent, shift[1], centres, second.edges[ray])
+            _proposal_weights(rays_o, rays_d, ray, grid1, limits, second)
+            resample(second.edges[ray], second.weights[ray], exponent, shift[2], centres, edges[ray])
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def field_samples(
-    rays_o, rays_d, edges, grid, network, limits, counts, t_mid, deltas, points, features
-):  # fmt: skip
+def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, points, features):
     """Look the field up in the final intervals, up to where a ray is opaque.
 
     Ray r writes its `counts[r]` samples to the rows from r * n on of `t_mid`, `deltas`, `points` and
     `features`; the rows behind them are left as they are.
     """
-    table, scales, offsets, hashed, mask = grid
-    w1, b1, w2, b2 = network
-    largest_logit, opaque = limits
     kind = edges.dtype.type
-    one, half = kind(1), kind(0.5)
+    half = kind(0.5)
     n = edges.shape[1] - 1
     block = 16
     n_rays = rays_o.shape[0]
     for start in prange((n_rays + block - 1) // block):
-        hidden = np.zeros(b1.shape[0], table.dtype)
+        hidden = np.zeros(field.b1.shape[0], edges.dtype)
         for ray in range(start * block, min((start + 1) * block, n_rays)):
             tau = kind(0)
             t0 = distance(edges[ray, 0])
             counts[ray] = 0
             for j in range(n):
-                if tau > opaque:
+                if tau > limits.opaque_depth:
                     break
                 t1 = distance(edges[ray, j + 1])
                 t = (t0 + t1) * half
                 k = ray * n + j
-                x, y, z = contracted_unit(
-                    rays_o[ray, 0] + t * rays_d[ray, 0],
-                    rays_o[ray, 1] + t * rays_d[ray, 1],
-                    rays_o[ray, 2] + t * rays_d[ray, 2],
-                    one,
-                )
-                encode_point(x, y, z, table, scales, offsets, hashed, mask, features[k])
-                logit = density_logit(features[k], w1, b1, w2, b2, hidden)
+                x, y, z = contracted_at(rays_o, rays_d, ray, t)
+                sigma = look_up(x, y, z, field, limits, features[k], hidden)
                 t_mid[k] = t
                 deltas[k] = t1 - t0
                 points[k, 0], points[k, 1], points[k, 2] = x, y, z
-                tau += np.exp(min(logit, largest_logit)) * (t1 - t0)
+                tau += sigma * (t1 - t0)
                 counts[ray] = j + 1
                 t0 = t1
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def interlevel(edges, starts, counts, weights, proposal_edges, proposal_weights, depths, losses, grad_logits):
-    """Interlevel loss (mip-NeRF 360, eq. 13) of each ray and its gradient for the proposal's log-densities.
+def interlevel(edges, starts, counts, weights, found, losses, grad_logits):
+    """Interlevel loss (mip-NeRF 360, eq. 13) of each ray and its gradient for the log-densities of the
+    proposal whose round is `found`.
 
     The final weight of an interval must not exceed the sum of the proposal's weights that overlap it:
     sum_i max(0, w_i - bound_i)^2 / w_i. Final weights are `weights[starts[r] : starts[r] + counts[r]]` on the
@@ -213,6 +210,7 @@ def interlevel(edges, starts, counts, weights, proposal_edges, proposal_weights,
     """
     kind = edges.dtype.type
     least = kind(1e-7)
+    proposal_edges, depths, _, proposal_weights = found
     n = proposal_weights.shape[1]
     for ray in prange(edges.shape[0]):
         grad = grad_logits[ray]
@@ -248,9 +246,10 @@ def interlevel(edges, starts, counts, weights, proposal_edges, proposal_weights,
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter_logits(points, grad_logits, scales, offsets, hashed, mask, n_threads, grad_table):
+def scatter_logits(points, grad_logits, levels, n_threads, grad_table):
     """Add to `grad_table` [n_entries, 1] the gradient of `proposal_logit` at `points` [n_points, 3], given
     `grad_logits` [n_points]. One thread owns a level, as in the hash grid's own scatter."""
+    scales, offsets, hashed, mask = levels
     n_levels = scales.shape[0]
     for thread in prange(n_threads):
         for level in range(thread, n_levels, n_threads):

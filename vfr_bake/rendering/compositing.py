@@ -8,16 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from player.march.march import OPAQUE_DEPTH
-from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels import compositing as kernels
-
-LIMITS = (np.float32(LARGEST_LOGIT), np.float32(OPAQUE_DEPTH))
-"""(largest log-density, OPAQUE_DEPTH) as the kernels take them."""
 
 
 @dataclass(frozen=True)
-class Samples:
+class RaySamples:
     """Visible samples of a batch of rays."""
 
     t_mid: Tensor
@@ -51,22 +46,6 @@ def composite(
     (0.6321, 0.6321, 0.6321)
     """
     return _Composite.apply(sigmas, features, deltas, starts, counts)  # type: ignore[return-value]
-
-
-def composite_reference(
-    sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The same ray by ray in plain torch."""
-    out, opacity, all_weights = [], [], []
-    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
-        depth = (sigmas * deltas)[start : start + count]
-        # The optical depth in front of each sample; a difference of sums would cancel behind a dense one.
-        before = torch.cumsum(torch.cat([depth.new_zeros(1), depth]), dim=0)[:-1]
-        weights = torch.exp(-before) * -torch.expm1(-depth)
-        out.append((weights[:, None] * features[start : start + count]).sum(dim=0))
-        opacity.append(-torch.expm1(-depth.sum()))
-        all_weights.append(weights)
-    return torch.stack(out), torch.stack(opacity), torch.cat(all_weights)
 
 
 def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from vfr_bake.field.field import VfrField
+from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
-from vfr_bake.rendering.compositing import LIMITS, Samples
-from vfr_bake.rendering.sampling import march
-from vfr_bake.torch_kernels.march import LOOKUP_POINTS
+from vfr_bake.rendering.compositing import RaySamples
+from vfr_bake.rendering.sampling import LOOKUP_POINTS, march, most_samples
 
 OPACITY_THRESHOLD = 0.03
 """A cell is empty when a whole march step through it is less opaque than this. With nerfacc's default of 0.01
@@ -98,17 +98,16 @@ class OccupancyGrid:
         features = np.zeros((len(rays_o), field.config.n_channels), np.float32)
         opacity, depth = np.zeros((2, len(rays_o)), np.float32)
         render_features(
-            rays_o, rays_d, np.float32(self.step), self.distance, *field.kernel_arguments(), LIMITS,
-            features, opacity, depth,
+            rays_o, rays_d, np.float32(self.step), self.distance, field.arrays(), LIMITS, features, opacity,
+            depth,
         )  # fmt: skip
         return features, opacity, depth
 
-    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The samples of all rays, in the middle of their intervals."""
         middle = torch.full((len(rays_o),), 0.5)
-        budget = len(rays_o) * (int(np.ceil(2 * 3**0.5 / self.step)) + 3)
-        samples, _ = march(field, self, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle, budget)
-        return samples
+        rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
+        return march(field, self.distance, self.step, *rays, middle, len(rays_o) * most_samples(self.step))[0]
 
     def state(self) -> dict[str, Any]:
         """All that the next update depends on, in tensors and plain values."""

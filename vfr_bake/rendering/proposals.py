@@ -7,8 +7,6 @@ distances spaced uniformly up to one model unit and by disparity beyond, positio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numba import get_num_threads
@@ -17,7 +15,9 @@ from torch import Tensor, nn
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
-from vfr_bake.rendering.compositing import LIMITS, Samples, composite
+from vfr_bake.kernels.density import LIMITS
+from vfr_bake.kernels.proposals import Round
+from vfr_bake.rendering.compositing import RaySamples, composite
 
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
@@ -33,20 +33,6 @@ RAY_CHUNK = 4096
 """Rays whose samples are held at once when pictures are rendered: 35 MB of features at most."""
 
 
-@dataclass(frozen=True)
-class Round:
-    """What one round of proposals found."""
-
-    edges: np.ndarray
-    """[n_rays, N_PROPOSED + 1] in s."""
-    depths: np.ndarray
-    """[n_rays, N_PROPOSED] optical depth of each interval."""
-    points: np.ndarray
-    """[n_rays, N_PROPOSED, 3] of the unit cube; undefined behind an opaque interval."""
-    weights: np.ndarray
-    """[n_rays, N_PROPOSED]."""
-
-
 class ProposalGrid(nn.Module):
     """Log-density as the sum over levels of one interpolated channel."""
 
@@ -54,9 +40,6 @@ class ProposalGrid(nn.Module):
         super().__init__()
         self.layout = GridLayout(N_LEVELS, 16, max_resolution, LOG2_TABLE_SIZE)
         self.table = nn.Parameter(zeros(self.layout.n_entries, 1))
-
-    def kernel_arguments(self) -> tuple:
-        return (self.table.detach().numpy(), *self.layout.kernel_arguments(np.float32))
 
 
 class ProposalSampler(nn.Module):
@@ -70,7 +53,7 @@ class ProposalSampler(nn.Module):
         self.near = near
         self.grids = nn.ModuleList(ProposalGrid(resolution) for resolution in RESOLUTIONS)
 
-    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The samples of all rays [n_rays, 3], in the middle of their intervals."""
         middle = torch.full((len(rays_o), 3), 0.5)
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
@@ -95,7 +78,7 @@ class ProposalSampler(nn.Module):
 
     def sample_rounds(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, exponent: float = 1.0
-    ) -> tuple[Samples, np.ndarray, list[Round]]:
+    ) -> tuple[RaySamples, np.ndarray, list[Round]]:
         """Samples, the borders [n_rays, N_FINAL + 1] of their intervals in s, and what the rounds found.
 
         `exponent`: weights are raised to it before they are drawn from; less than 1 early in training.
@@ -105,27 +88,27 @@ class ProposalSampler(nn.Module):
         edges = np.empty((n_rays, N_FINAL + 1), np.float32)
         near = np.float32(self.near)
         borders = (kernels.spacing(near), kernels.spacing(np.float32(FAR)))
-        first, second = rounds
-        grids = [grid.kernel_arguments() for grid in self.grids]  # type: ignore[operator]
+        grids = [grid.layout.grid(grid.table) for grid in self.grids]  # type: ignore[union-attr, arg-type]
         kernels.propose(
-            rays_o.numpy(), rays_d.numpy(), jitter.numpy(), borders, np.float32(exponent),
-            grids[0], grids[1], LIMITS, first.edges, first.depths, first.points, first.weights,
-            second.edges, second.depths, second.points, second.weights, edges,
+            rays_o.numpy(), rays_d.numpy(), jitter.numpy(), borders, np.float32(exponent), *grids, LIMITS,
+            *rounds, edges,
         )  # fmt: skip
         return self._field_samples(field, rays_o, rays_d, edges), edges, rounds
 
-    def _field_samples(self, field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: np.ndarray) -> Samples:
+    def _field_samples(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: np.ndarray
+    ) -> RaySamples:
         n_rays, n_samples = len(rays_o), len(rays_o) * N_FINAL
         counts = np.empty(n_rays, np.int64)
         t_mid, deltas = np.empty(n_samples, np.float32), np.empty(n_samples, np.float32)
         points = np.empty((n_samples, 3), np.float32)
         features = np.empty((n_samples, field.config.n_channels), np.float32)
         kernels.field_samples(
-            rays_o.numpy(), rays_d.numpy(), edges, *field.kernel_arguments(), LIMITS,
-            counts, t_mid, deltas, points, features,
+            rays_o.numpy(), rays_d.numpy(), edges, field.arrays(), LIMITS, counts, t_mid, deltas, points,
+            features,
         )  # fmt: skip
         kept = (np.arange(N_FINAL) < counts[:, None]).reshape(-1)
-        return Samples(
+        return RaySamples(
             t_mid=torch.from_numpy(t_mid[kept]),
             deltas=torch.from_numpy(deltas[kept]),
             points=torch.from_numpy(points[kept]),
@@ -136,7 +119,7 @@ class ProposalSampler(nn.Module):
         )
 
     def add_gradients(
-        self, rounds: list[Round], edges: np.ndarray, samples: Samples, weights: Tensor, n_rays: int
+        self, rounds: list[Round], edges: np.ndarray, samples: RaySamples, weights: Tensor, n_rays: int
     ) -> float:
         """Add the interlevel loss's gradient to the tables' `.grad`; returns the loss, both a mean over
         `n_rays`."""
@@ -145,14 +128,10 @@ class ProposalSampler(nn.Module):
         for grid, found in zip(self.grids, rounds, strict=True):
             losses = np.empty(len(edges), np.float32)
             grad_logits = np.empty_like(found.weights)
-            kernels.interlevel(
-                edges, starts, counts, weights.detach().numpy(), found.edges, found.weights, found.depths,
-                losses, grad_logits,
-            )  # fmt: skip
+            kernels.interlevel(edges, starts, counts, weights.detach().numpy(), found, losses, grad_logits)
             grad_logits /= n_rays
-            scales, offsets, hashed, mask = grid.layout.kernel_arguments(np.float32)  # type: ignore[union-attr]
             kernels.scatter_logits(
-                found.points.reshape(-1, 3), grad_logits.reshape(-1), scales, offsets, hashed, mask,
+                found.points.reshape(-1, 3), grad_logits.reshape(-1), grid.layout.arrays(np.float32),  # type: ignore[union-attr]
                 get_num_threads(), grid.table.grad.numpy(),  # type: ignore[union-attr]
             )  # fmt: skip
             total += float(losses.sum()) / n_rays

@@ -10,7 +10,7 @@ import torch
 
 from player.cameras.camera import Camera
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.compositing import Samples, composite
+from vfr_bake.rendering.compositing import RaySamples, composite
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
@@ -29,7 +29,7 @@ class Sampler(Protocol):
         """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays], 0 where nothing is)."""
         ...
 
-    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> Samples:
+    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The visible samples of all rays, without jitter."""
         ...
 

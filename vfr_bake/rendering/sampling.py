@@ -1,11 +1,11 @@
-"""Samples of bounded scenes: lattice points in occupied cells, up to where the ray is opaque.
+"""Samples of an object's box: lattice points in occupied cells, up to where the ray is opaque.
 
 Letters as in `vfr_bake.kernels.march`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -13,44 +13,56 @@ from torch import Tensor
 
 from player.march.march import OPAQUE_DEPTH
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels import march as kernels
-from vfr_bake.rendering.compositing import LIMITS, Samples
+from vfr_bake.kernels.density import LIMITS
+from vfr_bake.kernels.march import march_samples
+from vfr_bake.rendering.compositing import RaySamples
+from vfr_bake.torch_kernels import fast
+from vfr_bake.torch_kernels.compositing import sums_before
+from vfr_bake.torch_kernels.march import lattice
 
-if TYPE_CHECKING:
-    from vfr_bake.rendering.occupancy import OccupancyGrid
+LATTICE_POINTS = 2**22
+"""Lattice points held at once on a GPU: about 80 bytes each."""
+LOOKUP_POINTS = 2**18
+"""Points looked up at once on a GPU: without compilation 3.5 kB each, with 16 levels."""
+
+Lookup = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""From points [n, 3] of the unit cube to features [n, n_channels] and densities [n] there."""
+
+
+def most_samples(step: float) -> int:
+    """As many samples as a ray can have in the box [-1, 1]^3, and some to spare for rounding."""
+    return int(np.ceil(2 * 3**0.5 / step)) + 3
 
 
 def march(
     field: VfrField,
-    occupancy: OccupancyGrid,
+    distance: np.ndarray,
+    step: float,
     rays_o: Tensor,
     rays_d: Tensor,
     jitter: Tensor,
     budget: int,
     n_chunks: int = 2,
-) -> tuple[Samples, np.ndarray]:
+) -> tuple[RaySamples, np.ndarray]:
     """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities [n_samples]
     that the march met there; `jitter` [n_rays] in [0, 1).
 
     The budget is grown to hold at least one whole ray per chunk.
     """
-    step = occupancy.step
-    longest = int(np.ceil(2 * 3**0.5 / step)) + 3
-    capacity = max(budget // n_chunks, longest)
+    capacity = max(budget // n_chunks, most_samples(step))
     n_channels = field.config.n_channels
     t_mid, sigmas = np.empty((2, n_chunks, capacity), np.float32)
     points = np.empty((n_chunks, capacity, 3), np.float32)
     features = np.empty((n_chunks, capacity, n_channels), np.float32)
     counts = np.empty(len(rays_o), np.int64)
     starts = np.empty(len(rays_o), np.int64)
-    used = kernels.march_samples(
-        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step),
-        occupancy.distance,
-        *field.kernel_arguments(), LIMITS, counts, starts, t_mid, points, features, sigmas,
+    used = march_samples(
+        rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), distance, field.arrays(), LIMITS,
+        counts, starts, t_mid, points, features, sigmas,
     )  # fmt: skip
     first = np.concatenate([[0], np.cumsum(used)])
     served = np.flatnonzero(counts >= 0)
-    samples = Samples(
+    samples = RaySamples(
         t_mid=torch.from_numpy(_join(t_mid, used)),
         deltas=torch.full((int(first[-1]),), step),
         points=torch.from_numpy(_join(points, used)),
@@ -66,28 +78,58 @@ def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.concatenate([chunk[:n] for chunk, n in zip(chunks, used, strict=True)])
 
 
-def march_reference(
-    field: VfrField, occupied: np.ndarray, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, step: float
-) -> list[Tensor]:
-    """The t of every ray's visible samples, ray by ray and lattice point by lattice point: what `march` must
-    find."""
-    n = len(occupied)
-    found = []
-    for o, d, offset in zip(rays_o, rays_d, jitter, strict=True):
-        crosses = d != 0
-        if bool((o[~crosses].abs() > 1).any()):
-            found.append(torch.zeros(0))  # parallel to a face that it lies outside of
-            continue
-        slabs = torch.stack([(-1 - o[crosses]) / d[crosses], (1 - o[crosses]) / d[crosses]])
-        t_near = slabs.min(dim=0).values.max().clamp(min=0)
-        t_far = slabs.max(dim=0).values.min()
-        t = t_near + (torch.arange(int(2 * 3**0.5 / step) + 2) + offset) * step
-        t = t[t < t_far]
-        u = (o + t[:, None] * d + 1) / 2
-        cells = (u * n).long().clamp(0, n - 1)
-        t, u = t[occupied[tuple(cells.T)]], u[occupied[tuple(cells.T)]]
-        with torch.no_grad():
-            sigmas = field.density(field.grid.reference(u))
-        before = torch.cumsum(torch.cat([sigmas.new_zeros(1), sigmas * step]), dim=0)[:-1]
-        found.append(t[before <= OPAQUE_DEPTH])
-    return found
+@torch.no_grad()
+def march_on_device(
+    lookup: Lookup, occupied: Tensor, step: float, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, budget: int
+) -> tuple[RaySamples, Tensor]:
+    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities [n_samples]
+    there; `jitter` [n_rays] in [0, 1).
+
+    As `march`, but that a ray is served if its visible samples fit, known here,
+    and not the most that it could have had. The budget is grown to hold at least one whole ray.
+    """
+    longest = most_samples(step)
+    capacity, block = max(budget, longest), max(1, LATTICE_POINTS // longest)
+    found, n_found = [], 0
+    for start in range(0, max(len(rays_o), 1), block):
+        rows = slice(start, start + block)
+        found.append(_march_block(lookup, occupied, step, rays_o[rows], rays_d[rows], jitter[rows], longest))
+        n_found += len(found[-1][1])
+        if n_found > capacity:
+            break  # no ray of a later block would be served
+    counts, t_mid, points, features, sigmas = (torch.cat(parts) for parts in zip(*found, strict=True))
+    ends = torch.cumsum(counts, dim=0)
+    n_served = int((ends <= capacity).sum())
+    counts = counts[:n_served]
+    n = int(ends[n_served - 1]) if n_served else 0
+    samples = RaySamples(
+        t_mid=t_mid[:n],
+        deltas=torch.full_like(t_mid[:n], step),
+        points=points[:n],
+        features=features[:n],
+        rays=torch.arange(n_served, device=rays_o.device),
+        starts=ends[:n_served] - counts,
+        counts=counts,
+    )
+    return samples, sigmas[:n]
+
+
+def _march_block(
+    lookup: Lookup,
+    occupied: Tensor,
+    step: float,
+    rays_o: Tensor,
+    rays_d: Tensor,
+    jitter: Tensor,
+    longest: int,
+) -> tuple[Tensor, ...]:
+    """(counts [n_rays], t, points, features, densities) of the visible samples of a block of rays."""
+    t, u, candidate = fast(lattice, rays_o.device)(rays_o, rays_d, jitter, occupied, step, longest)
+    places = candidate.reshape(-1).nonzero()[:, 0]
+    points = u.reshape(-1, 3)[places]
+    looked_up = [lookup(part) for part in points.split(LOOKUP_POINTS)]
+    features, sigmas = (torch.cat(parts) for parts in zip(*looked_up, strict=True))
+    depths = t.new_zeros(t.numel()).scatter(0, places, sigmas.to(t.dtype) * step).reshape(t.shape)
+    visible = candidate & (sums_before(depths) <= OPAQUE_DEPTH)
+    kept = visible.reshape(-1)[places]
+    return visible.sum(dim=1), t.reshape(-1)[places][kept], points[kept], features[kept], sigmas[kept]

@@ -6,47 +6,31 @@ Letters as in `vfr_bake.kernels.hash_grid`; all levels of all points at once.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z
+from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z, Levels
 from vfr_bake.torch_kernels import fast
 
 _PRIME_Y, _PRIME_Z = int(PRIME_Y), int(PRIME_Z)  # torch's compiler takes a number of numpy's for a tensor
-
-
-class Levels(NamedTuple):
-    """Which entries of a table belong to which level; tensors on the table's device."""
-
-    scales: Tensor
-    """[n_levels] cells per axis, in the table's type."""
-    sides: Tensor
-    """[n_levels] int64 vertices per axis."""
-    offsets: Tensor
-    """[n_levels] int64 first row of each level."""
-    hashed: Tensor
-    """[n_levels] bool: whether vertices share entries through the spatial hash."""
-    mask: int
-    """Entries of a hashed level, less one; a power of two less one."""
 
 
 def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
     """(rows, trilinear weights), both [n_points, n_levels, 8] with x fastest, of the corners around `points`
     [n_points, 3] of the unit cube."""
     position = points[:, None, :] * levels.scales[:, None]
-    cell = torch.minimum(position.long().clamp(min=0), (levels.sides - 2)[:, None])
+    n_cells = levels.scales.long()
+    cell = torch.minimum(position.long().clamp(min=0), (n_cells - 1)[:, None])
     inside = position - cell
     weights = torch.stack([1 - inside, inside], dim=-1)  # [n_points, n_levels, 3, 2]
     vertices = cell[..., None] + torch.arange(2, device=points.device)
     x = vertices[:, :, 0, None, None, :]
     y = vertices[:, :, 1, None, :, None]
     z = vertices[:, :, 2, :, None, None]
-    side, hashed = levels.sides[:, None, None, None], levels.hashed[:, None, None, None]
+    side, hashed = (n_cells + 1)[:, None, None, None], levels.hashed[:, None, None, None]
     # In 64 bits: the products do not overflow, and the mask takes the bits that 32 would have kept.
     shared = (x ^ (y * _PRIME_Y) ^ (z * _PRIME_Z)) & levels.mask
-    rows = torch.where(hashed, shared, (z * side + y) * side + x) + levels.offsets[:, None, None, None]
+    rows = torch.where(hashed, shared, (z * side + y) * side + x) + levels.offsets[:-1, None, None, None]
     wx, wy, wz = weights[:, :, 0], weights[:, :, 1], weights[:, :, 2]
     products = wx[:, :, None, None, :] * (wy[:, :, None, :, None] * wz[:, :, :, None, None])
     return rows.flatten(2), products.flatten(2)

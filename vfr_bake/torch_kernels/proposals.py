@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from player.march.march import OPAQUE_DEPTH
-from vfr_bake.field.networks import LARGEST_LOGIT
+from vfr_bake.kernels.density import LARGEST_LOGIT
 from vfr_bake.kernels.proposals import PADDING
 from vfr_bake.torch_kernels.compositing import sums_before
 

@@ -10,14 +10,14 @@ from torch import Tensor
 from player.march.march import OPAQUE_DEPTH
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.compositing import Samples
+from vfr_bake.rendering.compositing import RaySamples
 from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid, ProposalSampler
+from vfr_bake.rendering.sampling import march_on_device
 from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels import proposals as kernels
 from vfr_bake.torch_kernels.compositing import Padding, distortion, sums_before
 from vfr_bake.torch_kernels.hash_grid import features_at
-from vfr_bake.torch_kernels.march import march
 from vfr_bake.training.guides import FOG_STEPS, STEPS_PER_UPDATE, OccupancyPace, ProposalPace
 from vfr_bake.training.optimiser import DeviceGridAdam
 
@@ -42,9 +42,9 @@ class DeviceOccupancyGuide(OccupancyPace):
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> Samples:
+    ) -> RaySamples:
         grid, budget = self._grid, int(self._budget(pilot) * share)
-        samples, sigmas = march(
+        samples, sigmas = march_on_device(
             field.lookup, grid.occupied, grid.step, rays_o, rays_d, jitter[:, 0].contiguous(), budget
         )
         grid.observe(samples.points, sigmas)
@@ -76,7 +76,7 @@ class DeviceProposalGuide(ProposalPace):
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> Samples:
+    ) -> RaySamples:
         self._rounds = []
         near, far = self._borders
         edges = rays_o.new_tensor([near, far]).expand(len(rays_o), 2)
@@ -95,7 +95,7 @@ class DeviceProposalGuide(ProposalPace):
     def _resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n: int) -> Tensor:
         return kernels.resample(edges.contiguous(), weights.detach(), exponent, jitter, n)
 
-    def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
@@ -105,7 +105,7 @@ class DeviceProposalGuide(ProposalPace):
         losses = distortion(weights, mids, widths, samples.starts, samples.counts)
         return self._config.distortion * losses.sum()
 
-    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+    def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         if not self._learns or not n_rays:
             return
         final = weights.new_zeros(len(samples.counts), N_FINAL)
@@ -135,14 +135,14 @@ def proposal_weights(grid: ProposalGrid, rays_o: Tensor, rays_d: Tensor, edges: 
 
 
 @torch.no_grad()
-def field_samples(field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> Samples:
+def field_samples(field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> RaySamples:
     """The field in the middle of intervals with borders `edges` [n_rays, n + 1] in s, up to where a ray is
     opaque."""
     t_mid, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
     features, sigmas = field.lookup(points.reshape(-1, 3))
     kept = sums_before(sigmas.reshape(lengths.shape) * lengths) <= OPAQUE_DEPTH
     counts = kept.sum(dim=1)
-    return Samples(
+    return RaySamples(
         t_mid=t_mid[kept],
         deltas=lengths[kept],
         points=points[kept],

@@ -16,7 +16,7 @@ from torch import Tensor
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import spacing
-from vfr_bake.rendering.compositing import Samples, distortion
+from vfr_bake.rendering.compositing import RaySamples, distortion
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.sampling import march
@@ -50,7 +50,7 @@ class Guide(Protocol):
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> Samples:
+    ) -> RaySamples:
         """Samples of rays [n_rays, 3] with `jitter` [n_rays, 3] in [0, 1), in this process' `share` of the
         batch."""
         ...
@@ -59,11 +59,11 @@ class Guide(Protocol):
         """What the batch came to, over all processes."""
         ...
 
-    def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         """Sum over the rays of a loss on the weights [n_samples], if there is one."""
         ...
 
-    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+    def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
         ...
 
@@ -95,10 +95,10 @@ class OccupancyPace:
         per_ray = max(n_samples / max(n_rays, 1), 1.0)
         self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
 
-    def regulariser(self, samples: Samples, weights: Tensor) -> None:
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> None:
         return None
 
-    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+    def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         pass
 
     def tables(self) -> Iterator[TableAdam]:
@@ -123,10 +123,12 @@ class OccupancyGuide(OccupancyPace):
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> Samples:
+    ) -> RaySamples:
         first = jitter[:, 0].contiguous()
         budget, n_chunks = int(self._budget(pilot) * share), torch.get_num_threads()
-        samples, sigmas = march(field, self.sampler, rays_o, rays_d, first, budget, n_chunks)
+        samples, sigmas = march(
+            field, self.sampler.distance, self.sampler.step, rays_o, rays_d, first, budget, n_chunks
+        )
         if self.sampler.n_updates > 0:
             self.sampler.observe(samples.points.numpy(), sigmas)
         return samples
@@ -176,13 +178,13 @@ class ProposalGuide(ProposalPace):
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> Samples:
+    ) -> RaySamples:
         samples, self._edges, self._rounds = self.sampler.sample_rounds(
             field, rays_o, rays_d, jitter, self._exponent
         )
         return samples
 
-    def regulariser(self, samples: Samples, weights: Tensor) -> Tensor | None:
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
@@ -193,7 +195,7 @@ class ProposalGuide(ProposalPace):
         losses = distortion(weights, mids, widths, samples.starts, samples.counts)
         return self._config.distortion * losses.sum()
 
-    def add_gradients(self, samples: Samples, weights: Tensor, n_rays: int) -> None:
+    def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         if self._learns:
             self.sampler.add_gradients(self._rounds, self._edges, samples, weights, n_rays)
 

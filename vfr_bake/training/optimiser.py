@@ -10,7 +10,7 @@ from numba import get_num_threads
 from torch import Tensor
 
 from vfr_bake.field.hash_grid import HashGrid, zeros
-from vfr_bake.kernels.adam import adam_step, scatter_and_step
+from vfr_bake.kernels.adam import Pace, adam_step, scatter_and_step
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 """Adam's decay rates and its smallest denominator, of grids and networks alike (instant-ngp)."""
@@ -102,18 +102,18 @@ class GridAdam:
     def step(self, rate: float) -> None:
         """Apply and clear the gradient."""
         arrays = (a.numpy() for a in (self.table.detach(), self.gradient, self.moments))
-        adam_step(*arrays, *self._next_scalars(rate))
+        adam_step(*arrays, self._next_pace(rate))
 
     def clear(self) -> None:
         """Drop the gradient of a step that is not to be taken."""
         self.gradient.zero_()
 
-    def _next_scalars(self, rate: float) -> list[np.float32]:
-        """(bias-corrected rate, beta1, beta2, epsilon) of the next step."""
+    def _next_pace(self, rate: float) -> Pace:
+        """Count a step, and return its numbers."""
         self.n_steps += 1
         beta1, beta2 = BETAS
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
-        return [np.float32(s) for s in (rate * correction, beta1, beta2, EPSILON)]
+        return Pace(*map(np.float32, (rate * correction, beta1, beta2, EPSILON)))
 
     def state(self) -> dict[str, Any]:
         return {"moments": self.moments, "n_steps": self.n_steps}
@@ -143,9 +143,8 @@ class FusedGridAdam(GridAdam):
         if self._rows.shape[1] < 8 * len(points) + 1:
             self._rows = np.empty((get_num_threads(), 8 * len(points) + 1), np.uint32)
         scatter_and_step(
-            points.numpy(), gradient.numpy(), *self._grid.layout.kernel_arguments(np.float32),
-            self._buffer.numpy(), self._rows, self.table.detach().numpy(), self.moments.numpy(),
-            *self._next_scalars(rate),
+            points.numpy(), gradient.numpy(), self._grid.layout.grid(self.table), self._buffer.numpy(),
+            self._rows, self.moments.numpy(), self._next_pace(rate),
         )  # fmt: skip
         self._pending.clear()
 

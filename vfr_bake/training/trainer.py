@@ -17,7 +17,7 @@ from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
-from vfr_bake.rendering.compositing import Samples, composite
+from vfr_bake.rendering.compositing import RaySamples, composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.torch_kernels import can_compile
@@ -240,7 +240,7 @@ class Trainer:
         share = self.processes.share
         return Batch(*(share(rows) for rows in (rays.rays_o, rays.rays_d, rays.rgba, jitter, background)))
 
-    def _error(self, batch: Batch, samples: Samples, pilot: bool) -> tuple[Tensor, Tensor]:
+    def _error(self, batch: Batch, samples: RaySamples, pilot: bool) -> tuple[Tensor, Tensor]:
         """(Squared error of the served rays, summed over rays and channels; weights [n_samples])."""
         rgba, background = batch.rgba[samples.rays], batch.background[samples.rays]
         target = rgba[:, :3] * rgba[:, 3:] + background * (1 - rgba[:, 3:])
@@ -255,7 +255,7 @@ class Trainer:
         return ((rgb - target[hit]) ** 2).sum() + missed_error, weights
 
     def _colours(
-        self, samples: Samples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
+        self, samples: RaySamples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(Colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of the rays that hit."""
         features = self._field.grid(samples.points, samples.features)
@@ -272,7 +272,7 @@ class Trainer:
         return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
 
     def _backward(
-        self, loss: Tensor, value: float, samples: Samples, weights: Tensor, n_rays: int, pilot: bool
+        self, loss: Tensor, value: float, samples: RaySamples, weights: Tensor, n_rays: int, pilot: bool
     ) -> bool:
         """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
         tables = [self._grid_adam, *self._guide.tables()]

@@ -14,7 +14,7 @@ from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, occupied_cells
 from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
-from vfr_bake.rendering.compositing import LIMITS
+from vfr_bake.kernels.density import LIMITS
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
@@ -76,7 +76,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
 ) -> None:
     """Against a sum in float64 over the model's own samples, those in cells below the floor left out."""
     held_out, floor = HeldOut(model, 1), 0.1
-    monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", (LIMITS[0], np.float32(1e9)))
+    monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", LIMITS._replace(opaque_depth=np.float32(1e9)))
     cells = cull(model, 96, held_out, floor, 0.0, quiet)
     marks = marked_cells(model, 96, (floor,), quiet)
     visible = close_gaps(marks[..., 0].view(bool))

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from tests.reference import spherical_harmonics
+from tests.vfr_bake import twins
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.networks import (
-    LARGEST_LOGIT,
     DensityNetwork,
     Head,
     Pilot,
     SphericalHarmonics,
     TruncatedExp,
 )
-from vfr_bake.kernels.march import density_logits
+from vfr_bake.kernels.density import LARGEST_LOGIT, density_logits
 
 
 def test_density_is_bounded_and_its_gradient_never_dies() -> None:
@@ -37,9 +37,9 @@ def test_compiled_density_equals_the_network(width: int) -> None:
     torch.nn.init.uniform_(field.grid.table, -1, 1)
     points = torch.rand(3000, 3)
     out = np.empty(3000, np.float32)
-    density_logits(points.numpy(), *field.kernel_arguments(), out)
+    density_logits(points.numpy(), field.arrays(), out)
     with torch.no_grad():
-        expected = field.density.logits(field.grid.reference(points)).numpy()
+        expected = field.density.logits(twins.encode(field.grid, points)).numpy()
     np.testing.assert_allclose(out, expected, rtol=0, atol=2e-5)
 
 

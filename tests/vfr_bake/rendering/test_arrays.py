@@ -22,7 +22,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.visibility import mark_visible_cells
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
-from vfr_bake.rendering.compositing import LIMITS
+from vfr_bake.kernels.density import LIMITS
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import FusedGridAdam, GridAdam
 
@@ -46,10 +46,10 @@ for unbounded in (False, True):
     else:
         sampler = OccupancyGrid(8, 0.1, seed=0)
         sampler.set_occupied(np.random.default_rng(1).random((8, 8, 8)) < 0.4)
-        samples, sigmas = march(field, sampler, rays_o, rays_d, torch.full((5,), 0.5), 300, n_chunks=2)
+        samples, sigmas = march(field, sampler.distance, 0.1, rays_o, rays_d, torch.full((5,), 0.5), 300)
         found["sigmas"] = sigmas
         visible = np.zeros((9, 9, 9, 2), np.uint8)
-        arguments = (np.float32(0.1), sampler.distance, *field.kernel_arguments(), LIMITS)
+        arguments = (np.float32(0.1), sampler.distance, field.arrays(), LIMITS)
         mark_visible_cells(rays_o.numpy(), rays_d.numpy(), *arguments, np.float32([0.01, 0.2]), visible)
         found["visible"] = visible
     for name in ("t_mid", "deltas", "points", "features", "counts"):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tests.reference import composite_ray
-from vfr_bake.rendering.compositing import composite, composite_reference, distortion
+from tests.vfr_bake import twins
+from vfr_bake.rendering.compositing import composite, distortion
 
 STEP = 0.25
 RAYS = {
@@ -34,7 +35,7 @@ def packed(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 3e-6)])
 def test_kernel_and_twin_match_the_equation(dtype: torch.dtype, tolerance: float) -> None:
     sigmas, features, deltas, starts, counts = packed(dtype)
-    for function in (composite, composite_reference):
+    for function in (composite, twins.composite):
         out, opacity, weights = function(sigmas, features, deltas, starts, counts)
         for ray, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
             rows = slice(start, start + count)
@@ -72,7 +73,7 @@ def test_gradients_match_finite_differences() -> None:
 def test_gradients_match_autograd_on_hard_inputs(dtype: torch.dtype) -> None:
     sigmas, features, deltas, starts, counts = packed(dtype)
     gradients = []
-    for function in (composite, composite_reference):
+    for function in (composite, twins.composite):
         s, f = sigmas.clone().requires_grad_(), features.clone().requires_grad_()
         outputs = function(s, f, deltas, starts, counts)
         torch.manual_seed(5)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.vfr_bake import twins
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.march import chebyshev_distance
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.sampling import march, march_reference
+from vfr_bake.rendering.sampling import march
 
 STEP = 0.037
 CONFIG = FieldConfig(n_levels=4, base_resolution=4, max_resolution=32, log2_table_size=12, head_width=16)
@@ -57,8 +58,8 @@ def test_march_finds_what_the_twin_finds(logit: float) -> None:
     field, occupancy = field_of_density(logit), half_full()
     rays_o, rays_d = rays()
     jitter = torch.rand(len(rays_o), generator=torch.Generator().manual_seed(4))
-    samples, sigmas = march(field, occupancy, rays_o, rays_d, jitter, 200_000)
-    expected = march_reference(field, occupancy.occupied, rays_o, rays_d, jitter, STEP)
+    samples, sigmas = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 200_000)
+    expected = twins.march(field, occupancy.occupied, rays_o, rays_d, jitter, STEP)
     assert samples.rays.tolist() == list(range(len(rays_o)))
     n_different = 0
     for ray, t in enumerate(expected):
@@ -70,7 +71,7 @@ def test_march_finds_what_the_twin_finds(logit: float) -> None:
             n_different += abs(len(found) - len(t))
     assert n_different <= 2
     assert len(samples.t_mid) > 200
-    torch.testing.assert_close(samples.features, field.grid.reference(samples.points), rtol=0, atol=1e-5)
+    torch.testing.assert_close(samples.features, twins.encode(field.grid, samples.points), rtol=0, atol=1e-5)
     np.testing.assert_allclose(sigmas, field.density(samples.features).detach().numpy(), rtol=1e-5)
 
 
@@ -78,11 +79,11 @@ def test_nothing_is_written_past_the_budget() -> None:
     field, occupancy = field_of_density(-9.0), OccupancyGrid(16, STEP, seed=0)
     rays_o, rays_d = rays(400)
     jitter = torch.zeros(len(rays_o))
-    samples, _ = march(field, occupancy, rays_o, rays_d, jitter, 1000, n_chunks=2)
+    samples, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 1000, n_chunks=2)
     assert 0 < len(samples.t_mid) <= 1000
     assert len(samples.rays) < len(rays_o)
     assert int(samples.counts.sum()) == len(samples.t_mid)
-    whole, _ = march(field, occupancy, rays_o, rays_d, jitter, 400_000, n_chunks=2)
+    whole, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 400_000, n_chunks=2)
     for ray, start, count in zip(samples.rays, samples.starts, samples.counts, strict=True):
         first = int(whole.starts[ray])
         assert torch.equal(samples.t_mid[start : start + count], whole.t_mid[first : first + int(count)])
@@ -91,7 +92,9 @@ def test_nothing_is_written_past_the_budget() -> None:
 def test_rendering_without_stored_samples_equals_rendering_with_them() -> None:
     field, occupancy = field_of_density(2.0), half_full()
     rays_o, rays_d = rays()
-    samples, _ = march(field, occupancy, rays_o, rays_d, torch.full((len(rays_o),), 0.5), 200_000)
+    samples, _ = march(
+        field, occupancy.distance, STEP, rays_o, rays_d, torch.full((len(rays_o),), 0.5), 200_000
+    )
     with torch.no_grad():
         sigmas = field.density(samples.features)
         out, opacity, _ = composite(sigmas, samples.features, samples.deltas, samples.starts, samples.counts)
@@ -104,7 +107,7 @@ def test_rendering_without_stored_samples_equals_rendering_with_them() -> None:
 def test_an_opaque_field_stops_at_its_first_samples() -> None:
     field, occupancy = field_of_density(12.0), OccupancyGrid(16, STEP, seed=0)
     rays_o, rays_d = rays()
-    samples, _ = march(field, occupancy, rays_o, rays_d, torch.zeros(len(rays_o)), 100_000)
+    samples, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, torch.zeros(len(rays_o)), 100_000)
     assert int(samples.counts.max()) == 1
 
 

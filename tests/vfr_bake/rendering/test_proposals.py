@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.reference import composite_ray
+from tests.vfr_bake import twins
 from vfr_bake.config import FieldOptions
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import proposals as kernels
@@ -113,9 +114,8 @@ def test_interlevel_loss_and_its_gradient() -> None:
     logits = random.normal(size=n)
     depths, p_weights = proposal(logits)
     losses, gradient = np.empty(1), np.empty((1, n))
-    kernels.interlevel(
-        edges, starts, counts, weights, p_edges, p_weights[None], depths[None], losses, gradient
-    )
+    found = kernels.Round(p_edges, depths[None], np.empty((1, n, 3)), p_weights[None])
+    kernels.interlevel(edges, starts, counts, weights, found, losses, gradient)
     assert losses[0] == pytest.approx(naive_interlevel(edges[0], weights, p_edges[0], p_weights), rel=1e-12)
     assert losses[0] > 0
     for j in range(n):
@@ -145,7 +145,7 @@ def test_samples_lie_where_they_say() -> None:
     points = (rays_o[owner] + samples.t_mid[:, None] * rays_d[owner]).double().numpy()
     expected = np.stack([(contract(point) + 2) / 4 for point in points])
     np.testing.assert_allclose(samples.points.numpy(), expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(samples.features, field.grid.reference(samples.points), rtol=0, atol=1e-5)
+    torch.testing.assert_close(samples.features, twins.encode(field.grid, samples.points), rtol=0, atol=1e-5)
     for found in rounds:
         before = np.cumsum(found.depths.astype(np.float64), axis=1) - found.depths
         weights = np.exp(-before) * -np.expm1(-found.depths.astype(np.float64))

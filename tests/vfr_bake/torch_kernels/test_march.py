@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.vfr_bake import twins
 from tests.vfr_bake.rendering.test_march import STEP, field_of_density, half_full, rays
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering import sampling as numba_path
-from vfr_bake.rendering.compositing import Samples
-from vfr_bake.torch_kernels import march as kernels
+from vfr_bake.rendering import sampling
+from vfr_bake.rendering.compositing import RaySamples
+from vfr_bake.torch_kernels.march import lattice
 
 
 def on(device: torch.device, logit: float) -> VfrField:
@@ -21,14 +22,14 @@ def on(device: torch.device, logit: float) -> VfrField:
 
 def march(
     logit: float, occupied: np.ndarray, budget: int, device: torch.device, n: int | None = None
-) -> tuple[Samples, torch.Tensor]:
+) -> tuple[RaySamples, torch.Tensor]:
     """Of the first `n` test rays; all tensors on the CPU."""
     rays_o, rays_d = (a[:n].to(device) for a in rays())
     cells = torch.from_numpy(occupied).to(device)
-    samples, sigmas = kernels.march(
+    samples, sigmas = sampling.march_on_device(
         on(device, logit).lookup, cells, STEP, rays_o, rays_d, jitters()[: len(rays_o)].to(device), budget
     )
-    return Samples(**{name: value.cpu() for name, value in vars(samples).items()}), sigmas.cpu()
+    return RaySamples(**{name: value.cpu() for name, value in vars(samples).items()}), sigmas.cpu()
 
 
 def jitters() -> torch.Tensor:
@@ -40,8 +41,10 @@ def test_it_finds_what_the_twin_and_the_kernel_find(logit: float, device: torch.
     field, occupancy = field_of_density(logit), half_full()
     rays_o, rays_d = rays()
     samples, sigmas = march(logit, occupancy.occupied, 200_000, device)
-    expected = numba_path.march_reference(field, occupancy.occupied, rays_o, rays_d, jitters(), STEP)
-    compiled, _ = numba_path.march(field, occupancy, rays_o, rays_d, jitters(), 200_000, n_chunks=1)
+    expected = twins.march(field, occupancy.occupied, rays_o, rays_d, jitters(), STEP)
+    compiled, _ = sampling.march(
+        field, occupancy.distance, STEP, rays_o, rays_d, jitters(), 200_000, n_chunks=1
+    )
     assert samples.rays.tolist() == list(range(len(rays_o)))
     n_different = 0
     for ray, t in enumerate(expected):
@@ -53,7 +56,7 @@ def test_it_finds_what_the_twin_and_the_kernel_find(logit: float, device: torch.
     assert n_different <= 2
     assert abs(len(samples.t_mid) - len(compiled.t_mid)) <= 2
     assert len(samples.t_mid) > 200 and (samples.deltas == STEP).all()
-    torch.testing.assert_close(samples.features, field.grid.reference(samples.points), rtol=0, atol=1e-5)
+    torch.testing.assert_close(samples.features, twins.encode(field.grid, samples.points), rtol=0, atol=1e-5)
     torch.testing.assert_close(sigmas, field.density(samples.features).detach(), rtol=1e-5, atol=0)
 
 
@@ -61,8 +64,8 @@ def test_it_does_not_depend_on_the_size_of_its_blocks(
     device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, sigmas = march(1.0, half_full().occupied, 200_000, device)
-    monkeypatch.setattr(kernels, "LATTICE_POINTS", 500)
-    monkeypatch.setattr(kernels, "LOOKUP_POINTS", 7)
+    monkeypatch.setattr(sampling, "LATTICE_POINTS", 500)
+    monkeypatch.setattr(sampling, "LOOKUP_POINTS", 7)
     parts, again = march(1.0, half_full().occupied, 200_000, device)
     torch.testing.assert_close(again, sigmas)
     for name, value in vars(whole).items():
@@ -75,7 +78,7 @@ def test_the_budget_holds_and_serves_whole_rays(
     full = np.ones((16, 16, 16), bool)
     whole, _ = march(-9.0, full, 200_000, device)
     for block in (2**22, 500):
-        monkeypatch.setattr(kernels, "LATTICE_POINTS", block)
+        monkeypatch.setattr(sampling, "LATTICE_POINTS", block)
         samples, sigmas = march(-9.0, full, 300, device)
         n, n_rays = len(samples.t_mid), len(samples.rays)
         assert 0 < n <= 300 and 0 < n_rays < len(whole.rays)
@@ -100,7 +103,7 @@ def test_a_lattice_is_one_graph(device: torch.device) -> None:
     rays_o, rays_d = (a.to(device) for a in rays())
     occupied = torch.from_numpy(half_full().occupied).to(device)
     torch._dynamo.reset()
-    graph = torch.compile(kernels.lattice, backend="aot_eager", fullgraph=True, dynamic=True)
+    graph = torch.compile(lattice, backend="aot_eager", fullgraph=True, dynamic=True)
     arguments = (rays_o, rays_d, jitters().to(device), occupied, STEP, 97)
-    for ours, expected in zip(graph(*arguments), kernels.lattice(*arguments), strict=True):
+    for ours, expected in zip(graph(*arguments), lattice(*arguments), strict=True):
         torch.testing.assert_close(ours, expected)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from player.march.march import OPAQUE_DEPTH
 from tests.vfr_bake.rendering.test_proposals import (
     HISTOGRAMS,
     contract,
@@ -14,10 +15,10 @@ from tests.vfr_bake.rendering.test_proposals import (
     naive_resample,
 )
 from vfr_bake.config import TrainConfig
-from vfr_bake.field.networks import LARGEST_LOGIT
 from vfr_bake.kernels import proposals as compiled
-from vfr_bake.kernels.proposals import spacing
-from vfr_bake.rendering.compositing import OPAQUE_DEPTH, Samples
+from vfr_bake.kernels.density import LARGEST_LOGIT, Limits
+from vfr_bake.kernels.proposals import Round, spacing
+from vfr_bake.rendering.compositing import RaySamples
 from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED
 from vfr_bake.torch_kernels import proposals as kernels
 from vfr_bake.training.device_guides import DeviceProposalGuide
@@ -113,22 +114,16 @@ def test_rounds_and_samples_are_the_kernels_in_float64(step: int, device: torch.
     for module in (field, expected.sampler, guide._sampler):
         module.double()
     guide.prepare(step, field)
-    grids = [
-        (grid.table.detach().numpy(), *grid.layout.kernel_arguments(np.float64))
-        for grid in expected.sampler.grids
-    ]
-    arrays, limits = [a.numpy() for a in rays], (np.float64(LARGEST_LOGIT), np.float64(OPAQUE_DEPTH))
+    grids = [grid.layout.grid(grid.table) for grid in expected.sampler.grids]
+    arrays, limits = [a.numpy() for a in rays], Limits(*map(np.float64, (LARGEST_LOGIT, OPAQUE_DEPTH)))
     shapes = [(40, N_PROPOSED + 1), (40, N_PROPOSED), (40, N_PROPOSED, 3), (40, N_PROPOSED)]
-    rounds = [[np.zeros(shape) for shape in shapes] for _ in range(2)]
+    rounds = [Round(*(np.zeros(shape) for shape in shapes)) for _ in range(2)]
     edges, counts, n = np.empty((40, N_FINAL + 1)), np.empty(40, np.int64), 40 * N_FINAL
-    compiled.propose(
-        *arrays, guide._borders, np.float64(guide._exponent), *grids, limits, *rounds[0], *rounds[1],
-        edges,
-    )  # fmt: skip
+    compiled.propose(*arrays, guide._borders, np.float64(guide._exponent), *grids, limits, *rounds, edges)
     t_mid, deltas, points = np.empty(n), np.empty(n), np.empty((n, 3))
     features = np.empty((n, field.config.n_channels))
     compiled.field_samples(
-        *arrays[:2], edges, *field.kernel_arguments(), limits, counts, t_mid, deltas, points, features
+        *arrays[:2], edges, field.arrays(), limits, counts, t_mid, deltas, points, features
     )
     field.to(device).grid.backend = "torch"
     samples = guide.sample(field, *(a.to(device) for a in rays), pilot=False, share=1.0)
@@ -173,7 +168,7 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
         torch.testing.assert_close(ours, expected, rtol=1e-3, atol=2e-4 * float(expected.abs().max()))
 
 
-def same_samples(ours: Samples, expected: Samples) -> None:
+def same_samples(ours: RaySamples, expected: RaySamples) -> None:
     assert torch.equal(ours.counts.cpu(), expected.counts) and torch.equal(ours.starts.cpu(), expected.starts)
     # Borders are drawn from sums of 64 weights in another order; far out a rounding of s is magnified in t.
     torch.testing.assert_close(ours.t_mid.cpu(), expected.t_mid, rtol=2e-3, atol=1e-5)
