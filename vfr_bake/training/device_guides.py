@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -18,56 +16,47 @@ from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels import proposals as kernels
 from vfr_bake.torch_kernels.compositing import Padding, distortion, sums_before
 from vfr_bake.torch_kernels.hash_grid import features_at
-from vfr_bake.training.guides import FOG_STEPS, STEPS_PER_UPDATE, OccupancyPace, ProposalPace
+from vfr_bake.training.guides import BoxGuide, SpaceGuide
 from vfr_bake.training.optimiser import DeviceGridAdam
 
 
-class DeviceOccupancyGuide(OccupancyPace):
-    """Marches an object's box and keeps its occupancy grid."""
+class DeviceOccupancyGuide(BoxGuide):
+    """Marches an object's box on a GPU and keeps its occupancy grid."""
+
+    _grid: DeviceOccupancyGrid
 
     def __init__(
-        self, config: TrainConfig, pace: DeviceSettings, step_length: float, device: torch.device
+        self, config: TrainConfig, settings: DeviceSettings, step_length: float, device: torch.device
     ) -> None:
-        super().__init__(pace, step_length)
-        self._grid = DeviceOccupancyGrid(config.occupancy_resolution, step_length, config.seed, device)
+        grid = DeviceOccupancyGrid(config.occupancy_resolution, step_length, config.seed, device)
+        super().__init__(settings, grid)
 
     @property
     def sampler(self) -> OccupancyGrid:
-        """As the CPU has it."""
         return self._grid.on_cpu()
-
-    def prepare(self, step: int, field: VfrField) -> None:
-        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
-            self._grid.update(field)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
         grid, budget = self._grid, int(self._budget(pilot) * share)
+        first = jitter[:, 0].contiguous()
         samples, sigmas = march_on_device(
-            field.lookup, grid.occupied, grid.step, rays_o, rays_d, jitter[:, 0].contiguous(), budget
+            field.lookup, grid.occupied, grid.step, rays_o, rays_d, first, budget
         )
         grid.observe(samples.points, sigmas)
         return samples
 
-    def state(self) -> dict[str, Any]:
-        return {"samples_per_ray": self._samples_per_ray, "occupancy": self._grid.state()}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self._samples_per_ray = state["samples_per_ray"]
-        self._grid.restore(state["occupancy"])
+class DeviceProposalGuide(SpaceGuide):
+    """Trains the two proposal grids of an unbounded scene beside the field on a GPU, by autograd."""
 
-
-class DeviceProposalGuide(ProposalPace):
-    """Trains the two proposal grids of an unbounded scene beside the field, by autograd."""
-
-    def __init__(self, config: TrainConfig, pace: DeviceSettings, near: float, device: torch.device) -> None:
-        super().__init__(config, pace, ProposalSampler(near).to(device))
-        self._adams = [DeviceGridAdam(grid.table) for grid in self._sampler.grids]  # type: ignore[arg-type]
+    def __init__(
+        self, config: TrainConfig, settings: DeviceSettings, near: float, device: torch.device
+    ) -> None:
+        super().__init__(config, settings, ProposalSampler(near).to(device), DeviceGridAdam, distortion)
 
     @property
     def sampler(self) -> ProposalSampler:
-        """As the CPU has it."""
         if next(self._sampler.parameters()).device.type == "cpu":
             return self._sampler
         copy = ProposalSampler(self._sampler.near)
@@ -95,16 +84,6 @@ class DeviceProposalGuide(ProposalPace):
     def _resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n: int) -> Tensor:
         return kernels.resample(edges.contiguous(), weights.detach(), exponent, jitter, n)
 
-    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        if self._config.distortion == 0:
-            return None
-        # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
-        kept = torch.arange(N_FINAL, device=weights.device) < samples.counts[:, None]
-        low, high = self._edges[:, :-1][kept], self._edges[:, 1:][kept]
-        mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
-        losses = distortion(weights, mids, widths, samples.starts, samples.counts)
-        return self._config.distortion * losses.sum()
-
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         if not self._learns or not n_rays:
             return
@@ -113,17 +92,6 @@ class DeviceProposalGuide(ProposalPace):
         final[:, : rows.shape[1]] = rows
         losses = [kernels.interlevel(self._edges, final, edges, proposed) for edges, proposed in self._rounds]
         (torch.stack(losses).sum() / n_rays).backward()
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "proposals": self._sampler.state_dict(),
-            "adams": [adam.state() for adam in self._adams],
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._sampler.load_state_dict(state["proposals"])
-        for adam, kept in zip(self._adams, state["adams"], strict=True):
-            adam.restore(kept)
 
 
 def proposal_weights(grid: ProposalGrid, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> Tensor:

@@ -1,15 +1,15 @@
 """What finds the geometry while a field is trained: an occupancy grid for objects, proposals for scenes.
 
-Both give the trainer rays' samples, learn from what came of them, and are at last the sampler that the
-trained field is rendered with.
+Both give the trainer the samples of rays, learn from what came of them, and are at last the sampler that the
+trained field is rendered with. Those of a GPU are in `vfr_bake.training.device_guides`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +17,7 @@ from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import spacing
 from vfr_bake.rendering.compositing import RaySamples, distortion
-from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import GridAdam, TableAdam
@@ -28,181 +28,195 @@ FOG_STEPS = 512
 STEPS_PER_UPDATE = (16, 64)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
-"""Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 (mip-NeRF 360,
-section C)."""
+"""Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
+steps and b the slope (mip-NeRF 360, section C)."""
 STEPS_PER_PROPOSAL_UPDATE = 5
 """Later proposals change slowly and learn in one step of so many (nerfacc's default)."""
 
 
-class Guide(Protocol):
+class Guide(ABC):
     """The sampler in training."""
 
     @property
-    def sampler(self) -> OccupancyGrid | ProposalSampler: ...
+    @abstractmethod
+    def sampler(self) -> OccupancyGrid | ProposalSampler:
+        """The sampler as it is now, on the CPU."""
 
+    @abstractmethod
     def n_rays(self, pilot: bool) -> int:
         """Rays to draw for the next batch, over all processes."""
-        ...
 
+    @abstractmethod
     def prepare(self, step: int, field: VfrField) -> None:
         """Before a step: look at what the field has become."""
-        ...
 
+    @abstractmethod
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
         """Samples of rays [n_rays, 3] with `jitter` [n_rays, 3] in [0, 1), in this process' `share` of the
         batch."""
-        ...
 
     def observe(self, n_rays: int, n_samples: int) -> None:
-        """What the batch came to, over all processes."""
-        ...
+        """Take note of how many rays and samples the batch had, over all processes."""
+        return None
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         """Sum over the rays of a loss on the weights [n_samples], if there is one."""
-        ...
+        return None
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
-        ...
+        return None
 
-    def tables(self) -> Iterator[TableAdam]:
+    def tables(self) -> Sequence[TableAdam]:
         """The tables that learn in this step, with their gradients."""
-        ...
+        return ()
 
-    def state(self) -> dict[str, Any]: ...
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """All that later steps depend on, in tensors and plain values."""
 
-    def restore(self, state: dict[str, Any]) -> None: ...
+    @abstractmethod
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` returned."""
 
 
-class OccupancyPace:
-    """How many rays of an object fill a batch: what its guides have in common on all devices."""
+class BoxGuide(Guide):
+    """Marches an object's box: what its guides have in common on all devices."""
 
-    def __init__(self, pace: DeviceSettings, step_length: float) -> None:
-        self._pace = pace
-        self._samples_per_ray = 2 / step_length
+    def __init__(self, settings: DeviceSettings, grid: OccupancyGrid | DeviceOccupancyGrid) -> None:
+        self._settings, self._grid = settings, grid
+        self._samples_per_ray = 2 / grid.step
 
     def n_rays(self, pilot: bool) -> int:
         wanted = 1.1 * self._budget(pilot) / self._samples_per_ray
-        return int(min(self._pace.max_rays, max(64, wanted)))
+        return int(min(self._settings.max_rays, max(64, wanted)))
 
     def _budget(self, pilot: bool) -> int:
         # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
-        return self._pace.batch_samples // 2 if pilot else self._pace.batch_samples
+        return self._settings.batch_samples // 2 if pilot else self._settings.batch_samples
+
+    def prepare(self, step: int, field: VfrField) -> None:
+        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
+            self._grid.update(field)
 
     def observe(self, n_rays: int, n_samples: int) -> None:
         per_ray = max(n_samples / max(n_rays, 1), 1.0)
         self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
 
-    def regulariser(self, samples: RaySamples, weights: Tensor) -> None:
-        return None
+    def state(self) -> dict[str, Any]:
+        return {"samples_per_ray": self._samples_per_ray, "occupancy": self._grid.state()}
 
-    def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
-        pass
-
-    def tables(self) -> Iterator[TableAdam]:
-        return iter(())
+    def restore(self, state: dict[str, Any]) -> None:
+        self._samples_per_ray = state["samples_per_ray"]
+        self._grid.restore(state["occupancy"])
 
 
-class OccupancyGuide(OccupancyPace):
-    """Marches an object's box and keeps its occupancy grid."""
+class OccupancyGuide(BoxGuide):
+    """Marches an object's box on a CPU and keeps its occupancy grid."""
+
+    _grid: OccupancyGrid
 
     def __init__(
-        self, config: TrainConfig, pace: DeviceSettings, step_length: float, processes: Processes
+        self, config: TrainConfig, settings: DeviceSettings, step_length: float, processes: Processes
     ) -> None:
-        super().__init__(pace, step_length)
+        super().__init__(settings, OccupancyGrid(config.occupancy_resolution, step_length, config.seed))
         self._processes = processes
-        self.sampler = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
+
+    @property
+    def sampler(self) -> OccupancyGrid:
+        return self._grid
 
     def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             # Every process has seen its own rays.
-            self._processes.take_largest(torch.from_numpy(self.sampler.densities))
-            self.sampler.update(field)
+            self._processes.take_largest(torch.from_numpy(self._grid.densities))
+        super().prepare(step, field)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
+        grid, budget, n_chunks = self._grid, int(self._budget(pilot) * share), torch.get_num_threads()
         first = jitter[:, 0].contiguous()
-        budget, n_chunks = int(self._budget(pilot) * share), torch.get_num_threads()
-        samples, sigmas = march(
-            field, self.sampler.distance, self.sampler.step, rays_o, rays_d, first, budget, n_chunks
-        )
-        if self.sampler.n_updates > 0:
-            self.sampler.observe(samples.points.numpy(), sigmas)
+        samples, sigmas = march(field, grid.distance, grid.step, rays_o, rays_d, first, budget, n_chunks)
+        if grid.n_updates > 0:
+            grid.observe(samples.points.numpy(), sigmas)
         return samples
 
-    def state(self) -> dict[str, Any]:
-        return {"samples_per_ray": self._samples_per_ray, "occupancy": self.sampler.state()}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self._samples_per_ray = state["samples_per_ray"]
-        self.sampler.restore(state["occupancy"])
-
-
-class ProposalPace:
+class SpaceGuide(Guide):
     """When the proposals of a scene learn and how far they are believed: what its guides have in common on
     all devices."""
 
-    def __init__(self, config: TrainConfig, pace: DeviceSettings, sampler: ProposalSampler) -> None:
-        self._config, self._pace, self._sampler = config, pace, sampler
-        self._adams: Sequence[TableAdam] = ()
+    _edges: Tensor
+    """[n_rays, N_FINAL + 1] borders of the last samples' intervals, in s."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        settings: DeviceSettings,
+        sampler: ProposalSampler,
+        adam: Callable[[Tensor], TableAdam],
+        distortion: Callable[..., Tensor],
+    ) -> None:
+        self._config, self._settings, self._sampler = config, settings, sampler
+        self._adams = [adam(grid.table) for grid in sampler.grids]  # type: ignore[arg-type]
+        self._distortion = distortion
         self._learns = True
         self._exponent = 1.0
         self._borders = (float(spacing(sampler.near)), float(spacing(FAR)))
         self._span = self._borders[1] - self._borders[0]
 
     def n_rays(self, pilot: bool) -> int:
-        return self._pace.batch_rays // 2 if pilot else self._pace.batch_rays
+        return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
 
     def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0
 
-    def observe(self, n_rays: int, n_samples: int) -> None:
-        pass
-
-    def tables(self) -> Iterator[TableAdam]:
-        return iter(self._adams if self._learns else ())
-
-
-class ProposalGuide(ProposalPace):
-    """Trains the two proposal grids of an unbounded scene beside the field."""
-
-    def __init__(self, config: TrainConfig, pace: DeviceSettings, near: float) -> None:
-        self.sampler = ProposalSampler(near)
-        super().__init__(config, pace, self.sampler)
-        self._adams = [GridAdam(grid.table) for grid in self.sampler.grids]  # type: ignore[arg-type]
-
-    def sample(
-        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> RaySamples:
-        samples, self._edges, self._rounds = self.sampler.sample_rounds(
-            field, rays_o, rays_d, jitter, self._exponent
-        )
-        return samples
-
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
-        kept = np.arange(N_FINAL) < samples.counts.numpy()[:, None]
+        kept = torch.arange(N_FINAL, device=weights.device) < samples.counts[:, None]
         low, high = self._edges[:, :-1][kept], self._edges[:, 1:][kept]
-        mids = torch.from_numpy((low + high) / np.float32(2 * self._span))
-        widths = torch.from_numpy((high - low) / np.float32(self._span))
-        losses = distortion(weights, mids, widths, samples.starts, samples.counts)
+        mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
+        losses = self._distortion(weights, mids, widths, samples.starts, samples.counts)
         return self._config.distortion * losses.sum()
+
+    def tables(self) -> Sequence[TableAdam]:
+        return self._adams if self._learns else ()
+
+    def state(self) -> dict[str, Any]:
+        return {"proposals": self._sampler.state_dict(), "adams": [adam.state() for adam in self._adams]}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._sampler.load_state_dict(state["proposals"])
+        for adam, kept in zip(self._adams, state["adams"], strict=True):
+            adam.restore(kept)
+
+
+class ProposalGuide(SpaceGuide):
+    """Trains the two proposal grids of an unbounded scene beside the field, on a CPU."""
+
+    def __init__(self, config: TrainConfig, settings: DeviceSettings, near: float) -> None:
+        super().__init__(config, settings, ProposalSampler(near), GridAdam, distortion)
+
+    @property
+    def sampler(self) -> ProposalSampler:
+        return self._sampler
+
+    def sample(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
+    ) -> RaySamples:
+        samples, edges, self._rounds = self._sampler.sample_rounds(
+            field, rays_o, rays_d, jitter, self._exponent
+        )
+        self._edges = torch.from_numpy(edges)
+        return samples
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         if self._learns:
-            self.sampler.add_gradients(self._rounds, self._edges, samples, weights, n_rays)
-
-    def state(self) -> dict[str, Any]:
-        return {"proposals": self.sampler.state_dict(), "adams": [adam.state() for adam in self._adams]}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.sampler.load_state_dict(state["proposals"])
-        for adam, kept in zip(self._adams, state["adams"], strict=True):
-            adam.restore(kept)
+            self._sampler.add_gradients(self._rounds, self._edges.numpy(), samples, weights, n_rays)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,41 +33,44 @@ def rate_factor(step: int, progress: float) -> float:
     return warm_up * DECAY ** sum(progress >= milestone for milestone in MILESTONES)
 
 
-class TableAdam(Protocol):
-    """Adam on a hash table, which gradients are added to until it takes its step."""
+class TableAdam(ABC):
+    """Adam on a hash table [n_entries, n_channels], to whose gradient others add until it takes its step."""
+
+    def __init__(self, table: Tensor) -> None:
+        self.table = table
 
     @property
     def gradient(self) -> Tensor:
-        """[n_entries, n_channels], of the step to come."""
-        ...
+        """[n_entries, n_channels] gradient of the step to come."""
+        assert self.table.grad is not None
+        return self.table.grad
 
+    @abstractmethod
     def step(self, rate: float) -> None:
         """Apply and clear the gradient."""
-        ...
 
+    @abstractmethod
     def clear(self) -> None:
         """Drop the gradient of a step that is not to be taken."""
-        ...
 
-    def state(self) -> dict[str, Any]: ...
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """All that later steps depend on, in tensors and plain values."""
 
-    def restore(self, state: dict[str, Any]) -> None: ...
+    @abstractmethod
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` returned."""
 
 
-class DeviceGridAdam:
+class DeviceGridAdam(TableAdam):
     """torch's Adam on a hash table on a GPU, whose memory is fast enough to step all entries.
 
     So entries without a gradient go on by their momentum for some steps, which `GridAdam`'s do not.
     """
 
     def __init__(self, table: Tensor) -> None:
-        self.table = table
+        super().__init__(table)
         self._adam = torch.optim.Adam([table], betas=BETAS, eps=EPSILON, fused=True)
-
-    @property
-    def gradient(self) -> Tensor:
-        assert self.table.grad is not None
-        return self.table.grad
 
     def step(self, rate: float) -> None:
         self._adam.param_groups[0]["lr"] = rate
@@ -83,29 +87,20 @@ class DeviceGridAdam:
         self._adam.load_state_dict(state)
 
 
-class GridAdam:
-    """Adam on a hash table [n_entries, n_channels] whose gradient is mostly zero; it owns that gradient's
-    buffer."""
+class GridAdam(TableAdam):
+    """Adam on a hash table whose gradient is mostly zero; it owns that gradient's buffer."""
 
     def __init__(self, table: Tensor) -> None:
-        self.table = table
+        super().__init__(table)
         table.grad = zeros(*table.shape)
         self.moments = zeros(len(table), 2 * table.shape[1])
         self.n_steps = 0
 
-    @property
-    def gradient(self) -> Tensor:
-        """The buffer [n_entries, n_channels] that gradients are added to."""
-        assert self.table.grad is not None
-        return self.table.grad
-
     def step(self, rate: float) -> None:
-        """Apply and clear the gradient."""
         arrays = (a.numpy() for a in (self.table.detach(), self.gradient, self.moments))
         adam_step(*arrays, self._next_pace(rate))
 
     def clear(self) -> None:
-        """Drop the gradient of a step that is not to be taken."""
         self.gradient.zero_()
 
     def _next_pace(self, rate: float) -> Pace:

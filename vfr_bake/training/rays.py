@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,74 +24,83 @@ class RayBatch:
     """[n_rays, 4] float32 in [0, 1], straight alpha, sRGB."""
 
 
-class Pixels(Protocol):
-    """Draws random pixels."""
+class Pixels(NamedTuple):
+    """All pixels of all pictures, which may differ in size; arrays, or tensors on one device."""
 
-    def draw(self, n_rays: int) -> RayBatch: ...
+    rgba: Any
+    """[n_pixels, 4] uint8, picture after picture, row after row."""
+    starts: Any
+    ends: Any
+    """[n_pictures] int64: the first pixel of each picture, and the one behind its last."""
+    widths: Any
+    """[n_pictures] int64."""
+    poses: Any
+    """[n_pictures, 3, 4] float32 camera to model frame."""
+    intrinsics: Any
+    """[n_pictures, 4] float32: fx, fy, cx, cy in pixels."""
 
-
-class DevicePixelSampler:
-    """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
-
-    def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        device = generator.device
-        n_pixels = torch.tensor([camera.width * camera.height for camera in views.cameras])
-        pixels = np.concatenate([image.reshape(-1, 4) for image in views.images])
-        self._pixels = torch.from_numpy(pixels).to(device)
-        self._ends = torch.cumsum(n_pixels, dim=0).to(device)
-        self._starts = self._ends - n_pixels.to(device)
-        self._widths = torch.tensor([camera.width for camera in views.cameras], device=device)
-        poses = np.stack([c.c2w[:3] for c in views.cameras]).astype(np.float32)
-        self._poses = torch.from_numpy(poses).to(device)
-        self._intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], device=device)
-        self._generator = generator
-
-    def draw(self, n_rays: int) -> RayBatch:
-        device = self._pixels.device
-        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator, device=device)
-        view = torch.searchsorted(self._ends, index, right=True)
-        inside, width = index - self._starts[view], self._widths[view]
-        row, column = inside // width, inside % width
-        fx, fy, cx, cy = self._intrinsics[view].unbind(-1)
-        x, y = (column + 0.5 - cx) / fx, (cy - row - 0.5) / fy
-        poses = self._poses[view]
-        rays_d = x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
-        return RayBatch(
-            rays_o=poses[:, :, 3].contiguous(),
-            rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
-            rgba=self._pixels[index] * (1 / 255),
+    @classmethod
+    def of(cls, views: PosedImages) -> Pixels:
+        cameras = views.cameras
+        n_pixels = np.array([camera.width * camera.height for camera in cameras])
+        ends = np.cumsum(n_pixels)
+        return cls(
+            rgba=np.concatenate([image.reshape(-1, 4) for image in views.images]),
+            starts=ends - n_pixels,
+            ends=ends,
+            widths=np.array([camera.width for camera in cameras]),
+            poses=np.stack([camera.c2w[:3] for camera in cameras]).astype(np.float32),
+            intrinsics=np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float32),
         )
+
+    def directions(self, view: Any, row: Any, column: Any) -> Any:
+        """Directions [n_rays, 3], not of unit length, through the centres of pixels of the pictures `view`
+        [n_rays]."""
+        fx, fy, cx, cy = self.intrinsics[view].T
+        x, y = (column + 0.5 - cx) / fx, (cy - row - 0.5) / fy
+        poses = self.poses[view]
+        return x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
 
 
 class PixelSampler:
-    """Draws pixels uniformly from all pixels of all training pictures, which may differ in size.
+    """Draws pixels uniformly from all pixels of all training pictures.
 
-    In NumPy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
+    In numpy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
     the step itself.
     """
 
     def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        n_pixels = np.array([camera.width * camera.height for camera in views.cameras])
-        self._pixels = np.concatenate([image.reshape(-1, 4) for image in views.images])
-        self._ends = np.cumsum(n_pixels)
-        self._starts = self._ends - n_pixels
-        self._widths = np.array([camera.width for camera in views.cameras])
-        self._poses = np.stack([c.c2w[:3] for c in views.cameras]).astype(np.float32)
-        self._intrinsics = np.array([[c.fx, c.fy, c.cx, c.cy] for c in views.cameras], np.float32)
-        self._generator = generator
+        self._pixels, self._generator = Pixels.of(views), generator
 
     def draw(self, n_rays: int) -> RayBatch:
-        index = torch.randint(len(self._pixels), (n_rays,), generator=self._generator).numpy()
-        view = np.searchsorted(self._ends, index, side="right")
-        row, column = np.divmod(index - self._starts[view], self._widths[view])
-        fx, fy, cx, cy = self._intrinsics[view].T
-        x = (column.astype(np.float32) + np.float32(0.5) - cx) / fx
-        y = (cy - row.astype(np.float32) - np.float32(0.5)) / fy
-        poses = self._poses[view]
-        rays_d = x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
+        pixels = self._pixels
+        index = torch.randint(len(pixels.rgba), (n_rays,), generator=self._generator).numpy()
+        view = np.searchsorted(pixels.ends, index, side="right")
+        row, column = np.divmod(index - pixels.starts[view], pixels.widths[view])
+        rays_d = pixels.directions(view, row.astype(np.float32), column.astype(np.float32))
         rays_d /= np.sqrt((rays_d * rays_d).sum(axis=-1, keepdims=True))
         return RayBatch(
-            rays_o=torch.from_numpy(poses[:, :, 3].copy()),
+            rays_o=torch.from_numpy(pixels.poses[view, :, 3]),
             rays_d=torch.from_numpy(rays_d),
-            rgba=torch.from_numpy(self._pixels[index] * np.float32(1 / 255)),
+            rgba=torch.from_numpy(pixels.rgba[index] * np.float32(1 / 255)),
+        )
+
+
+class DevicePixelSampler(PixelSampler):
+    """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
+
+    def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
+        super().__init__(views, generator)
+        self._pixels = Pixels(*(torch.from_numpy(array).to(generator.device) for array in self._pixels))
+
+    def draw(self, n_rays: int) -> RayBatch:
+        pixels, device = self._pixels, self._generator.device
+        index = torch.randint(len(pixels.rgba), (n_rays,), generator=self._generator, device=device)
+        view = torch.searchsorted(pixels.ends, index, right=True)
+        inside, width = index - pixels.starts[view], pixels.widths[view]
+        rays_d = pixels.directions(view, inside // width, inside % width)
+        return RayBatch(
+            rays_o=pixels.poses[view, :, 3],
+            rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
+            rgba=pixels.rgba[index] * (1 / 255),
         )

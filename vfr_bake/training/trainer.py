@@ -34,7 +34,7 @@ from vfr_bake.training.optimiser import (
     rate_factor,
 )
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.rays import DevicePixelSampler, Pixels, PixelSampler
+from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
 
 MINUTES = {False: 9.4, True: 12.0}
 """Training time on a CPU by whether the scene is unbounded, where none is asked for."""
@@ -58,15 +58,9 @@ class StepReport:
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(RayBatch):
     """This process' rays of one step."""
 
-    rays_o: Tensor
-    """[n_rays, 3] model frame."""
-    rays_d: Tensor
-    """[n_rays, 3] unit length."""
-    rgba: Tensor
-    """[n_rays, 4] in [0, 1], straight alpha, sRGB."""
     jitter: Tensor
     """[n_rays, 3] in [0, 1)."""
     background: Tensor
@@ -109,11 +103,14 @@ class Trainer:
         # A GPU is done with its steps in minutes.
         minutes = MINUTES[scene.unbounded] if self.device.type == "cpu" else float("inf")
         self._minutes = minutes if config.minutes is None else config.minutes
-        self._next_step, self._seconds = 0, 0.0
+        self.next_step = 0
+        """As many steps are done."""
+        self.seconds = 0.0
+        """Training time so far, interruptions left out."""
         self._generator = torch.Generator(self.device).manual_seed(config.seed)
         # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
         self._random_background = scene.has_alpha or scene.unbounded
-        self._pixels: Pixels
+        self._pixels: PixelSampler
         self._guide: Guide
         self._grid_adam: TableAdam
         if backend == "torch":
@@ -165,25 +162,15 @@ class Trainer:
         return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
 
     @property
-    def next_step(self) -> int:
-        """How many steps are done."""
-        return self._next_step
-
-    @property
-    def seconds(self) -> float:
-        """Training time so far, interruptions left out."""
-        return self._seconds
-
-    @property
     def sampler(self) -> OccupancyGrid | ProposalSampler:
         """Where the field is to be looked up; on the CPU, as `field`."""
         return self._guide.sampler
 
     def run(self) -> Iterator[StepReport]:
         """Train until the steps or the minutes are over. Raises TrainingError when the loss stays NaN."""
-        begin = time.monotonic() - self._seconds
+        begin = time.monotonic() - self.seconds
         bad_in_a_row = 0
-        for step in range(self._next_step, self.pace.steps):
+        for step in range(self.next_step, self.pace.steps):
             seconds = self.processes.agree(time.monotonic() - begin)
             progress = max(step / self.pace.steps, seconds / (60 * self._minutes))
             if progress >= 1:
@@ -197,8 +184,8 @@ class Trainer:
                     f"lower --network-rate (now {self.pace.network_rate}) "
                     f"or --grid-rate (now {self.pace.grid_rate})"
                 )
-            self._next_step, self._seconds = step + 1, time.monotonic() - begin
-            yield StepReport(step, progress, loss, n_rays, n_samples, self._seconds)
+            self.next_step, self.seconds = step + 1, time.monotonic() - begin
+            yield StepReport(step, progress, loss, n_rays, n_samples, self.seconds)
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
@@ -303,8 +290,8 @@ class Trainer:
     def state(self) -> dict[str, Any]:
         """All that the steps to come depend on, in CPU tensors and plain values."""
         state = {
-            "step": self._next_step,
-            "seconds": self._seconds,
+            "step": self.next_step,
+            "seconds": self.seconds,
             "n_bad_steps": self.n_bad_steps,
             "generator": self._generator.get_state(),
             "field": self._field.state_dict(),
@@ -317,7 +304,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` gave, as if nothing had happened in between."""
-        self._next_step, self._seconds = state["step"], state["seconds"]
+        self.next_step, self.seconds = state["step"], state["seconds"]
         self.n_bad_steps = state["n_bad_steps"]
         self._generator.set_state(state["generator"])
         self._field.load_state_dict(state["field"])

@@ -81,10 +81,10 @@ def test_interlevel_loss_and_its_gradient(device: torch.device) -> None:
     losses = kernels.interlevel(*tensors, p_weights)
     proposed = p_weights.detach().cpu().numpy()
     expected, depths, starts = np.empty(n_rays), np.zeros((n_rays, n)), np.arange(n_rays) * m
+    found = Round(p_edges, depths, np.empty((n_rays, n, 3)), proposed)
     compiled.interlevel(
-        edges, starts, np.full(n_rays, m), weights.reshape(-1), p_edges, proposed, depths, expected,
-        np.empty((n_rays, n)),
-    )  # fmt: skip
+        edges, starts, np.full(n_rays, m), weights.reshape(-1), found, expected, np.empty((n_rays, n))
+    )
     np.testing.assert_allclose(losses.detach().cpu().numpy(), expected, rtol=1e-12)
     for ray in (0, 3, 4, 5):
         naive = naive_interlevel(edges[ray], weights[ray], p_edges[ray], proposed[ray])
