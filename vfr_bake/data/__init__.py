@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from player.cameras.colmap import colmap_folder
@@ -11,10 +10,9 @@ from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
+from vfr_bake.data.threads import Progress
 
 __all__ = ["PosedImages", "Scene", "load_scene"]
-
-Progress = Callable[[int, int], object]
 
 
 def load_scene(

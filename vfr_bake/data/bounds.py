@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from PIL import Image, ImageFilter
 
 from player.cameras.camera import Camera, focus_point
 
@@ -91,9 +92,6 @@ def _dilated(mask: np.ndarray, step: int) -> np.ndarray:
     """`mask` in blocks of `step` pixels, true wherever the mask is within `step` pixels, or a bit more."""
     height, width = mask.shape
     rows, columns = -(-height // step), -(-width // step)
-    padded = np.zeros((rows * step, columns * step), bool)
-    padded[:height, :width] = mask
-    blocks = np.zeros((rows + 2, columns + 2), bool)
-    blocks[1:-1, 1:-1] = padded.reshape(rows, step, columns, step).any(axis=(1, 3))
-    grown = blocks[:-2] | blocks[1:-1] | blocks[2:]
-    return grown[:, :-2] | grown[:, 1:-1] | grown[:, 2:]
+    padded = np.pad(mask, ((0, rows * step - height), (0, columns * step - width)))
+    blocks = padded.reshape(rows, step, columns, step).any(axis=(1, 3))
+    return np.asarray(Image.fromarray(blocks.astype(np.uint8)).filter(ImageFilter.MaxFilter(3))) > 0

@@ -1,8 +1,8 @@
-"""What a data set holds, in its own world: posed pictures, those to train on and those held out."""
+"""Posed pictures of a data set in its own world frame: those to train on and those held out for tests."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,11 @@ class PosedImages:
                     f"got {camera.width}x{camera.height}"
                 )
 
+    def some(self, numbers: Iterable[int]) -> PosedImages:
+        """The views with these numbers, in ascending order."""
+        chosen = sorted(numbers)
+        return PosedImages([self.cameras[i] for i in chosen], [self.images[i] for i in chosen])
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -52,27 +57,8 @@ class Capture:
 
 
 def held_out(views: PosedImages) -> tuple[PosedImages, PosedImages]:
-    """(train, test): every eighth view is held out, the first one included; fewer than eight are all
-    trained on."""
-    held = np.zeros(len(views.cameras), bool)
-    if len(held) >= HOLD_OUT_EVERY:
-        held[::HOLD_OUT_EVERY] = True
-    return _subset(views, ~held), _subset(views, held)
-
-
-def _subset(views: PosedImages, which: np.ndarray) -> PosedImages:
-    chosen = np.flatnonzero(which)
-    return PosedImages([views.cameras[i] for i in chosen], [views.images[i] for i in chosen])
-
-
-def counter(of: int, progress: Callable[[int, int], object] | None) -> Callable[[object], None]:
-    """A function that reports one more of `of` things done to `progress` at every call."""
-    done = 0
-
-    def count(_: object) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, of)
-
-    return count
+    """The views to train on and those to test with: every eighth, the first one included, where there are at
+    least eight."""
+    n_views = len(views.cameras)
+    held = set(range(0, n_views, HOLD_OUT_EVERY)) if n_views >= HOLD_OUT_EVERY else set()
+    return views.some(set(range(n_views)) - held), views.some(held)

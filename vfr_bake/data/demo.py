@@ -11,8 +11,6 @@ Vectors in that frame are stored component first, [3, n].
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from player.cameras.camera import Camera
@@ -36,7 +34,7 @@ from vfr_bake.data.demo_solids import (
     scene_distance,
 )
 from vfr_bake.data.scene import Scene, build_scene
-from vfr_bake.data.threads import in_threads
+from vfr_bake.data.threads import Progress, in_threads
 
 __all__ = [
     "AABB",
@@ -136,7 +134,7 @@ def demo_views(
     size: int = 256,
     n_train: int = 64,
     n_test: int = 16,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[PosedImages, PosedImages]:
     """Training and test pictures of `size` x `size` pixels, with their cameras in the world frame.
 
@@ -151,7 +149,7 @@ def demo_views(
     def picture(camera: Camera) -> np.ndarray:
         return (trace(camera)[0] * 255 + 0.5).astype(np.uint8)
 
-    images = in_threads(picture, cameras, progress or (lambda *_: None))
+    images = in_threads(picture, cameras, progress)
     return PosedImages(train, images[:n_train]), PosedImages(test, images[n_train:])
 
 
@@ -159,7 +157,7 @@ def demo_capture(
     size: int = 256,
     n_train: int = 64,
     n_test: int = 16,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Capture:
     """The built-in scene as a data set would give it, in its world.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.errors import MissingExtraError
+from vfr_bake.data.pictures import opencv, shrunk
 
 MAX_SIDE = 1600
 """Pictures are reduced to this many pixels before features are looked for: beyond it, a photograph's finest
@@ -43,20 +43,10 @@ def find_features(rgba: np.ndarray) -> Features:
 
     `rgba`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtraError(
-            "features: expected OpenCV to find them: pip install 'vfr-bake[poses]'"
-        ) from error
+    cv2 = opencv("features: expected OpenCV to find them")
     height, width = rgba.shape[:2]
-    grey = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY)
-    mask = rgba[..., 3]
-    scale = MAX_SIDE / max(height, width)
-    if scale < 1:
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+    grey = shrunk(cv2, cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY), MAX_SIDE)
+    mask = shrunk(cv2, rgba[..., 3], MAX_SIDE, cv2.INTER_NEAREST)
     # Half of OpenCV's contrast threshold: dim and smooth things need features too, and the limit on their
     # number keeps the strongest.
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)

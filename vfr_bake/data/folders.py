@@ -4,7 +4,6 @@ instant-ngp and nerfstudio, or a COLMAP model, `sparse/0/cameras.bin`, `images.b
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ from player.cameras.camera import Camera
 from player.cameras.colmap import colmap_folder, read_cameras, read_images, read_points
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
-from vfr_bake.data.capture import Capture, counter, held_out
-from vfr_bake.data.pictures import SUFFIXES, picture_size, read_pictures
+from vfr_bake.data.capture import Capture, held_out
+from vfr_bake.data.pictures import SUFFIXES, DescribedView, picture_size, read_pictures
+from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-Progress = Callable[[int, int], object]
 
 
 def load_folder(folder: Path, progress: Progress | None = None) -> Capture:
@@ -45,14 +43,18 @@ def load_transforms_folder(folder: Path, progress: Progress | None = None) -> Ca
     train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
     if not train_file.exists():
         train_file = folder / "transforms.json"
-    jobs = [_Job(train_file)]
-    if train_file.name == "transforms_train.json" and test_file.exists():
-        jobs.append(_Job(test_file))
-    if len(jobs[0].paths) < 2:
-        raise DataError(f"{train_file}: training views: expected at least 2, got {len(jobs[0].paths)}")
-    count = counter(sum(len(job.paths) for job in jobs), progress)
-    views = [read_pictures(job.paths, job.cameras, job.distortions, count) for job in jobs]
-    train, test = views if len(views) == 2 else held_out(views[0])
+    described = _described_views(train_file)
+    n_train = len(described)
+    has_test = train_file.name == "transforms_train.json" and test_file.exists()
+    if has_test:
+        described += _described_views(test_file)
+    if n_train < 2:
+        raise DataError(f"{train_file}: training views: expected at least 2, got {n_train}")
+    views = read_pictures(described, progress)
+    n_views = len(described)
+    train, test = (
+        (views.some(range(n_train)), views.some(range(n_train, n_views))) if has_test else held_out(views)
+    )
     return Capture(folder.resolve().name or "scene", train, test)
 
 
@@ -61,22 +63,20 @@ def has_transforms(folder: Path) -> bool:
     return any((folder / name).exists() for name in ("transforms_train.json", "transforms.json"))
 
 
-class _Job:
-    """One transforms file: everything that can be wrong is found before the first picture is decoded."""
+def _described_views(path: Path) -> list[DescribedView]:
+    """The views of a transforms file: what can be wrong is found before the first picture is decoded."""
+    document = load_transforms(path)
+    frames: list[dict[str, Any]] = document["frames"]
+    paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
+    cameras = transforms_cameras(document, path, [picture_size(picture) for picture in paths])
+    distortions = [_distortion(document, path, index) for index in range(len(frames))]
+    return [DescribedView(*view) for view in zip(paths, cameras, distortions, strict=True)]
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.document = load_transforms(path)
-        frames: list[dict[str, Any]] = self.document["frames"]
-        self.paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
-        sizes = [picture_size(picture) for picture in self.paths]
-        self.cameras = transforms_cameras(self.document, path, sizes)
-        self.distortions = [self._distortion(index, frame) for index, frame in enumerate(frames)]
 
-    def _distortion(self, index: int, frame: dict[str, Any]) -> dict[str, float]:
-        where = f"{self.path}: frame {index} ({frame['file_path']})"
-        values = {key: transforms_number(self.document, frame, key, where) for key in DISTORTION_KEYS}
-        return {key: value or 0.0 for key, value in values.items()}
+def _distortion(document: dict[str, Any], path: Path, index: int) -> dict[str, float]:
+    frame = document["frames"][index]
+    where = f"{path}: frame {index} ({frame['file_path']})"
+    return {key: transforms_number(document, frame, key, where) or 0.0 for key in DISTORTION_KEYS}
 
 
 def _picture_path(transforms: Path, index: int, frame: dict[str, Any]) -> Path:
@@ -99,7 +99,7 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def load_colmap_folder(folder: Path, progress: Callable[[int, int], object] | None = None) -> Capture:
+def load_colmap_folder(folder: Path, progress: Progress | None = None) -> Capture:
     """The pictures of `folder` that its COLMAP model has registered, in the order of their names.
 
     Pictures are looked for in `images/` and in the folder itself; every eighth is held out. Raises DataError
@@ -113,18 +113,15 @@ def load_colmap_folder(folder: Path, progress: Callable[[int, int], object] | No
         raise DataError(f"{model}: registered pictures: expected at least 2, got {len(registered)}")
     points_file = model / "points3D.bin"
     points = read_points(points_file) if points_file.exists() else None
-    paths, cameras, distortions = [], [], []
+    described = []
     for image in registered:
         if image.camera_id not in lenses:
             raise FormatError(f"{model}: {image.name}: camera {image.camera_id} is not in cameras.bin")
         lens = lenses[image.camera_id]
-        paths.append(_colmap_picture(folder, image.name))
-        cameras.append(
-            Camera(image.name, image.c2w, lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
-        )
-        distortions.append(lens.distortion)
-    views = read_pictures(paths, cameras, distortions, counter(len(paths), progress))
-    train, test = held_out(views)
+        size = (lens.width, lens.height)
+        camera = Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy)
+        described.append(DescribedView(_colmap_picture(folder, image.name), camera, lens.distortion))
+    train, test = held_out(read_pictures(described, progress))
     return Capture(folder.resolve().name or "scene", train, test, points)
 
 

@@ -9,7 +9,7 @@ turned. Pairs whose own geometry says something else are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +20,7 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
 from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_options
-from vfr_bake.data.threads import in_threads
+from vfr_bake.data.threads import Progress, in_threads
 
 MIN_KEPT = 0.1
 """Of the matches of two pictures that follow each other, a model keeps more than half as points that both see
@@ -69,7 +69,7 @@ def agreeing_pairs(
     names: Sequence[str],
     features: Sequence[Features],
     pairs: Sequence[Pair],
-    progress: Callable[[int, int], object],
+    progress: Progress,
 ) -> list[Pair]:
     """The near pairs, and those of the others whose turn is the one that `walk`, the model of the near ones,
     has: where it comes by again."""

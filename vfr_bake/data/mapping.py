@@ -8,7 +8,7 @@ takes the process down on some it does not know.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from contextlib import closing
@@ -20,7 +20,7 @@ import numpy as np
 
 from player.errors import MissingExtraError
 from vfr_bake.data.features import Features, match
-from vfr_bake.data.threads import in_threads, n_threads
+from vfr_bake.data.threads import Progress, in_threads, n_threads
 
 MIN_MATCHES = 15
 MIN_FOR_PRINCIPAL_POINT = 20
@@ -125,7 +125,7 @@ def match_pictures(
     sensors: Sequence[Sensor],
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
-    progress: Callable[[int, int], object],
+    progress: Progress,
 ) -> list[Pair]:
     """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry."""
     pycolmap = pycolmap_module()
@@ -145,9 +145,7 @@ def match_pictures(
     return [pair for pair in in_threads(geometry, pairs, progress) if pair is not None]
 
 
-def map_pictures(
-    database: Path, pictures: Path, work: Path, n_pictures: int, progress: Callable[[int, int], object]
-) -> Any:
+def map_pictures(database: Path, pictures: Path, work: Path, n_pictures: int, progress: Progress) -> Any:
     """The largest `pycolmap.Reconstruction` that the database's matches allow, or None.
 
     `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -14,31 +15,32 @@ from player.errors import DataError, FormatError, MissingExtraError
 from player.files.files import open_file, read_bytes
 from player.files.images import MAX_FILE_BYTES, open_picture
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.threads import in_threads
+from vfr_bake.data.threads import Progress, in_threads
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-def read_pictures(
-    paths: Sequence[Path],
-    cameras: Sequence[Camera],
-    distortions: Sequence[dict[str, float]],
-    count: Callable[[object], None],
-) -> PosedImages:
-    """The pictures with the pinhole cameras that would have taken them; `count` is called after each.
+class DescribedView(NamedTuple):
+    """A picture file with what a data set says of its camera."""
 
-    A camera that speaks of another size than its picture has is scaled to it. `distortions`: keyword
-    arguments of `undistort`. Raises DataError.
-    """
+    path: Path
+    camera: Camera
+    """Scaled to the picture where it speaks of another size."""
+    distortion: dict[str, float]
+    """Keyword arguments of `undistort`."""
 
-    def load(index: int) -> tuple[Camera, np.ndarray]:
-        image = read_picture(paths[index])
-        camera = cameras[index].resized(image.shape[1], image.shape[0])
-        if any(distortions[index].values()):
-            image = undistort(image, camera, **distortions[index])
+
+def read_pictures(described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
+    """Read pictures, each with the pinhole camera that would have taken it. Raises DataError."""
+
+    def load(view: DescribedView) -> tuple[Camera, np.ndarray]:
+        image = read_picture(view.path)
+        camera = view.camera.resized(image.shape[1], image.shape[0])
+        if any(view.distortion.values()):
+            image = undistort(image, camera, **view.distortion)
         return camera, image
 
-    results = in_threads(load, range(len(paths)), lambda *_: count(None))
+    results = in_threads(load, described, progress)
     return PosedImages([camera for camera, _ in results], [image for _, image in results])
 
 
@@ -66,13 +68,21 @@ def reduced(views: PosedImages, factor: int) -> PosedImages:
 def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     if (image[..., 3] == 255).all():
         return np.asarray(Image.fromarray(image).reduce(factor))
-    # Colours under zero alpha mean nothing, so it is the premultiplied picture that has a mean.
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    return _straight(_premultiplied(image).reshape(height, factor, width, factor, 4).mean(axis=(1, 3)))
+
+
+def _premultiplied(image: np.ndarray) -> np.ndarray:
+    """[height, width, 4] float32: colours under zero alpha mean nothing, so it is this that has a mean."""
     weighted = image.astype(np.float32)
     weighted[..., :3] *= weighted[..., 3:] / 255
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    mean = weighted.reshape(height, factor, width, factor, 4).mean(axis=(1, 3))
-    mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6) / 255
-    return (mean + 0.5).clip(0, 255).astype(np.uint8)
+    return weighted
+
+
+def _straight(weighted: np.ndarray) -> np.ndarray:
+    """[height, width, 4] uint8 with straight alpha; the inverse of `_premultiplied`, in place."""
+    weighted[..., :3] /= np.maximum(weighted[..., 3:], 1e-6) / 255
+    return (weighted + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -108,7 +118,7 @@ def _is_16_bit_colour(path: Path) -> bool:
 
 
 def _read_16_bit_colour(path: Path) -> np.ndarray:
-    cv2 = _opencv(f"{path}: 16-bit picture: expected OpenCV to read it")
+    cv2 = opencv(f"{path}: 16-bit picture: expected OpenCV to read it", "train")
     data = read_bytes(path, "a picture", MAX_FILE_BYTES)
     with open_picture(path):  # so that it is no larger than one of 8 bits may be
         values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -126,12 +136,22 @@ def _read_16_bit_colour(path: Path) -> np.ndarray:
     return rgba
 
 
-def _opencv(wanted: str):
+def opencv(wanted: str, extra: str = "poses") -> Any:
+    """OpenCV. Raises MissingExtraError: `wanted`, and the extra of this project that brings it."""
     try:
         import cv2
     except ImportError as error:
-        raise MissingExtraError(f"{wanted}: pip install 'vfr-bake[train]'") from error
+        raise MissingExtraError(f"{wanted}: pip install 'vfr-bake[{extra}]'") from error
     return cv2
+
+
+def shrunk(cv2: Any, image: np.ndarray, side: int, interpolation: int | None = None) -> np.ndarray:
+    """A picture reduced by OpenCV until no side is longer than `side` pixels, by areas if not told how."""
+    scale = side / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if interpolation is None else interpolation)
 
 
 def undistort(
@@ -152,28 +172,25 @@ def undistort(
 
     `image`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
     """
-    cv2 = _opencv(f"{camera.name}: lens distortion: expected OpenCV to undo it")
+    cv2 = opencv(f"{camera.name}: lens distortion: expected OpenCV to undo it", "train")
     x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     column = camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx - 0.5
     row = camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy - 0.5
-    # Colours under zero alpha mean nothing, so it is the premultiplied picture that can be interpolated.
-    weighted = image.astype(np.float32)
-    weighted[..., :3] *= weighted[..., 3:] / 255
     result = cv2.remap(
-        weighted,
+        _premultiplied(image),
         column.clip(-1e6, 1e6).astype(np.float32),
         row.clip(-1e6, 1e6).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    result[..., :3] /= np.maximum(result[..., 3:], 1e-6) / 255
-    return (result + 0.5).clip(0, 255).astype(np.uint8)
+    return _straight(result)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of a picture file, which is not decoded. Raises DataError."""
     try:
         with open_picture(path) as file:
             return file.size

@@ -16,7 +16,7 @@ from player.cameras.colmap import MAX_FILE_BYTES
 from player.errors import DataError, FormatError
 from player.files.files import new_folder, read_bytes
 from player.files.images import open_picture
-from vfr_bake.data import video
+from vfr_bake.data import threads, video
 from vfr_bake.data.features import Features, find_features, pairs_to_match
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
 from vfr_bake.data.mapping import (
@@ -28,7 +28,6 @@ from vfr_bake.data.mapping import (
     write_database,
 )
 from vfr_bake.data.pictures import read_picture
-from vfr_bake.data.threads import in_threads
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -206,7 +205,7 @@ def _other_kinds(folder: Path) -> str:
 
 
 def _look_at(
-    pictures: Sequence[Path], photos: Path, progress: Callable[[int, int], object]
+    pictures: Sequence[Path], photos: Path, progress: threads.Progress
 ) -> tuple[list[Sensor], list[Features]]:
     """Sensor and features of every picture; raises DataError where they cannot be enough."""
 
@@ -215,7 +214,7 @@ def _look_at(
         thumbnail = np.asarray(Image.fromarray(rgba).convert("L").resize((32, 32), Image.Resampling.BOX))
         return _sensor(path, rgba.shape[1], rgba.shape[0]), find_features(rgba), thumbnail.astype(np.float64)
 
-    looks = in_threads(look, pictures, progress)
+    looks = threads.in_threads(look, pictures, progress)
     sensors, features, thumbnails = (list(column) for column in zip(*looks, strict=True))
     n_good = sum(len(found.points) >= MIN_FEATURES for found in features)
     if n_good < _n_needed(len(pictures)):

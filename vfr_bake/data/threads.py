@@ -1,4 +1,4 @@
-"""Many pictures, or pairs of them, at a time."""
+"""Work on many pictures, or pairs of them, at a time."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Progress = Callable[[int, int], object]
+"""Called with how many things are done and how many there are."""
 
 
 def n_threads() -> int:
-    """As many as there are cores, up to eight: each holds a block of products and a decoded picture."""
+    """As many threads as cores, up to eight: each holds a decoded picture and a block of products."""
     return min(8, os.cpu_count() or 1)
 
 
 def in_threads(
-    function: Callable[[Item], Result], items: Sequence[Item], progress: Callable[[int, int], object]
+    function: Callable[[Item], Result], items: Sequence[Item], progress: Progress | None
 ) -> list[Result]:
-    """`function` of every item, in their order; what it raises ends the others, as does an interruption.
+    """Call `function` for every item, and return what it returned in the order of the items.
 
-    `progress`: called with how many are done and how many there are.
+    What it raises ends the others, as does an interruption.
 
-    >>> in_threads(str, [1, 2], lambda done, of: None)
+    >>> in_threads(str, [1, 2], None)
     ['1', '2']
     """
     results = []
@@ -32,7 +34,8 @@ def in_threads(
         try:
             for done, future in enumerate(futures):
                 results.append(future.result())
-                progress(done + 1, len(items))
+                if progress is not None:
+                    progress(done + 1, len(items))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from player.errors import DataError, MissingExtraError
+from player.errors import DataError
 from player.files.files import new_folder
+from vfr_bake.data.pictures import opencv, shrunk
+from vfr_bake.data.threads import Progress
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 N_FRAMES = 80
@@ -30,7 +31,7 @@ def frames_folder(video: Path) -> Path:
     return video.with_name(f"{video.stem}_frames")
 
 
-def extract_frames(video: Path, progress: Callable[[int, int], object]) -> Path:
+def extract_frames(video: Path, progress: Progress) -> Path:
     """Write about `N_FRAMES` frames of `video` as JPEG files into `<stem>_frames/images/` beside it.
 
     The video is cut into stretches of equal length, and each gives its sharpest frame: a hand-held camera
@@ -43,12 +44,7 @@ def extract_frames(video: Path, progress: Callable[[int, int], object]) -> Path:
     folder = frames_folder(video)
     if (folder / "images").is_dir():
         return folder
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{video}: video: expected OpenCV to read it: pip install 'vfr-bake[poses]'"
-        ) from error
+    cv2 = opencv(f"{video}: video: expected OpenCV to read it")
     # Turned upright by OpenCV where the file says how the camera was held.
     capture = cv2.VideoCapture(str(video))
     try:
@@ -65,9 +61,7 @@ def extract_frames(video: Path, progress: Callable[[int, int], object]) -> Path:
     return folder
 
 
-def _write_sharpest(
-    cv2: Any, capture: Any, n_frames: int, folder: Path, progress: Callable[[int, int], object]
-) -> None:
+def _write_sharpest(cv2: Any, capture: Any, n_frames: int, folder: Path, progress: Progress) -> None:
     n_kept = min(N_FRAMES, n_frames)
     best: np.ndarray | None = None
     best_sharpness = -1.0
@@ -88,18 +82,10 @@ def _write_sharpest(
 
 def _sharpness(cv2: Any, frame: np.ndarray) -> float:
     """Mean square of the second derivative: blur of any direction lowers it."""
-    grey = _reduced(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), _SHARPNESS_SIDE)
+    grey = shrunk(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), _SHARPNESS_SIDE)
     return float(np.square(cv2.Laplacian(grey, cv2.CV_32F)).mean())
 
 
-def _reduced(cv2: Any, image: np.ndarray, side: int) -> np.ndarray:
-    scale = side / max(image.shape[:2])
-    if scale >= 1:
-        return image
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
 def _write(cv2: Any, frame: np.ndarray, path: Path) -> None:
-    rgb = cv2.cvtColor(_reduced(cv2, frame, MAX_SIDE), cv2.COLOR_BGR2RGB)
+    rgb = cv2.cvtColor(shrunk(cv2, frame, MAX_SIDE), cv2.COLOR_BGR2RGB)
     Image.fromarray(rgb).save(path, quality=95)
