@@ -63,9 +63,8 @@ def _visual_hull(
     axis = (np.arange(N_CELLS, dtype=np.float32) + 0.5) * np.float32(2 / N_CELLS) - 1
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * np.float32(half)
     seen = np.zeros(len(points), bool)
-    reach = (
-        cell * np.sqrt(3) / 2
-    )  # from a cell's centre to its corners: what a thin thing in the cell may be off by
+    # From a cell's centre to its corners: a thin thing in the cell may be off by so much.
+    reach = cell * np.sqrt(3) / 2
     for camera, alpha in zip(cameras, alphas, strict=True):
         rotation = camera.c2w[:3, :3]
         eye = camera.c2w[:3, 3] - centre
@@ -89,7 +88,7 @@ def _visual_hull(
 
 
 def _dilated(mask: np.ndarray, step: int) -> np.ndarray:
-    """`mask` in blocks of `step` pixels, true wherever the mask is within `step` pixels, or a bit more."""
+    """Reduce a mask to blocks of `step` pixels, true wherever the mask is true within about `step` pixels."""
     height, width = mask.shape
     rows, columns = -(-height // step), -(-width // step)
     padded = np.pad(mask, ((0, rows * step - height), (0, columns * step - width)))

@@ -18,7 +18,7 @@ class PosedImages:
     """Pictures and where they were taken from; each may have its own size."""
 
     cameras: list[Camera]
-    """As many as there are pictures, of the pictures' sizes; in a `Scene`, in the model frame."""
+    """One a picture, of the picture's size; in the model frame in a `Scene`, in the world in a `Capture`."""
     images: list[np.ndarray]
     """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha."""
 

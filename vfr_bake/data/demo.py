@@ -104,7 +104,7 @@ def trace(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def demo_cameras(size: int, n_views: int, phase: float = 0.0, prefix: str = "./train/r_") -> list[Camera]:
-    """`n_views` cameras around the scene, world frame: most above it, a few a little below the plate.
+    """Place cameras around the scene, world frame: most above it, a few a little below the plate.
 
     They follow a Fibonacci spiral from above to below; another `phase`, in turns of its angle, gives other
     views.
@@ -201,7 +201,8 @@ def _sample(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.n
 
 
 def _first_hits(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`t` [n] (infinite: none) and the number of the solid [n] (-1), by sphere tracing solid after solid.
+    """Find t [n] (infinite where nothing is hit) and the number of the solid [n] (-1 there) by sphere
+    tracing, solid after solid.
 
     `origin` [3, 1], `direction` [3, n], float32. A ray that grazes a solid until its steps run out passes it.
     """

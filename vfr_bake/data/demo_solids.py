@@ -15,7 +15,7 @@ import numpy as np
 CENTRE = np.array([0.3, -0.2, 0.5])
 SCALE = 0.8
 WIRE_RADIUS = 0.02
-"""In world units, like the ball's and the hole's below."""
+"""World units, as the radii of the ball and of the hole below are."""
 
 BALL_CENTRE = CENTRE + SCALE * np.array([-0.42, -0.30, -0.28])
 BALL_RADIUS = SCALE * 0.32
@@ -32,7 +32,7 @@ Colour = Callable[[np.ndarray], np.ndarray]
 
 
 def _rotated(p: np.ndarray, angle: float) -> np.ndarray:
-    """`p` turned about z by minus `angle`: a solid turned by `angle` is the straight one there."""
+    """Turn `p` about z by minus `angle`: there a solid that is turned by `angle` stands straight."""
     c, s = p.dtype.type(np.cos(angle)), p.dtype.type(np.sin(angle))
     turned = np.empty_like(p)
     turned[0] = c * p[0] + s * p[1]
@@ -133,7 +133,7 @@ class Solid:
     centre: tuple[float, float, float]
     angle: float
     own_half: tuple[float, float, float]
-    """Of its box before the turn; the arch's centre is at its foot, its box larger than need be."""
+    """Half sides of the box before the turn; the arch's centre is at its foot, and its box too large."""
     own_distance: Distance
     own_colour: Colour
     gloss: float
@@ -222,7 +222,7 @@ def scene_distance(p: np.ndarray) -> np.ndarray:
 def enter(
     low: np.ndarray, high: np.ndarray, origin: np.ndarray, reciprocal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays enter and leave the box from `low` [3] to `high` [3]; entered after left if they miss it.
+    """The t at which rays enter and leave the box from `low` [3] to `high` [3]; near > far if they miss it.
 
     `origin` [3, 1] or [3, n]; `reciprocal`: the `inverse` of their directions.
     """

@@ -119,8 +119,8 @@ def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
 
 
 def _n_matches(a: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """As many matches as `match` finds of `a` [n, 128] in each of `others` [n_others, m, 128]; rows of zeros
-    match nothing."""
+    """Count the matches [n_others] that `match` finds of `a` [n, 128] in each of `others` [n_others, m, 128];
+    rows of zeros match nothing."""
     cosines = (a @ others.reshape(-1, 128).T).reshape(len(a), *others.shape[:2])
     best_of_others = cosines.max(axis=0)
     nearest = cosines.argmax(axis=2)

@@ -23,8 +23,8 @@ from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_o
 from vfr_bake.data.threads import Progress, in_threads
 
 MIN_KEPT = 0.1
-"""Of the matches of two pictures that follow each other, a model keeps more than half as points that both see
-(fox and can: 0.52 to 0.97), and 0 to 0.02 where it is folded."""
+"""Share of the matches of two pictures that follow each other which a model must keep as points that both
+see: it keeps more than half (fox and can: 0.52 to 0.97), and 0 to 0.02 where it is folded."""
 MAX_TURN = 30.0
 """Degrees between what a pair's own geometry says of the turn and what the walk does. Walks drift, and two
 views of a plane are off by some 10 degrees: of can's pairs that are a lap apart nine in ten are within it,
@@ -135,5 +135,5 @@ def _own_turn(cameras: Sequence[Any], points: Sequence[np.ndarray], matches: np.
 
 
 def _angle(rotation: np.ndarray) -> float:
-    """Degrees."""
+    """Angle of a rotation [3, 3] in degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

@@ -49,7 +49,7 @@ class Pair:
     matches: np.ndarray
     """[n, 2] uint32, indices of features of i and of j."""
     geometry: Any
-    """`pycolmap.TwoViewGeometry`: which of the matches agree with one geometry, and with which."""
+    """The `pycolmap.TwoViewGeometry` that most matches agree with, and which do."""
 
 
 def pycolmap_module() -> Any:

@@ -34,10 +34,10 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 MIN_PICTURES = 3
 MIN_SHARE = 0.6
-"""Where two pictures in five find no place, the subject is seen from one side only, or in two models of which
-the other half is lost: a field trained on the rest has holes that nobody asked for."""
+"""Share of the pictures that must find a place. Where two in five find none, the subject is seen from one
+side only, or in two models of which one is lost: a field trained on the rest has holes."""
 MIN_REGISTERED = 8
-"""Of fewer than these, all must be registered: a handful of pictures can agree on a wrong model."""
+"""If there are fewer pictures, all must be registered: a handful can agree on a wrong model."""
 MIN_FEATURES = 50
 """Fewer than these, and a picture is blank, out of focus, or all blur."""
 SAME = 1.5
@@ -240,7 +240,7 @@ def _sensor(path: Path, width: int, height: int) -> Sensor:
     # Maker, model; focal length, and the same as it would be on 35 mm film.
     device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
     film = _positive(details.get(0xA405))
-    # Of equal diagonals, as the standard (CIPA DC-008, 4.6.5) has it; film's is 43.27 mm.
+    # The standard (CIPA DC-008, 4.6.5) compares by diagonals; that of film is 43.27 mm.
     focal = film / 43.27 * float(np.hypot(width, height)) if film else None
     return Sensor(width, height, device, focal)
 

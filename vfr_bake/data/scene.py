@@ -28,7 +28,7 @@ NEAR_CAMERA = 0.05
 """Matter begins at this distance from a camera, model units, where no points tell: nearer things than a
 twentieth of the way to the subject are out of focus in a photograph."""
 NEAR_QUANTILE, NEAR_SHARE = 0.01, 0.5
-"""Where points tell: half the depth that hardly any is in front of."""
+"""Where points tell: matter begins at half the depth that one point in a hundred is in front of."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ _SHARPNESS_SIDE = 960
 
 
 def frames_folder(video: Path) -> Path:
-    """Where the frames of a video are kept: `walk.mp4` -> `walk_frames`.
+    """The folder in which the frames of a video are kept: `walk.mp4` -> `walk_frames`.
 
     >>> frames_folder(Path("a/walk.mp4")).name
     'walk_frames'

@@ -20,7 +20,7 @@ from vfr_bake.kernels.hash_grid import GridArrays, Levels
 from vfr_bake.torch_kernels.hash_grid import features_at
 
 Backend = Literal["numba", "torch"]
-"""Whose kernels run: numba's, on a CPU, or torch's, on any device."""
+"""The kernels that run: numba's, on a CPU, or torch's, on any device."""
 
 
 def zeros(*shape: int) -> Tensor:
@@ -74,7 +74,7 @@ class GridLayout:
         return Levels(np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask)
 
     def grid(self, table: Tensor) -> GridArrays:
-        """`table`, which is on a CPU, with its levels, as numba's kernels take them."""
+        """The table, which is on a CPU, with its levels, as numba's kernels take them."""
         array = table.detach().numpy()
         return GridArrays(array, *self.arrays(array.dtype))
 

@@ -103,7 +103,7 @@ class SphericalHarmonics(nn.Module):
     def __init__(self, degree: int) -> None:
         super().__init__()
         exponents, coefficients = sh_monomials(degree)
-        self._highest = int(exponents.max())  # of the array: a GPU's tensor would have to be waited for
+        self._highest = int(exponents.max())  # read from the array: for a GPU's tensor one would have to wait
         self.register_buffer("exponents", torch.as_tensor(exponents), persistent=False)
         self.register_buffer(
             "coefficients", torch.as_tensor(coefficients, dtype=torch.float32), persistent=False

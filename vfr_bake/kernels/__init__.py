@@ -1,7 +1,7 @@
 """The field's inner loops compiled with numba for the CPU.
 
-Each kernel has a slow, readable twin in torch (`vfr_bake.field`, `vfr_bake.rendering`) that the tests
-compare it with, and one for a GPU in `vfr_bake.torch_kernels`. Kernels are generic in the float type:
+Each kernel has a counterpart for a GPU in `vfr_bake.torch_kernels`, and the tests compare both with slow,
+readable loops. Kernels are generic in the float type:
 training runs in float32, `gradcheck` in float64. Constants are cast to the type of the arrays, because a bare
 `1.0` would silently turn float32 arithmetic into float64.
 """
@@ -21,11 +21,12 @@ from player.compiled.kept_code import keep
 config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore[reportAttributeAccessIssue]
 
 SOURCES = Path(__file__).parent, Path(player.__file__).parent
-"""Of all kernels: they take functions from the player."""
+"""Folders of the sources of all kernels, which take functions from the player."""
 
 
 def njit(cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`, whose `cache` asks for all sources (`player.compiled.kept_code`)."""
+    """Compile with `numba.njit`; with `cache`, compiled code is kept until one of `SOURCES` changes
+    (`player.compiled.kept_code`)."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)

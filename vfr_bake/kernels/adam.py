@@ -13,7 +13,7 @@ from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
 
 AHEAD = 16
-"""Rows asked for before they are stepped: a trip to memory takes about as long as so many steps."""
+"""Rows by which memory is prefetched ahead: a trip to memory takes about as long as so many steps."""
 
 
 class Pace(NamedTuple):
@@ -63,7 +63,7 @@ def adam_step(table, grad, moments, pace):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def scatter_and_step(points, grad_features, grid, grad, rows, moments, pace):
-    """`hash_grid.scatter` and `adam_step` in one, level by level: while a level's rows are stepped, its
+    """Do what `hash_grid.scatter` and `adam_step` do, level by level: while a level's rows are stepped, its
     gradient is still in the cache.
 
     `grad` [n_threads, largest level, 2], all zero before and after, is the gradient of one level, so that a

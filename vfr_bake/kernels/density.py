@@ -17,13 +17,14 @@ LARGEST_LOGIT = 15.0
 
 
 class Limits(NamedTuple):
-    """Where logits are clamped and where rays stop."""
+    """The largest logit, and the optical depth at which rays stop."""
 
     largest_logit: np.floating
     opaque_depth: np.floating
 
 
 LIMITS = Limits(np.float32(LARGEST_LOGIT), MAX_TAU)
+"""Both as the kernels take them, in float32."""
 
 
 class DensityArrays(NamedTuple):

@@ -115,7 +115,7 @@ def corners(x, y, z, scale, offset, mask, hashed):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def prefetch_point(x, y, z, grid):
-    """Ask for the rows around a point of all levels that are too large to be in the cache anyway."""
+    """Prefetch the rows around a point of all levels that are hashed: the others are in the cache anyway."""
     for level in range(grid.scales.shape[0]):
         if grid.hashed[level]:
             scale = grid.scales[level]

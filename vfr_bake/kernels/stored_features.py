@@ -21,14 +21,15 @@ from vfr_bake.kernels import njit
 BLOCK = 64
 """Rays that a thread takes at a time."""
 OWN = 6
-"""Vertices belong to the parts in turns of 2^OWN: two threads hardly ever write to one line of the cache."""
+"""Vertices belong to the parts in turns of 2^OWN, so that two threads hardly ever write to one line of the
+cache."""
 AHEAD = 6
-"""Fetches ahead of which memory is asked for: the rows of one lie all over the grid."""
+"""Fetches by which memory is prefetched ahead: the rows of one lie all over the grid."""
 
 
 @njit(cache=True)
-def _ask(rows, j, table):
-    """For what fetch j will read of `table`; every other corner is the next row of the one before."""
+def _prefetch_rows(rows, j, table):
+    """Prefetch what fetch j will read of `table`; every other corner is the next row of the one before."""
     if j < rows.shape[0]:
         for corner in range(0, 8, 2):
             prefetch(table, rows[j, corner])
@@ -43,7 +44,7 @@ def compose(starts, rows, shares, weights, latent, out):
             for c in range(n_channels):
                 out[i, c] = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
-                _ask(rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, latent)
                 for corner in range(8):
                     share = weights[j] * shares[j, corner]
                     if share == 0:
@@ -73,8 +74,8 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                 continue
             square /= np.float32(n_channels)
             for j in range(starts[i], starts[i + 1]):
-                _ask(rows, j + AHEAD, latent)
-                _ask(rows, j + AHEAD, steepness)
+                _prefetch_rows(rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, steepness)
                 for corner in range(8):
                     row = rows[j, corner]
                     share = weights[j] * shares[j, corner]
@@ -99,7 +100,7 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
                 if tau > opaque:
                     weights[j] = np.float32(0)
                     continue
-                _ask(rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, latent)
                 code = np.float32(0)
                 for corner in range(8):
                     code += shares[j, corner] * np.rint(latent[rows[j, corner]])
@@ -126,8 +127,8 @@ def slants(
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
             behind = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
-                _ask(rows, j + AHEAD, values)
-                _ask(density_rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, values)
+                _prefetch_rows(density_rows, j + AHEAD, latent)
                 along = np.float32(0)
                 for corner in range(8):
                     row = rows[j, corner]
@@ -159,8 +160,8 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
     gradients `slants` [n_fetches] of what is interpolated from `rows` by `shares`; in parts as `descend`."""
     for part in prange(n_parts):
         for j in range(slants.shape[0]):
-            _ask(rows, j + AHEAD, latent)
-            _ask(rows, j + AHEAD, steepness)
+            _prefetch_rows(rows, j + AHEAD, latent)
+            _prefetch_rows(rows, j + AHEAD, steepness)
             if slants[j] == 0:
                 continue
             for corner in range(8):

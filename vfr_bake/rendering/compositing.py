@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from vfr_bake.kernels import compositing as kernels
+from vfr_bake.torch_kernels.compositing import Composite
+
+
+class RayFeatures(NamedTuple):
+    """What a field shows along rays, before the head gives it colour."""
+
+    features: np.ndarray
+    """[n_rays, n_channels] composited."""
+    opacity: np.ndarray
+    """[n_rays]."""
+    depth: np.ndarray
+    """[n_rays] mean distance, model units; 0 where nothing is."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +44,8 @@ class RaySamples:
     """[n_served] number of samples of each, 0 where a ray meets nothing."""
 
 
-def composite(
-    sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composited features [n_rays, n_channels], opacity [n_rays] and weights [n_samples].
+def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
+    """Composite packed samples.
 
     `sigmas` [n_samples] >= 0, `features` [n_samples, n_channels], `deltas` [n_samples] lengths along the ray;
     ray r owns the rows `starts[r] : starts[r] + counts[r]`. Optical depth is accumulated and exponentiated
@@ -45,7 +56,7 @@ def composite(
     >>> round(float(A[0]), 4), round(float(F[0, 0]), 4), round(float(w[0]), 4)
     (0.6321, 0.6321, 0.6321)
     """
-    return _Composite.apply(sigmas, features, deltas, starts, counts)  # type: ignore[return-value]
+    return Composite(*_Composite.apply(sigmas, features, deltas, starts, counts))  # type: ignore[misc]
 
 
 def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
-from vfr_bake.rendering.compositing import RaySamples
+from vfr_bake.rendering.compositing import RayFeatures, RaySamples
 from vfr_bake.rendering.sampling import LOOKUP_POINTS, march, most_samples
 
 OPACITY_THRESHOLD = 0.03
@@ -32,7 +32,8 @@ with 8, more cells stay occupied, and a batch of so many samples holds fewer ray
 
 
 class OccupancyGrid:
-    """`densities` [n, n, n] float32 per model unit, and `distance` [n, n, n] uint8 for the march.
+    """The grid on a CPU: `densities` [n, n, n] float32 per model unit, and `distance` [n, n, n] uint8, in
+    cells to the nearest occupied one, for the march.
 
     >>> grid = OccupancyGrid(16, step=0.01, seed=0)
     >>> int(grid.distance.max())
@@ -49,7 +50,7 @@ class OccupancyGrid:
 
     @property
     def occupied(self) -> np.ndarray:
-        """[n, n, n] bool."""
+        """Which cells [n, n, n] may hold matter, bool."""
         return self.distance == 0
 
     def update(self, field: VfrField) -> None:
@@ -90,18 +91,15 @@ class OccupancyGrid:
             occupied = np.ones_like(occupied)  # nothing found yet: look everywhere rather than nowhere
         chebyshev_distance(occupied, self.distance)
 
-    def composited_features(
-        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays]) of rays, every sample
-        used."""
+    def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
+        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
         features = np.zeros((len(rays_o), field.config.n_channels), np.float32)
         opacity, depth = np.zeros((2, len(rays_o)), np.float32)
         render_features(
             rays_o, rays_d, np.float32(self.step), self.distance, field.arrays(), LIMITS, features, opacity,
             depth,
         )  # fmt: skip
-        return features, opacity, depth
+        return RayFeatures(features, opacity, depth)
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The samples of all rays, in the middle of their intervals."""
@@ -119,7 +117,7 @@ class OccupancyGrid:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Go on from what `state` returned."""
         self.densities[:] = state["densities"].numpy()
         self.n_updates = state["n_updates"]
         self._random.bit_generator.state = state["random"]
@@ -127,7 +125,9 @@ class OccupancyGrid:
 
 
 class DeviceOccupancyGrid:
-    """`densities` [n, n, n] float32 per model unit and `occupied` [n, n, n] bool on `device`.
+    """The grid on `device`: `densities` [n, n, n] float32 per model unit and `occupied` [n, n, n] bool.
+
+    The march on a GPU tests every lattice point and needs no distances.
 
     >>> grid = DeviceOccupancyGrid(16, step=0.01, seed=0, device=torch.device("cpu"))
     >>> bool(grid.occupied.all())
@@ -192,7 +192,7 @@ class DeviceOccupancyGrid:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Go on from what `state` returned."""
         self.densities.copy_(state["densities"])
         self.occupied = state["occupied"].to(self.densities.device)
         self.n_updates = state["n_updates"]

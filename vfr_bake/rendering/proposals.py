@@ -17,14 +17,14 @@ from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.proposals import Round
-from vfr_bake.rendering.compositing import RaySamples, composite
+from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
 
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
 N_FINAL = 32
 """Intervals in which the field itself is looked up."""
 FAR = 1e3
-"""Where rays end, model units: the farthest camera is at 1."""
+"""Rays end at this distance, model units; the farthest camera is at 1."""
 RESOLUTIONS = (128, 512)
 """Finest level of each round's grid, cells per axis over contracted space; both have 10 levels from 16 on."""
 N_LEVELS = 10
@@ -43,7 +43,7 @@ class ProposalGrid(nn.Module):
 
 
 class ProposalSampler(nn.Module):
-    """Where to look a field up along the rays of an unbounded scene.
+    """Says where to look a field up along the rays of an unbounded scene.
 
     `near`: how near to a camera matter may begin, model units.
     """
@@ -59,11 +59,8 @@ class ProposalSampler(nn.Module):
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
 
     @torch.no_grad()
-    def composited_features(
-        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays]) of rays, every sample
-        used."""
+    def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
+        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
         features = np.empty((len(rays_o), field.config.n_channels), np.float32)
         opacity, depth = np.empty((2, len(rays_o)), np.float32)
         for start in range(0, len(rays_o), RAY_CHUNK):
@@ -74,7 +71,7 @@ class ProposalSampler(nn.Module):
             out, alpha, _ = composite(sigmas, values, samples.deltas, samples.starts, samples.counts)
             features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
             depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
-        return features, opacity, depth
+        return RayFeatures(features, opacity, depth)
 
     def sample_rounds(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, exponent: float = 1.0

@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
 from player.cameras.camera import Camera
 from vfr_bake.field.field import VfrField
-from vfr_bake.rendering.compositing import RaySamples, composite
+from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.occupancy import OccupancyGrid
+from vfr_bake.rendering.proposals import ProposalSampler
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
 SMALL = 24
-"""Pixels along the side of a picture that only its mean is wanted of."""
+"""Pixels along each side of the pictures whose mean colour is taken."""
 RAY_CHUNK = 1024
-"""Rays whose samples are held at once where the head is evaluated at each of them."""
+"""Rays whose samples are held at once where colours are composited, with a head at each sample."""
 
 
-class Sampler(Protocol):
-    """Where to look a field up along rays: the occupancy grid of an object, the proposals of a scene."""
-
-    def composited_features(
-        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(features [n_rays, n_channels], opacity [n_rays], mean depth [n_rays], 0 where nothing is)."""
-        ...
-
-    def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
-        """The visible samples of all rays, without jitter."""
-        ...
+Sampler: TypeAlias = OccupancyGrid | ProposalSampler
+"""What says where to look a field up along rays: an object's occupancy grid, or a scene's proposals."""
 
 
 @torch.no_grad()
@@ -75,7 +67,7 @@ def _colours_of_features(
 def _composited_colours(
     field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Equation 2: the same of colours that the head gives at every sample."""
+    """Equation 2: (colours times opacity [n_rays, 3], opacity [n_rays]), one head a sample."""
     colours = np.empty((len(rays_o), 3), np.float32)
     opacity = np.empty(len(rays_o), np.float32)
     for start in range(0, len(rays_o), RAY_CHUNK):

@@ -16,7 +16,7 @@ import torch
 
 
 def fast(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """`function` compiled where that pays: on a GPU, where its code generator Triton is there.
+    """Compile `function` for a GPU where Triton, torch's code generator, is there; else return it as it is.
 
     >>> fast(len, torch.device("cpu")) is len
     True

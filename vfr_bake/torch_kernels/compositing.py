@@ -7,13 +7,15 @@ are padded. Autograd finds the gradients; every step of it gathers, scatters or 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 
 def owners(starts: Tensor, counts: Tensor, n_samples: int) -> Tensor:
-    """[n_samples] the ray that each sample belongs to; ray r has the rows `starts[r] : starts[r] +
+    """Number [n_samples] of the ray that each sample belongs to; ray r has the rows `starts[r] : starts[r] +
     counts[r]`, and all rows belong to some ray.
 
     >>> owners(torch.tensor([3, 0]), torch.tensor([2, 3]), 5).tolist()
@@ -53,17 +55,25 @@ class Padding:
         return rows.reshape(-1).gather(0, self._places)
 
 
-def composite(
-    sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composited features [n_rays, n_channels], opacity [n_rays] and weights [n_samples], differentiable; as
-    `vfr_bake.rendering.compositing.composite`."""
+class Composite(NamedTuple):
+    """What samples along rays come to."""
+
+    values: Tensor
+    """[n_rays, n_channels] sum of the samples' features, or of their colours, by their weights."""
+    opacity: Tensor
+    """[n_rays]."""
+    weights: Tensor
+    """[n_samples]."""
+
+
+def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
+    """Composite packed samples, differentiably, as `vfr_bake.rendering.compositing.composite` does."""
     padding = Padding(starts, counts, len(sigmas))
     depths = padding.rows(sigmas * deltas)
     weights = padding.packed(torch.exp(-sums_before(depths)) * -torch.expm1(-depths))
     out = features.new_zeros(len(starts), features.shape[1])
     out = out.index_add(0, padding.rays, weights[:, None] * features)
-    return out, -torch.expm1(-depths.sum(dim=1)), weights
+    return Composite(out, -torch.expm1(-depths.sum(dim=1)), weights)
 
 
 def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:

@@ -58,8 +58,8 @@ def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) ->
 
 
 def features_at(points: Tensor, table: Tensor, levels: Levels, features: Tensor | None = None) -> Tensor:
-    """`encode`, differentiable with respect to `table` alone. `features`, if already known, are taken as they
-    are."""
+    """Encode as `encode` does, differentiably with respect to `table` alone. `features`, if already known,
+    are returned as they are."""
     return _Features.apply(points, table, levels, features)  # type: ignore[return-value]
 
 

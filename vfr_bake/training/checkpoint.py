@@ -1,5 +1,5 @@
-"""What `vfr-train --resume` goes on from: all of a trainer's state, beside the model file until that is
-written.
+"""Checkpoints, from which `vfr-train --resume` goes on: all of a trainer's state, beside the model file until
+that is written.
 
 Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), state (`Trainer.state`).
 Tensors and plain values only; loads with `weights_only=True`.
@@ -20,7 +20,7 @@ LENGTH_SETTINGS = {"steps", "minutes", "eval_views", "checkpoint_minutes"}
 
 
 def checkpoint_path(model: Path) -> Path:
-    """Where the checkpoints of the training of `model` are.
+    """Path of the checkpoint of the training of `model`.
 
     >>> checkpoint_path(Path("a/model.pt")).name
     'model.pt.checkpoint'

@@ -22,7 +22,7 @@ class RenderedView:
     rgb: np.ndarray
     """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
     photograph: np.ndarray
-    """As `rgb`."""
+    """[height, width, 3] float32 in [0, 1], over the same background."""
 
 
 def render_views(model: Model, views: PosedImages, n_views: int = 0) -> Iterator[RenderedView]:

@@ -19,6 +19,7 @@ from vfr_bake.kernels.proposals import spacing
 from vfr_bake.rendering.compositing import RaySamples, distortion
 from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
+from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
@@ -39,7 +40,7 @@ class Guide(ABC):
 
     @property
     @abstractmethod
-    def sampler(self) -> OccupancyGrid | ProposalSampler:
+    def sampler(self) -> Sampler:
         """The sampler as it is now, on the CPU."""
 
     @abstractmethod

@@ -32,15 +32,15 @@ class ViewScore:
 
     name: str
     psnr: float
-    """dB, of 8-bit pictures; infinite where they are equal."""
+    """In dB, between 8-bit pictures; infinite where they are equal."""
     ssim: float
-    """Of 8-bit pictures; 1 where they are equal."""
+    """SSIM between 8-bit pictures; 1 where they are equal."""
     psnr_float: float
-    """dB, of the pictures before they are rounded to 8 bits."""
+    """In dB, between the pictures before they are rounded to 8 bits."""
     ssim_float: float
-    """Of the pictures before they are rounded to 8 bits."""
+    """SSIM between the pictures before they are rounded to 8 bits."""
     lpips: float | None
-    """Of 8-bit pictures; 0 where they are equal, None where it was not asked for."""
+    """LPIPS between 8-bit pictures; 0 where they are equal, None where it was not asked for."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

@@ -1,5 +1,5 @@
-"""`model.pt`: a trained field with all that baking needs. Tensors and plain values only; loads with
-`weights_only=True`.
+"""The model file, `model.pt`: a trained field with all that baking needs. It holds tensors and plain values
+only, and loads with `weights_only=True`.
 
 Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
 the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
@@ -28,7 +28,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
-from vfr_bake.rendering.render import mean_colour
+from vfr_bake.rendering.render import Sampler, mean_colour
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 FORMAT = "vfr-model"
 VERSION = (2, 0)
 N_MEAN_VIEWS = 16
-"""As many cameras tell the mean colour of what all see."""
+"""Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Model:
     """A trained field with its frame, its cameras and its occupancy grid."""
 
     field: VfrField
-    sampler: OccupancyGrid | ProposalSampler
+    sampler: Sampler
     world_from_model: np.ndarray
     """[4, 4] float64 similarity; an object's box is [-1, 1]^3 of the model frame, a scene's cameras are in
     its unit ball."""
@@ -169,7 +169,7 @@ def _read(path: Path, max_memory: float | None) -> dict[str, Any]:
     return content
 
 
-def _sampler_content(sampler: OccupancyGrid | ProposalSampler) -> dict[str, Any]:
+def _sampler_content(sampler: Sampler) -> dict[str, Any]:
     if isinstance(sampler, ProposalSampler):
         return {"near": sampler.near, "state": sampler.state_dict()}
     bits = torch.from_numpy(np.packbits(sampler.occupied.reshape(-1)))

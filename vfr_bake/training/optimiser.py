@@ -119,7 +119,7 @@ class GridAdam(TableAdam):
 
 
 class FusedGridAdam(GridAdam):
-    """The same steps for the table of a `HashGrid`, faster: its gradient never exists as a whole."""
+    """`GridAdam` for the table of a `HashGrid`, faster: the table's gradient never exists as a whole."""
 
     def __init__(self, grid: HashGrid) -> None:
         assert isinstance(grid.table, Tensor)

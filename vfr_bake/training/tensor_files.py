@@ -23,9 +23,9 @@ from player.files.json_files import brief
 from player.files.memory import allowed_bytes, check_memory
 
 COPIES = 3
-"""Of a file's tensors in memory, at most: what is read, what it is restored into, and what is checked."""
+"""Copies of a file's tensors in memory at most: one is read, one is restored, one is checked."""
 _PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
-"""What a pickle of tensors and plain values names."""
+"""The names that a pickle of tensors and plain values may contain."""
 
 
 def write_tensors(path: Path, content: dict[str, Any]) -> None:

@@ -18,8 +18,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
 from vfr_bake.rendering.compositing import RaySamples, composite
-from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
@@ -81,7 +80,9 @@ class Trainer:
         processes: Processes | None = None,
         backend: Backend | None = None,
     ) -> None:
-        """`backend`: None for numba on a CPU and torch elsewhere; "torch" to do on a CPU what a GPU does.
+        """Make a field, its optimisers and what samples it.
+
+        `backend`: None for numba on a CPU and torch elsewhere; "torch" to do on a CPU what a GPU does.
 
         Raises ConfigError: there is no such device, or it cannot be shared by several processes.
         """
@@ -104,7 +105,7 @@ class Trainer:
         minutes = MINUTES[scene.unbounded] if self.device.type == "cpu" else float("inf")
         self._minutes = minutes if config.minutes is None else config.minutes
         self.next_step = 0
-        """As many steps are done."""
+        """Number of the next step, which is how many are done."""
         self.seconds = 0.0
         """Training time so far, interruptions left out."""
         self._generator = torch.Generator(self.device).manual_seed(config.seed)
@@ -162,8 +163,8 @@ class Trainer:
         return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
 
     @property
-    def sampler(self) -> OccupancyGrid | ProposalSampler:
-        """Where the field is to be looked up; on the CPU, as `field`."""
+    def sampler(self) -> Sampler:
+        """What says where to look the field up, on the CPU."""
         return self._guide.sampler
 
     def run(self) -> Iterator[StepReport]:
@@ -278,8 +279,8 @@ class Trainer:
         return False
 
     def _gradients(self, pilot: bool) -> list[Tensor]:
-        """Of the networks that learn in this step, zero where this process' rays met nothing; the others
-        have none, which Adam leaves alone."""
+        """Gradients of the networks that learn in this step, zero where this process' rays met nothing; other
+        networks have none, which Adam leaves alone."""
         network = self.pilot if pilot else self._field.head
         learning = [*self._field.density.parameters(), *network.parameters()]
         for parameter in learning:
@@ -327,7 +328,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def scale_near_gradients(features: Tensor, t_mid: Tensor, distance: float) -> Tensor:
-    """`features` [n_samples, n_channels] as they are; what flows back to them is times min(1, (t / d)^2).
+    """Return `features` [n_samples, n_channels] as they are, with gradients scaled by min(1, (t / d)^2).
 
     Space just before a camera is sampled far more densely than what it looks at, and fog there explains a
     single picture better than any surface does, above all where poses are off. Philip and Deschaintre,
@@ -349,7 +350,7 @@ def scale_near_gradients(features: Tensor, t_mid: Tensor, distance: float) -> Te
 
 
 def _on_cpu(state: Any) -> Any:
-    """`state` with every tensor in it on the CPU."""
+    """Copy plain values with every tensor in them on the CPU."""
     if isinstance(state, Tensor):
         return state.cpu()
     if isinstance(state, dict):
