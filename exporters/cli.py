@@ -68,7 +68,7 @@ frames of --frame:
            VDB half a voxel lower, which is where Blender's renderer then draws it
 
 In Blender: PLY and GLB bring a colour attribute; show it with Viewport Shading > Color > Attribute, render it
-with a Color Attribute node. docs/exports.md has the layers of the pictures, and more programs.
+with a Color Attribute node. docs/export.md has the layers of the pictures, and more programs.
 
 exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 unread output
 """

@@ -6,7 +6,8 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,52 @@ def test_module_is_short_and_says_what_it_is(path: Path) -> None:
     assert path.stem not in {"utils", "helpers", "common", "misc"}
 
 
+def module_name(path: Path) -> str:
+    parts = path.relative_to(REPOSITORY).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_name(module: str) -> str:
+    """The folder of a package that a module is in; a module of the package's root stands for itself."""
+    package, *rest = module.split(".")
+    return f"{package}/{rest[0]}" if (REPOSITORY / package).joinpath(*rest[:1]).is_dir() and rest else module
+
+
+def arrows() -> dict[str, set[str]]:
+    """Of every module those that it imports anywhere, also inside functions and for annotations alone."""
+    modules = {module_name(path): path for path in MODULES}
+    graph = {}
+    for name, path in modules.items():
+        wanted = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                wanted |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                whole = {f"{node.module}.{alias.name}" for alias in node.names}
+                wanted |= (whole & set(modules)) or {node.module}
+        graph[name] = (wanted & set(modules)) - {name}
+    return graph
+
+
+@pytest.mark.parametrize("node", [str, room_name], ids=["files", "rooms"])
+def test_imports_have_no_circle(node: Callable[[str], str]) -> None:
+    graph: dict[str, set[str]] = {}
+    for module, wanted in arrows().items():
+        graph.setdefault(node(module), set()).update({node(other) for other in wanted} - {node(module)})
+    assert sum(map(len, graph.values())) > 80
+    TopologicalSorter(graph).prepare()  # CycleError names a circle
+
+
+def test_a_folder_can_be_looked_through() -> None:
+    """At most 15 modules, or 8 folders, beside an `__init__`."""
+    for folder in {
+        path.parent for package in (*PACKAGES, "tests") for path in (REPOSITORY / package).rglob("*.py")
+    }:
+        modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+        rooms = [path for path in folder.iterdir() if path.is_dir() and any(path.rglob("*.py"))]
+        assert len(modules) <= 15 and len(rooms) <= 8, folder
+
+
 STARTERS = re.compile(
     r"sys\.(executable|path)\b|\bmultiprocessing\b|ProcessPoolExecutor|DataLoader|LocalCluster|\bdistributed\.Nanny"
     r"|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*)\b|mp\.spawn"
@@ -169,3 +216,15 @@ def test_constraints_pin_exactly_and_cover_every_dependency() -> None:
     )
     assert len(wanted) > 16
     assert not {name.lower() for name in wanted} - pins
+
+
+def test_one_file_alone_names_instructions_of_one_processor() -> None:
+    """Everything else that is written down for LLVM is for any processor, kernels for training included: LLVM
+    ends no process for it."""
+    named = [
+        path.relative_to(REPOSITORY).as_posix()
+        for package in ("player", "exporters", "vfr_bake")
+        for path in (REPOSITORY / package).rglob("*.py")
+        if re.search(r"llvm\.(x86|aarch64|arm|nvvm)|InlineAsm|inline_asm", path.read_text(encoding="utf-8"))
+    ]
+    assert named == ["player/head/dense_tiles.py"]

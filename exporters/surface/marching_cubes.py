@@ -4,7 +4,7 @@ Letters: c, the interpolated density code; sigma, the density, whose logarithm i
 (`player.asset.density`); v, the size of a voxel; dt, the step of the march. The default level is the density
 that is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields
 are soft at their surface, and of the levels tried this one has the player's outlines and lies on known
-geometry in the middle (docs/exports.md). Only live cells are cut, those whose eight corners are stored: what
+geometry in the middle (docs/export.md). Only live cells are cut, those whose eight corners are stored: what
 no training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where
 they end.
 

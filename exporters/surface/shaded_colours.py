@@ -3,7 +3,7 @@
 A ray starts a few voxels above the point and is marched as the player marches, so that a point that is a
 little beside the surface still gets the surface's colour. A point has one colour for all directions: it is
 the mean over the directions of training cameras that see the point, or, where none does, the view along the
-normal. docs/exports.md has the measurement that chose between them.
+normal. docs/export.md has the measurement that chose between them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from player.render import choose_march, default_threads
 STAND_OFF = 3.0
 """How many voxels above the surface a ray starts."""
 MAX_DIRECTIONS = 4
-"""The most cameras that count for a point: eight are no nearer to the player's pictures (docs/exports.md)."""
+"""The most cameras that count for a point: eight are no nearer to the player's pictures (docs/export.md)."""
 _RAYS = 1 << 14  # rays that a thread marches at a time
 _LEAST = 0.1  # a ray of less opacity has met too little to have a colour
 

@@ -1,10 +1,10 @@
-"""docs/trade.md: trains, bakes, plays and measures whole scenes, by the commands that a user has.
+"""docs/benchmarks.md: trains, bakes, plays and measures whole scenes, by the commands that a user has.
 
     python tests/benchmarks/bench_trade.py demo ../shared/data/lego_400 --output /tmp/trade
     python tests/benchmarks/bench_trade.py ../shared/data/fox --output /tmp/trade --downscale 2 \\
         --minutes 2 5 12 --presets balanced
 
-prints the tables of docs/trade.md. Each scene is trained for each of `--minutes`; from the last model every
+prints the tables of docs/benchmarks.md. Each scene is trained for each of `--minutes`; from the last model every
 preset is baked, and `vfr-bench` measures them all. What is in the output folder already is used as it is, so
 that an interrupted run goes on.
 """

@@ -62,7 +62,7 @@ DIRECTION_SHARE = 0.1
 """A small head leaves the direction out where that loses no more than this share of the loss that the preset
 aims at."""
 ROUNDING_LEFT = 0.5
-"""Share of what a head loses by 8 bits that is left after it was tuned with them (docs/baking.md)."""
+"""Share of what a head loses by 8 bits that is left after it was tuned with them (docs/bake.md)."""
 N_WARM, N_TIMED = 10, 40
 """Steps of a round that are not timed, because something may be compiled for the first time, and steps that
 are."""

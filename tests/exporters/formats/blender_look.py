@@ -5,7 +5,7 @@ blender --background --factory-startup --python blender_look.py -- JOBS.json
 JOBS is a list of {"file", "camera": {"c2w", "width", "height", "fx", "fy", "cx", "cy"}, "picture", "arrays"}.
 The pictures are PNG with alpha, view transform Standard; `arrays` is an NPZ of what was imported. A GLB keeps
 the material that the importer made of it, so the picture shows what a user sees first; others get the recipe
-of docs/exports.md: an emission of the colour attribute, for a volume an absorption too.
+of docs/export.md: an emission of the colour attribute, for a volume an absorption too.
 """
 
 import json

@@ -56,18 +56,6 @@ def test_what_arm_has(name: str) -> None:
     assert not has_wide_registers(of) and not multiplies_bytes(32, of) and not multiplies_bytes(64, of)
 
 
-def test_one_file_alone_names_instructions_of_one_processor() -> None:
-    """Everything else that is written down for LLVM is for any processor, kernels for training included: LLVM
-    ends no process for it."""
-    named = [
-        path.relative_to(REPOSITORY).as_posix()
-        for package in ("player", "exporters", "vfr_bake")
-        for path in (REPOSITORY / package).rglob("*.py")
-        if re.search(r"llvm\.(x86|aarch64|arm|nvvm)|InlineAsm|inline_asm", path.read_text(encoding="utf-8"))
-    ]
-    assert named == ["player/head/dense_tiles.py"]
-
-
 def asked(**settings: str) -> str:
     program = (
         "from player.compiled.lanes import LANES; from player.head.dense_tiles import MULTIPLIES_BYTES; "

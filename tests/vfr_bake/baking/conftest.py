@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.vfr_bake.baking.training import trained
+from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model

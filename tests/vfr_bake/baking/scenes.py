@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from player.cameras.camera import Camera
+from vfr_bake.config import TrainConfig
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import CENTRE, SCALE, demo_cameras
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.training.model_file import Model, trained_model
+from vfr_bake.training.trainer import Trainer
 
 BALL = np.array([0.0, 0.0, -0.35])
 RADIUS = 0.6
@@ -83,3 +86,11 @@ def analytic_scene(kind: str, size: int, n_train: int) -> Scene:
 
     test = demo_cameras(size, 2, phase=0.5, prefix="./test/r_")
     return build_scene(Capture(kind, views(demo_cameras(size, n_train)), views(test)))
+
+
+def trained(scene: Scene, config: TrainConfig) -> Model:
+    """What `vfr-train` would have written, without a file in between."""
+    trainer = Trainer(scene, config)
+    for _ in trainer.run():
+        pass
+    return trained_model(trainer, scene, {})

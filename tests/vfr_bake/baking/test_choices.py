@@ -7,8 +7,7 @@ import json
 import pytest
 
 from player.asset.asset import Asset
-from tests.vfr_bake.baking.scenes import analytic_scene
-from tests.vfr_bake.baking.training import trained
+from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.training.model_file import Model

@@ -18,7 +18,7 @@ from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
 from player.march.contraction import contract
 from player.render import render
-from tests.vfr_bake.baking.training import trained
+from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import lattice_step, weighty_cells
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays

@@ -9,7 +9,7 @@ import pytest
 
 from vfr_bake.presets import PRESETS
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "bake.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "bake.md"
 
 
 def rows() -> dict[str, list[str]]:
