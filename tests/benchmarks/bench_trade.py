@@ -4,9 +4,9 @@
     python tests/benchmarks/bench_trade.py ../shared/data/fox --output /tmp/trade --downscale 2 \\
         --minutes 2 5 12 --presets balanced
 
-prints the tables of docs/benchmarks.md. Each scene is trained for each of `--minutes`; from the last model every
-preset is baked, and `vfr-bench` measures them all. What is in the output folder already is used as it is, so
-that an interrupted run goes on.
+prints the tables of docs/benchmarks.md. Each scene is trained for each of `--minutes`; from the last model
+every preset is baked, and `vfr-bench` measures them all. What is in the output folder already is used as it
+is, so that an interrupted run goes on.
 """
 
 from __future__ import annotations
