@@ -105,7 +105,7 @@ def room_name(module: str) -> str:
 
 
 def arrows() -> dict[str, set[str]]:
-    """Of every module those that it imports anywhere, also inside functions and for annotations alone."""
+    """The modules that each module imports anywhere, also inside functions and for annotations alone."""
     modules = {module_name(path): path for path in MODULES}
     graph = {}
     for name, path in modules.items():

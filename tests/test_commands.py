@@ -161,7 +161,7 @@ ASKED = {
     "check": ["--check"],
 }
 ALONE = {"cameras", "orbit", "view", "info", "check"}
-"""Of these argparse takes one: beside no other, and what chooses a mode of its own in no other."""
+"""Options of which argparse takes one at a time; one that chooses a mode is not taken in another mode."""
 
 PAIRS = [
     (name, mode)

@@ -110,7 +110,8 @@ def hard_coordinates(resolution: int) -> list[float]:
 @pytest.mark.parametrize("resolution", [40, 512, 4096])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
-    """Of the position as the type holds it: at a resolution of N a position is off by N 2^-24 cells."""
+    """Features are exact for the position as the type holds it, which is off by N 2^-24 cells at a resolution
+    of N."""
     grid = small_grid(dtype, resolution)
     some = hard_coordinates(resolution)
     random = np.random.default_rng(0)

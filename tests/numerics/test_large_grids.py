@@ -33,7 +33,7 @@ N_CHANNELS = 10
 LAST_IN_32_BITS = 2**31 // 729 - 1
 """The last slot whose densities have indices below 2^31."""
 MOST_SLOTS = bricks_per_axis(MAX_RESOLUTION) ** 3
-"""Of a grid that the format allows."""
+"""The most slots that a grid of the format may have."""
 MOST_ROWS = 2**31 - 1
 
 

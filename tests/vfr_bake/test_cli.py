@@ -87,8 +87,8 @@ def test_the_help_names_the_defaults_that_hold(
 
 
 def test_trainings_own_score_is_that_of_vfr_eval(small_data: Path, tmp_path: Path) -> None:
-    """Of photographs without alpha and without end, what is missing is no white: training has to score over
-    the background that the model's pictures are shown over, by which the bake counts its losses."""
+    """Where an unbounded model stores nothing it shows its background and not white: training has to score
+    over that background too, because the bake counts its losses by that score."""
     data = tmp_path / "data"
     shutil.copytree(small_data, data)
     for path in data.rglob("*.png"):

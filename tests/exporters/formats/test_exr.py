@@ -21,7 +21,7 @@ from player.march.march import MIN_OPACITY
 from player.render import Frame, Renderer
 
 SRGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-"""Of linear sRGB, as IEC 61966-2-1 has it, to four digits."""
+"""The matrix from linear sRGB to XYZ, as IEC 61966-2-1 has it, to four digits."""
 LAYERS = [
     *("R", "G", "B", "A", "Z", "distance.V", "position.X", "position.Y", "position.Z"),
     *("normal.X", "normal.Y", "normal.Z", "opacity.V", "samples.V"),

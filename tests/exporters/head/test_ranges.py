@@ -114,7 +114,8 @@ def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: fl
 
 
 def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None:
-    """Of inputs that they were not made from: two in ten thousand are left out, where they were."""
+    """Activations of inputs that the ranges were not made from lie within them, but for two in ten
+    thousand."""
     ranges = activation_ranges(weights, **inputs(4000))
     assert len(ranges) == 3
     found: dict[int, np.ndarray] = {}

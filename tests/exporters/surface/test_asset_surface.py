@@ -13,7 +13,7 @@ def strip(n: int) -> np.ndarray:
 
 
 def test_a_colour_goes_on_from_corner_to_corner() -> None:
-    """Of one colour alone: the whole strip has it in the end, and alpha stays each corner's own."""
+    """One known colour spreads over the whole strip, and alpha stays each corner's own."""
     colours = np.zeros((9, 4))
     colours[:, 3] = np.arange(9)
     colours[0, :3] = 10, 20, 30

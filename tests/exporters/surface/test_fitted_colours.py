@@ -22,7 +22,7 @@ def colour_of(places: np.ndarray) -> np.ndarray:
 
 
 def pictures(bias: float = 0.0) -> list[DepthView]:
-    """Of the ball, all around; in the second half of them everything is brighter by `bias`."""
+    """Views of the ball from all around; in the second half of them everything is brighter by `bias`."""
     views = []
     for number, view in enumerate(all_around(1.0)):
         rays_o, rays_d = view.camera.rays()

@@ -52,7 +52,7 @@ def test_normals_are_the_naive_loop(asset: Asset, scene: Scene, camera: Camera) 
 
 
 def test_a_sphere_has_radial_normals(asset: Asset) -> None:
-    """Of the gradient alone, a voxel outside the peak of the outer shell. Most cells bend by a degree; a few
+    """The gradient alone, a voxel outside the peak of the outer shell. Most cells bend by a degree; a few
     have a corner on the other side of the peak."""
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)

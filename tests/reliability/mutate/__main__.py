@@ -175,7 +175,7 @@ class Copy:
                 path.replace(target)
 
     def _outcome(self, tests: list[str], compiled: Path, folder: Path, limit: float) -> dict[str, Any]:
-        """Of the likeliest tests, then of the others."""
+        """Run the likeliest tests, then the others, and say what came of them."""
         begin = time.monotonic()
         end, by = begin + limit, None
         for first, last in itertools.pairwise((0, *BATCHES, len(tests))):

@@ -46,7 +46,7 @@ class Site:
     old: str
     new: str
     number: int
-    """Of equal changes in the scope, which one."""
+    """Which one it is among equal changes in the same scope, from 0."""
 
     @property
     def name(self) -> str:

@@ -28,7 +28,7 @@ from vfr_bake.field.networks import Head, SphericalHarmonics
 
 N_CHANNELS = 16
 SCALE = 0.02
-"""Of the codes, folded into the first layer as the bake folds it."""
+"""The step of the codes, which is folded into the first layer as the bake folds it."""
 
 
 @pytest.fixture(scope="module")
