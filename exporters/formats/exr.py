@@ -162,8 +162,9 @@ def check_channels(path: Path, expected: dict[str, np.ndarray], got: dict[str, n
             )
         wrong = (array != other) & ~(np.isnan(array) & np.isnan(other))
         if wrong.any():
-            apart = np.nan_to_num(np.abs(array.astype(np.float64) - other), nan=-1, posinf=np.inf)
-            row, column = np.unravel_index(np.where(wrong, apart, -2).argmax(), apart.shape)
+            apart = np.full(array.shape, -2.0)
+            apart[wrong] = np.nan_to_num(np.abs(array[wrong].astype(np.float64) - other[wrong]), nan=-1)
+            row, column = np.unravel_index(apart.argmax(), apart.shape)
             raise ParityError(
                 f"{path}: {name}: expected {array[row, column]:g}, got {other[row, column]:g} at row {row}, "
                 f"column {column}, the worst of {int(wrong.sum())} pixels that differ"
