@@ -72,7 +72,7 @@ def commands(work: Path, names: list[str]) -> list[Command]:
     _write_data(data)
     play = [str(asset), "--orbit", "2", "--size", "32x24", "--threads", "1"]
     small = ["--method", "density", "--faces", "100"]
-    exr = ["--format", "exr", "--views", str(asset / "cameras.json")]
+    exr = ["--format", "exr", "--cameras", str(asset / "cameras.json")]
 
     def prepare() -> int:
         return train_main([str(data), str(model), *SMALL]) or bake_main([str(model), str(baked), *BAKE])
