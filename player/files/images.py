@@ -83,7 +83,10 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
                 yield picture
         except UnidentifiedImageError:
             raise FormatError(f"{path}: picture: expected a PNG or JPEG file, got something else") from None
-        except (OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError) as error:
+        except (
+            *(OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError),
+            MemoryError,  # a chunk may say that it has gigabytes, for which Pillow asks at once
+        ) as error:
             if isinstance(error, VfrError):
                 raise
             reason = (str(error).splitlines() or [type(error).__name__])[0]

@@ -23,10 +23,12 @@ from player.asset.manifest import NAME, parse_manifest
 from player.asset.packing import pack_codes, pack_masks
 from player.asset.unpacking import read_coords
 from player.cameras.transforms import parse_transforms, transforms_cameras
-from player.errors import ConfigError, FormatError
+from player.errors import ConfigError, DataError, FormatError
+from player.files.images import png_bytes, read_key
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.hostile_files import vouch
 from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.data.pictures import read_picture
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import FORMAT, Model, load_model, save_model
@@ -151,3 +153,20 @@ def test_a_name_of_thousands_of_letters_is_not_repeated_in_full() -> None:
     with pytest.raises(FormatError) as caught:
         transforms_cameras(parse_transforms(json.dumps(document).encode(), "t"), "t")
     assert "frame 0" in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_a_picture_that_asks_for_more_memory_than_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A PNG of 324 bytes may say that 4 GB follow, which Pillow asks the system for at once."""
+    path = tmp_path / "frame.png"
+    path.write_bytes(png_bytes(np.zeros((9, 7, 3), np.uint8), "abc"))
+    assert read_key(path) == "abc"
+
+    def load(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", load)
+    assert read_key(path) is None
+    with pytest.raises(DataError, match=r"frame\.png: picture: cannot be read to its end: MemoryError"):
+        read_picture(path)

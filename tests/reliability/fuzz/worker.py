@@ -123,7 +123,10 @@ def said_twice(message: str) -> bool:
     True
     >>> said_twice("m.json: files: a: bytes: expected an integer, got 'a'")
     False
+    >>> said_twice("a.npy: expected a numpy array, got b'x: y x: y: z'")
+    False
     """
+    message = re.sub(r"""\bb(['"]).*\1""", "bytes", message)  # a file's own bytes may say anything
     names = [part.replace("\\", "/").rsplit("/", 1)[-1] for part in message.split(": ")[:-1]]
     places = [name for name in names if re.fullmatch(r"[\w.-]*[A-Za-z][\w.-]*", name)]
     return len(places) != len(set(places))
