@@ -1,0 +1,342 @@
+"""A pyramid: one grid at several levels of detail, each as fine as the place needs.
+
+Level 0 is the finest, with R cells along each axis of the box; cells of level l are 2^l times as wide. A
+brick is 8 x 8 x 8 cells of its level, and its coordinate is that of its lowest cell >> 3. The mask of a brick
+says which of its cells are live, with the bits of `player.asset.bricks`.
+
+The pyramid is whole: below every live cell of a finer level there is a live cell of the next coarser one, so
+that the coarser levels alone are a picture, too. A place is read from the finest level that has a brick
+there; if that brick's cell is not live, nothing is there.
+
+Vertices of a level are the corners of its live cells; their rows are in the order of the bricks of vertices,
+8 x 8 x 8 each, and then of the bits. A vertex is on the *border* of its level if it is also a corner of a
+place that is read from a live cell of a coarser level. What a level stores is by how much its values differ
+from those of the next coarser level, interpolated; on the border they do not, so that the field is
+continuous where levels meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from player.asset.bricks import BRICK, bricks_per_axis, stored_bits
+
+MAX_LEVELS = 8
+
+_Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
+_ONE, _SEVEN, _EIGHT, _FIFTY_SIX = (np.uint64(n) for n in (1, 7, 8, 56))
+
+
+@dataclass(frozen=True, eq=False)
+class Bricks:
+    """Bricks of one level, each with a mask."""
+
+    coords: np.ndarray
+    """[n_bricks, 3] uint16, sorted, each at most once."""
+    masks: np.ndarray
+    """[n_bricks, 8] uint64: which cells are live, or which vertices there are."""
+
+    def __len__(self) -> int:
+        return len(self.coords)
+
+    @cached_property
+    def _keys(self) -> np.ndarray:
+        return _keys(self.coords)
+
+    def find(self, coords: np.ndarray) -> np.ndarray:
+        """[n] int64: which bricks have the coordinates [n, 3]; -1 where there is none.
+
+        >>> some = Bricks(np.array([[0, 0, 1], [2, 0, 0]], np.uint16), np.ones((2, 8), np.uint64))
+        >>> some.find(np.array([[2, 0, 0], [0, 0, 0], [-1, 0, 0]])).tolist()
+        [1, -1, -1]
+        """
+        if not len(self):
+            return np.full(len(coords), -1)
+        keys = _keys(coords)
+        index = np.minimum(np.searchsorted(self._keys, keys), len(self) - 1)
+        return np.where(self._keys[index] == keys, index, -1)
+
+    def masks_at(self, coords: np.ndarray) -> np.ndarray:
+        """[n, 8] uint64: the masks at the coordinates [n, 3]; 0 where there is no brick."""
+        index = self.find(coords)
+        return np.where(index[:, None] >= 0, self.masks[index], 0) if len(self) else _no_masks(len(coords))
+
+    def without_empty(self) -> Bricks:
+        """Those whose masks are not all 0."""
+        some = self.masks.any(axis=1)
+        return self if some.all() else Bricks(self.coords[some], self.masks[some])
+
+
+def _keys(coords: np.ndarray) -> np.ndarray:
+    x, y, z = np.asarray(coords, np.int64).T
+    return (x << 40) + (y << 20) + z  # rises with (x, y, z) for components from -1 to 2^19
+
+
+def _no_masks(n: int) -> np.ndarray:
+    return np.zeros((n, 8), np.uint64)
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """The vertices of a level, in the order of their rows."""
+
+    bricks: Bricks
+    """Bricks of vertices; the masks say which vertices there are."""
+    border: np.ndarray
+    """[n_bricks, 8] uint64: those of them on the border."""
+
+    @cached_property
+    def n(self) -> int:
+        return int(stored_bits(self.bricks.masks).sum())
+
+    @cached_property
+    def on_border(self) -> np.ndarray:
+        """[n] bool."""
+        return stored_bits(self.border)[stored_bits(self.bricks.masks)]
+
+    @cached_property
+    def index(self) -> np.ndarray:
+        """[n, 3] int32: positions in cells of the level."""
+        brick, bit = np.nonzero(stored_bits(self.bricks.masks))
+        local = np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1).astype(np.int32)
+        return self.bricks.coords.astype(np.int32)[brick] * BRICK + local
+
+    @cached_property
+    def row_of_bit(self) -> np.ndarray:
+        """[n_bricks * 512] int32: the row of each vertex of each brick, -1 where there is none."""
+        there = stored_bits(self.bricks.masks)
+        rows = np.full(there.shape, -1, np.int32)
+        rows[there] = np.arange(self.n, dtype=np.int32)
+        return rows.reshape(-1)
+
+    def rows(self, index: np.ndarray) -> np.ndarray:
+        """[n] int32: the rows of vertices [n, 3]; -1 where there is none."""
+        brick = self.bricks.find(index >> 3)
+        x, y, z = (index & 7).T
+        return np.where(
+            brick >= 0, self.row_of_bit.take(np.maximum(brick, 0) * 512 + (x * 64 + y * 8 + z)), -1
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """Which cells are live on which level."""
+
+    resolution: int
+    """Cells of the finest level along each axis."""
+    levels: tuple[Bricks, ...]
+    """The bricks of each level, the finest first; the masks are those of live cells."""
+
+    def cells_per_axis(self, level: int) -> int:
+        return -(-self.resolution // (1 << level))
+
+    def shown(self, level: int, coords: np.ndarray) -> np.ndarray:
+        """[n, 8] uint64: which cells of `level`, in places of bricks [n, 3], are read from live cells when
+        all finer levels are left out."""
+        bricks = self.levels[level]
+        index = bricks.find(coords)
+        masks = bricks.masks_at(coords)
+        missing = np.flatnonzero(index < 0)
+        if len(missing) and level + 1 < len(self.levels):
+            around = coords[missing]
+            masks[missing] = expanded(self.shown(level + 1, around >> 1), around & 1)
+        return masks
+
+    def vertices(self, level: int) -> Vertices:
+        """The vertices of a level."""
+        bricks = self.levels[level]
+        corners = corners_of(bricks)
+        beside = _neighbourhood(bricks.coords, -1, 1)
+        last = bricks_per_axis(self.cells_per_axis(level) - 1)
+        inside = ((beside >= 0) & (beside < last)).all(axis=1)
+        beside = beside[inside]
+        beside = beside[bricks.find(beside) < 0]
+        coarser = corners_of(Bricks(beside, self.shown(level, beside)).without_empty())
+        border = corners.masks & coarser.masks_at(corners.coords)
+        return Vertices(corners, border)
+
+
+def corners_of(cells: Bricks) -> Bricks:
+    """The corners of live cells, as masks of bricks of vertices.
+
+    A cell's corners are added axis by axis: along z, then y, then x, the last into the next brick.
+
+    >>> one = Bricks(np.array([[0, 0, 0]], np.uint16), np.array([[1 << 63, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
+    >>> found = corners_of(one)
+    >>> found.coords.tolist()
+    [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]]
+    >>> np.flatnonzero(stored_bits(found.masks[3:])).tolist()
+    [0, 64]
+    """
+    coords = _neighbourhood(cells.coords, 0, 1)
+    masks = cells.masks_at(coords)
+
+    def behind(masks: np.ndarray, *offset: int) -> np.ndarray:
+        return Bricks(coords, masks).masks_at(coords - np.array(offset))
+
+    masks = masks | ((masks & ~_Z_LAST) << _ONE) | ((behind(masks, 0, 0, 1) & _Z_LAST) >> _SEVEN)
+    masks = masks | (masks << _EIGHT) | (behind(masks, 0, 1, 0) >> _FIFTY_SIX)
+    before = np.concatenate([behind(masks, 1, 0, 0)[:, 7:], masks[:, :7]], axis=1)
+    return Bricks(coords.astype(np.uint16), masks | before).without_empty()
+
+
+def _neighbourhood(coords: np.ndarray, low: int, high: int) -> np.ndarray:
+    """[n, 3] int64, sorted: the coordinates at all offsets with components from `low` to `high`."""
+    keys = _keys(coords)
+    offsets = np.arange(low, high + 1)
+    for shift in (0, 20, 40):
+        keys = np.unique((keys[:, None] + (offsets << shift)).reshape(-1))
+    z = ((keys + (1 << 19)) & 0xFFFFF) - (1 << 19)  # components may be -1
+    keys = (keys - z) >> 20
+    y = ((keys + (1 << 19)) & 0xFFFFF) - (1 << 19)
+    return np.stack([(keys - y) >> 20, y, z], axis=-1)
+
+
+def expanded(masks: np.ndarray, octants: np.ndarray) -> np.ndarray:
+    """Each cell of an octant of a brick as eight cells of a brick of the next finer level.
+
+    Args:
+        masks: [n, 8] uint64 of the coarser bricks.
+        octants: [n, 3] components 0 or 1: which half along each axis.
+
+    >>> masks = expanded(np.array([[1, 0, 0, 0, 0, 0, 0, 0]], np.uint64), np.array([[0, 0, 0]]))
+    >>> np.flatnonzero(stored_bits(masks)).tolist()
+    [0, 1, 8, 9, 64, 65, 72, 73]
+    """
+    out = _no_masks(len(masks))
+    some = np.flatnonzero(masks.any(axis=1))
+    if len(some):
+        cells = stored_bits(masks[some]).reshape(-1, 2, 4, 2, 4, 2, 4)
+        x, y, z = octants[some].T
+        cells = cells[np.arange(len(some)), x, :, y, :, z]
+        for axis in (1, 2, 3):
+            cells = cells.repeat(2, axis=axis)
+        out[some] = packed_bits(cells)
+    return out
+
+
+def packed_bits(cells: np.ndarray) -> np.ndarray:
+    """[n, 8, 8, 8] bool to masks [n, 8] uint64."""
+    bits = np.packbits(cells.reshape(-1, BRICK**3), axis=1, bitorder="little")
+    return bits.view("<u8").astype(np.uint64, copy=False)
+
+
+def coarser(bricks: Bricks) -> Bricks:
+    """The bricks of the next coarser level whose live cells hold a live cell of these.
+
+    >>> fine = Bricks(np.array([[3, 0, 0]], np.uint16), np.array([[0, 0, 4, 0, 0, 0, 0, 0]], np.uint64))
+    >>> found = coarser(fine)
+    >>> found.coords.tolist(), np.flatnonzero(stored_bits(found.masks)).tolist()
+    ([[1, 0, 0]], [321])
+    """
+    cells = stored_bits(bricks.masks).reshape(-1, 4, 2, 4, 2, 4, 2).any(axis=(2, 4, 6))
+    keys, owner = np.unique(_keys(bricks.coords >> 1), return_inverse=True)
+    coords = np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=-1)
+    whole = np.zeros((len(keys), 2, 4, 2, 4, 2, 4), bool)
+    x, y, z = (bricks.coords & 1).T
+    whole[owner.reshape(-1), x, :, y, :, z] = cells  # each octant has one brick
+    return Bricks(coords.astype(np.uint16), packed_bits(whole.reshape(-1, 8, 8, 8)))
+
+
+def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
+    """The pyramid whose level l shows the live cells of `leaves[l]`, and what finer levels need below them.
+
+    Where a finer level has a brick, a coarser one does not show: its own live cells there are dropped unless
+    a finer one needs them.
+    """
+    levels = [leaves[0].without_empty()]
+    for own in leaves[1:]:
+        below = coarser(levels[-1])
+        coords = np.unique(np.concatenate([_keys(own.coords), _keys(below.coords)]))
+        coords = np.stack([coords >> 40, (coords >> 20) & 0xFFFFF, coords & 0xFFFFF], axis=-1)
+        octants = np.zeros((len(coords), 2, 1, 2, 1, 2, 1), bool)
+        at = Bricks(coords, _no_masks(len(coords))).find(levels[-1].coords >> 1)
+        x, y, z = (levels[-1].coords & 1).T
+        octants[at, x, :, y, :, z] = True
+        refined = packed_bits(np.broadcast_to(octants, (len(coords), 2, 4, 2, 4, 2, 4)).reshape(-1, 8, 8, 8))
+        masks = (own.masks_at(coords) & ~refined) | below.masks_at(coords)
+        levels.append(Bricks(coords.astype(np.uint16), masks).without_empty())
+    return Pyramid(resolution, tuple(levels))
+
+
+def predicted(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
+    """What the next coarser level says at the vertices of a level.
+
+    Args:
+        fine: n vertices.
+        coarse: those of the next coarser level.
+        values: [n_coarse, n_channels] integers.
+
+    Returns:
+        [n, n_channels] int16: (the sum of the values at floor(v / 2) and ceil(v / 2) of each axis + 4) >> 3.
+    """
+    out = np.empty((fine.n, values.shape[1]), np.int16)
+    index = fine.index
+    parity = (index & 1) @ np.array([4, 2, 1])
+    for odd in np.ndindex(2, 2, 2):
+        rows = np.flatnonzero(parity == odd[0] * 4 + odd[1] * 2 + odd[2])
+        if not len(rows):
+            continue
+        low = index[rows] >> 1
+        total = np.zeros((len(rows), values.shape[1]), np.int16)
+        for up in np.ndindex(*(1 + o for o in odd)):
+            total += values[coarse.rows(low + np.array(up, np.int32))]
+        out[rows] = (total * np.int16(8 >> sum(odd)) + np.int16(4)) >> np.int16(3)
+    return out
+
+
+def values_of(
+    vertices: Sequence[Vertices], symbols: Sequence[np.ndarray], steps: Sequence[int], limits: tuple[int, int]
+) -> list[np.ndarray]:
+    """The values of all levels from what each stores.
+
+    Args:
+        vertices: those of each level, the finest first.
+        symbols: for each level [n_stored, n_channels] integers, one row for each vertex that is not on the
+            border: by how many steps it differs from what the coarser level says; on the coarsest level, from
+            0.
+        steps: for each level the width of a step, 1 or more.
+        limits: the lowest and the highest value.
+
+    Returns:
+        for each level [n, n_channels] int16, a row for each vertex.
+    """
+    found: list[np.ndarray] = []
+    for level in reversed(range(len(vertices))):
+        here, stored = vertices[level], ~vertices[level].on_border
+        if found:
+            values = predicted(here, vertices[level + 1], found[-1])
+        else:
+            values = np.zeros((here.n, symbols[level].shape[1]), np.int16)
+        moved = values[stored] + steps[level] * symbols[level].astype(np.int32)
+        values[stored] = np.clip(moved, *limits)
+        found.append(values)
+    return found[::-1]
+
+
+def symbols_of(
+    vertices: Sequence[Vertices], wanted: Sequence[np.ndarray], steps: Sequence[int], limits: tuple[int, int]
+) -> list[np.ndarray]:
+    """What each level stores so that `values_of` is as close to `wanted` as its steps allow.
+
+    The arguments are those of `values_of`, with `wanted` [n, n_channels] of each level, which need not be
+    whole numbers.
+    """
+    found: list[np.ndarray] = []
+    coarse: np.ndarray | None = None
+    for level in reversed(range(len(vertices))):
+        here, stored = vertices[level], ~vertices[level].on_border
+        if coarse is None:
+            values = np.zeros(wanted[level].shape, np.int16)
+        else:
+            values = predicted(here, vertices[level + 1], coarse)
+        away = np.rint((np.clip(wanted[level][stored], *limits) - values[stored]) / steps[level])
+        symbols = away.astype(np.int16)
+        values[stored] = np.clip(values[stored] + steps[level] * symbols.astype(np.int32), *limits)
+        found.append(symbols)
+        coarse = values
+    return found[::-1]
