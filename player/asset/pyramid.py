@@ -146,8 +146,12 @@ class Pyramid:
             masks[missing] = expanded(self.shown(level + 1, around >> 1), around & 1)
         return masks
 
-    def vertices(self, level: int) -> Vertices:
-        """The vertices of a level."""
+    @cached_property
+    def vertices(self) -> tuple[Vertices, ...]:
+        """The vertices of each level."""
+        return tuple(self._vertices(level) for level in range(len(self.levels)))
+
+    def _vertices(self, level: int) -> Vertices:
         bricks = self.levels[level]
         corners = corners_of(bricks)
         beside = _neighbourhood(bricks.coords, -1, 1)
@@ -158,6 +162,26 @@ class Pyramid:
         coarser = corners_of(Bricks(beside, self.shown(level, beside)).without_empty())
         border = corners.masks & coarser.masks_at(corners.coords)
         return Vertices(corners, border)
+
+
+@dataclass(frozen=True, eq=False)
+class PyramidValues:
+    """A pyramid with what is stored at its vertices."""
+
+    pyramid: Pyramid
+    values: tuple[np.ndarray, ...]
+    """For each level [n_vertices, n_channels] uint8 or int8 codes, a row for each vertex, the border's
+    too."""
+
+    @cached_property
+    def first_rows(self) -> np.ndarray:
+        """[n_levels + 1] int64: where the rows of each level begin among those of all levels, the finest
+        first; last their number."""
+        return np.cumsum([0, *(len(values) for values in self.values)])
+
+    @property
+    def n_channels(self) -> int:
+        return self.values[0].shape[1]
 
 
 def corners_of(cells: Bricks) -> Bricks:

@@ -86,7 +86,7 @@ def test_what_the_leaves_show_is_shown():
 def test_vertices_and_borders_are_those_of_the_definition(pyramid):
     reading = Reading(pyramid)
     for level, some in enumerate(pyramid.levels):
-        vertices = pyramid.vertices(level)
+        vertices = pyramid.vertices[level]
         corners = {tuple(np.add(cell, c).tolist()) for cell in cells_of(some) for c in CORNERS}
         assert list(map(tuple, vertices.index.tolist())) == sorted(
             corners, key=lambda v: ([c >> 3 for c in v], [c & 7 for c in v])
@@ -117,7 +117,7 @@ def values_at(pyramid: Pyramid, vertices, values, level: int, cell: Cell, place:
 
 def test_the_field_is_continuous_where_levels_meet(pyramid):
     random = np.random.default_rng(7)
-    vertices = [pyramid.vertices(level) for level in range(len(pyramid.levels))]
+    vertices = pyramid.vertices
     symbols = [random.integers(-20, 20, (int((~v.on_border).sum()), 1)) for v in vertices]
     values = values_of(vertices, symbols, [3] * len(vertices), (-127, 127))
     met, reading = 0, Reading(pyramid)
@@ -139,7 +139,7 @@ def test_the_field_is_continuous_where_levels_meet(pyramid):
 
 
 def test_a_ramp_needs_no_symbols_on_finer_levels(pyramid):
-    vertices = [pyramid.vertices(level) for level in range(len(pyramid.levels))]
+    vertices = pyramid.vertices
     wanted = [(v.index @ [1, 2, -1])[:, None] * 2**level for level, v in enumerate(vertices)]
     symbols = symbols_of(vertices, wanted, [1] * len(vertices), (-1000, 1000))
     values = values_of(vertices, symbols, [1] * len(vertices), (-1000, 1000))
@@ -149,7 +149,7 @@ def test_a_ramp_needs_no_symbols_on_finer_levels(pyramid):
 
 def test_symbols_and_values_undo_each_other(pyramid):
     random = np.random.default_rng(3)
-    vertices = [pyramid.vertices(level) for level in range(len(pyramid.levels))]
+    vertices = pyramid.vertices
     wanted = [random.uniform(-150, 150, (v.n, 3)) for v in vertices]
     steps = [1, 4, 2, 8][: len(vertices)]
     symbols = symbols_of(vertices, wanted, steps, (-127, 127))
@@ -162,7 +162,7 @@ def test_symbols_and_values_undo_each_other(pyramid):
 def test_predictions_are_means_of_the_coarser_corners(pyramid):
     random = np.random.default_rng(4)
     for level in range(len(pyramid.levels) - 1):
-        fine, coarse = pyramid.vertices(level), pyramid.vertices(level + 1)
+        fine, coarse = pyramid.vertices[level], pyramid.vertices[level + 1]
         values = random.integers(-127, 128, (coarse.n, 2)).astype(np.int16)
         found = predicted(fine, coarse, values)
         for row in random.choice(fine.n, 50):
