@@ -40,7 +40,7 @@ class Scene:
     test: PosedImages
     """Views that training never sees; none when there are too few to spare one."""
     has_alpha: bool
-    """Whether any picture has a pixel that is not opaque."""
+    """Whether any training picture has a pixel that is not opaque."""
     world_from_model: np.ndarray
     """[4, 4] float64: uniform scale and translation."""
     unbounded: bool = False
@@ -62,7 +62,7 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     """
     train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
     _check_cameras(capture.name, train.cameras)
-    has_alpha = any(bool((image[..., 3] < 255).any()) for image in (*train.images, *test.images))
+    has_alpha = any(bool((image[..., 3] < 255).any()) for image in train.images)
     unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(train.images))
     if unbounded:
         centre, half = _camera_ball(train.cameras)

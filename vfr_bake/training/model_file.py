@@ -4,7 +4,8 @@ only, and loads with `weights_only=True`.
 Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
 the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
 frame, as transforms.json text), sampler (below), state (the field's tensors), figures (what training
-measured). The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits),
+measured), and since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), which are missing in older
+files. The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits),
 resolution; that of an unbounded scene its proposals: near (model units), state (their tensors).
 """
 
@@ -24,19 +25,21 @@ from player.cameras.transforms import parse_transforms, transforms_cameras, writ
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
 from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
 from vfr_bake.rendering.render import Sampler, mean_colour
-from vfr_bake.training.tensor_files import read_tensors, write_tensors
+from vfr_bake.training.tensor_files import check_kinds, check_plain, read_tensors, write_tensors
+from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 0)
+VERSION = (2, 1)
 N_MEAN_VIEWS = 16
 """Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
@@ -58,6 +61,9 @@ class Model:
     """Settings of the training, for the record."""
     figures: dict[str, Any]
     """What training measured, for the record."""
+    witnesses: Witnesses | None = None
+    """Pixels of the training views that training has not learned from; None in the models of before there
+    were any."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -77,7 +83,30 @@ class Model:
         return (np.round(255 * seen) / 255).astype(np.float32)
 
     def model_cameras(self) -> list[Camera]:
-        """The training cameras in the model frame."""
+        """The cameras of the views that training has learned from, in the model frame."""
+        cameras = self._in_model_frame()
+        return cameras if self.witnesses is None else [cameras[i] for i in self.witnesses.learned()]
+
+    def witness_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions of the witnesses' rays, [n_witnesses, 3] float32 each, model frame.
+
+        Raises ConfigError for a model without witnesses.
+        """
+        if self.witnesses is None:
+            raise ConfigError(
+                "model: witnesses: expected some, got none: it was trained before there were any"
+            )
+        ends = np.cumsum(self.witnesses.counts)[:-1]
+        rays = [
+            tuple(column[pixels] for column in camera.rays())
+            for camera, pixels in zip(
+                self._in_model_frame(), np.split(self.witnesses.pixels, ends), strict=True
+            )
+        ]
+        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
+        return rays_o, rays_d
+
+    def _in_model_frame(self) -> list[Camera]:
         model_from_world = np.linalg.inv(self.world_from_model)
         return [camera.transformed(model_from_world) for camera in self.cameras]
 
@@ -92,26 +121,27 @@ def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Mo
         has_alpha=scene.has_alpha,
         train={"data": scene.name} | trainer.settings,
         figures=figures,
+        witnesses=trainer.witnesses,
     )
 
 
 def save_model(path: Path, model: Model) -> None:
     """Write beside `path` and rename into place."""
-    write_tensors(
-        path,
-        {
-            "format": FORMAT,
-            "version": list(VERSION),
-            "field": asdict(model.field.config),
-            "train": model.train,
-            "world_from_model": torch.from_numpy(np.asarray(model.world_from_model, np.float64)),
-            "has_alpha": model.has_alpha,
-            "cameras": write_cameras(model.cameras).decode(),
-            "sampler": _sampler_content(model.sampler),
-            "state": model.field.state_dict(),
-            "figures": model.figures,
-        },
-    )
+    content = {
+        "format": FORMAT,
+        "version": list(VERSION),
+        "field": asdict(model.field.config),
+        "train": model.train,
+        "world_from_model": torch.from_numpy(np.asarray(model.world_from_model, np.float64)),
+        "has_alpha": model.has_alpha,
+        "cameras": write_cameras(model.cameras).decode(),
+        "sampler": _sampler_content(model.sampler),
+        "state": model.field.state_dict(),
+        "figures": model.figures,
+    }
+    if model.witnesses is not None:
+        content["witnesses"] = witness_content(model.witnesses)
+    write_tensors(path, content)
 
 
 def load_model(path: Path, max_memory: float | None = None) -> Model:
@@ -131,21 +161,26 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
     restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
     sampler = restore_sampler(content["sampler"], f"{path}: sampler")
     matrix = content["world_from_model"]
-    _check_plain(matrix, matrix.is_floating_point(), "floats", f"{path}: world_from_model")
+    check_plain(matrix, matrix.is_floating_point(), "floats", f"{path}: world_from_model")
     if matrix.shape != (4, 4) or not matrix.isfinite().all():
         got = matrix.tolist() if matrix.numel() <= 16 else list(matrix.shape)
         raise FormatError(f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(got)}")
     world_from_model = matrix.double().numpy()
     where = f"{path}: cameras"
-    cameras = content["cameras"].encode(errors="surrogatepass")  # a reader of UTF-8 refuses half a character
+    text = content["cameras"].encode(errors="surrogatepass")  # a reader of UTF-8 refuses half a character
+    cameras = transforms_cameras(parse_transforms(text, where), where)
+    witnesses = None
+    if "witnesses" in content:
+        witnesses = restore_witnesses(content["witnesses"], cameras, f"{path}: witnesses")
     return Model(
         field=field,
         sampler=sampler,
         world_from_model=world_from_model,
-        cameras=transforms_cameras(parse_transforms(cameras, where), where),
+        cameras=cameras,
         has_alpha=bool(content["has_alpha"]),
         train=content["train"],
         figures=content["figures"],
+        witnesses=witnesses,
     )
 
 
@@ -165,7 +200,7 @@ def _read(path: Path, max_memory: float | None) -> dict[str, Any]:
         "field": dict, "train": dict, "world_from_model": torch.Tensor, "has_alpha": bool, "cameras": str,
         "sampler": dict, "state": dict, "figures": dict,
     }  # fmt: skip
-    _check_kinds(content, kinds, str(path))
+    check_kinds(content, kinds, str(path))
     return content
 
 
@@ -191,14 +226,14 @@ def _check_table(config: FieldConfig, state: dict[str, Any], where: str) -> None
 
 
 def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
-    _check_kinds(content, {"step": float, "occupied": torch.Tensor, "resolution": int}, where)
+    check_kinds(content, {"step": float, "occupied": torch.Tensor, "resolution": int}, where)
     step, resolution = content["step"], content["resolution"]
     if not 0 < step < 1:
         raise FormatError(f"{where}: step: expected a number between 0 and 1, got {step}")
     if not 8 <= resolution <= 512:
         raise FormatError(f"{where}: resolution: expected 8 to 512, got {resolution}")
     packed = content["occupied"]
-    _check_plain(packed, packed.dtype == torch.uint8, "bytes", f"{where}: occupied")
+    check_plain(packed, packed.dtype == torch.uint8, "bytes", f"{where}: occupied")
     if packed.ndim != 1 or len(packed) != -(-(resolution**3) // 8):
         raise FormatError(
             f"{where}: occupied: expected {resolution**3} bits, got {brief(list(packed.shape))}"
@@ -210,7 +245,7 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
 
 
 def _restore_proposals(content: dict[str, Any], where: str) -> ProposalSampler:
-    _check_kinds(content, {"near": float, "state": dict}, where)
+    check_kinds(content, {"near": float, "state": dict}, where)
     if not 0 <= content["near"] < FAR:
         raise FormatError(f"{where}: near: expected 0 to {FAR}, got {content['near']}")
     sampler = ProposalSampler(content["near"])
@@ -228,17 +263,3 @@ def _restore(module: nn.Module, state: dict[str, Any], where: str) -> None:
     for name, tensor in module.state_dict().items():
         if not torch.isfinite(tensor).all():
             raise FormatError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
-
-
-def _check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> None:
-    if not fits or tensor.layout is not torch.strided:
-        got = f"{tensor.dtype}, {tensor.layout}".replace("torch.", "")
-        raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
-
-
-def _check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
-    for key, kind in kinds.items():
-        if not isinstance(content.get(key), kind):
-            raise FormatError(
-                f"{where}: {key}: expected {kind.__name__}, got {type(content.get(key)).__name__}"
-            )

@@ -1,4 +1,4 @@
-"""Random pixels of the training pictures as rays with their colours."""
+"""Random pixels of the training pictures, all but the witnesses, as rays with their colours."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.witnesses import Witnesses
 
 
 @dataclass(frozen=True)
@@ -63,18 +64,28 @@ class Pixels(NamedTuple):
 
 
 class PixelSampler:
-    """Draws pixels uniformly from all pixels of all training pictures.
+    """Draws pixels uniformly from all pixels of all training pictures that are no witnesses.
 
     In numpy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
     the step itself.
     """
 
-    def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        self._pixels, self._generator = Pixels.of(views), generator
+    def __init__(
+        self, views: PosedImages, generator: torch.Generator, witnesses: Witnesses | None = None
+    ) -> None:
+        """`witnesses`: of `views`; with None all pixels are drawn."""
+        learned = range(len(views.cameras)) if witnesses is None else witnesses.learned()
+        self._pixels, self._generator = Pixels.of(views.some(learned)), generator
+        kept = np.zeros(0, np.int64) if witnesses is None else _single_pixels(witnesses, self._pixels.starts)
+        self._n_drawn = len(self._pixels.rgba) - len(kept)
+        self._n_before: Any = kept - np.arange(len(kept))
+        """[n_single] int64, ascending: the number of pixels that are drawn before each single witness."""
 
     def draw(self, n_rays: int) -> RayBatch:
+        """`n_rays` pixels, with replacement."""
         pixels = self._pixels
-        index = torch.randint(len(pixels.rgba), (n_rays,), generator=self._generator).numpy()
+        index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator).numpy()
+        index += np.searchsorted(self._n_before, index, side="right")
         view = np.searchsorted(pixels.ends, index, side="right")
         row, column = np.divmod(index - pixels.starts[view], pixels.widths[view])
         rays_d = pixels.directions(view, row.astype(np.float32), column.astype(np.float32))
@@ -89,13 +100,17 @@ class PixelSampler:
 class DevicePixelSampler(PixelSampler):
     """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
 
-    def __init__(self, views: PosedImages, generator: torch.Generator) -> None:
-        super().__init__(views, generator)
+    def __init__(
+        self, views: PosedImages, generator: torch.Generator, witnesses: Witnesses | None = None
+    ) -> None:
+        super().__init__(views, generator, witnesses)
         self._pixels = Pixels(*(torch.from_numpy(array).to(generator.device) for array in self._pixels))
+        self._n_before = torch.from_numpy(self._n_before).to(generator.device)
 
     def draw(self, n_rays: int) -> RayBatch:
         pixels, device = self._pixels, self._generator.device
-        index = torch.randint(len(pixels.rgba), (n_rays,), generator=self._generator, device=device)
+        index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator, device=device)
+        index += torch.searchsorted(self._n_before, index, right=True)
         view = torch.searchsorted(pixels.ends, index, right=True)
         inside, width = index - pixels.starts[view], pixels.widths[view]
         rays_d = pixels.directions(view, inside // width, inside % width)
@@ -104,3 +119,13 @@ class DevicePixelSampler(PixelSampler):
             rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
             rgba=pixels.rgba[index] * (1 / 255),
         )
+
+
+def _single_pixels(witnesses: Witnesses, starts: np.ndarray) -> np.ndarray:
+    """[n_single] int64, ascending: the single witnesses among all pixels of the learned views, of which each
+    begins at `starts` [n_learned]."""
+    first = np.full(len(witnesses.counts), -1)
+    first[witnesses.learned()] = starts
+    of_view = first[witnesses.views()]
+    single = of_view >= 0
+    return of_view[single] + witnesses.pixels[single]

@@ -90,6 +90,22 @@ def _check_archive(file: BinaryIO, path: Path, what: str) -> None:
         raise FormatError(f"{path}: not {what}: expected plain tensors and values, got {brief(unknown[0])}")
 
 
+def check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> None:
+    """Raises FormatError unless `tensor` `fits` and is dense; `numbers` are what it should hold, in words."""
+    if not fits or tensor.layout is not torch.strided:
+        got = f"{tensor.dtype}, {tensor.layout}".replace("torch.", "")
+        raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
+
+
+def check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
+    """Raises FormatError unless the value of each key of `kinds` in `content` is of that kind."""
+    for key, kind in kinds.items():
+        if not isinstance(content.get(key), kind):
+            raise FormatError(
+                f"{where}: {key}: expected {kind.__name__}, got {type(content.get(key)).__name__}"
+            )
+
+
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
     """Every tensor in plain values, once, however often it is referred to."""
     left, seen = [content], set()

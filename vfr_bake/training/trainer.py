@@ -14,6 +14,7 @@ from torch import Tensor
 from player.errors import ConfigError, TrainingError
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
@@ -34,6 +35,7 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
+from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 MINUTES = {False: 9.4, True: 12.0}
 """Training time on a CPU by whether the scene is unbounded, where none is asked for."""
@@ -91,14 +93,14 @@ class Trainer:
         self.device = choose_device(config.device)
         self.pace = config.for_device(self.device.type, scene.unbounded)
         self.processes = processes or Processes(0, 1)
-        backend = backend or ("numba" if self.device.type == "cpu" else "torch")
-        if backend == "torch" and self.processes.size > 1:
+        self._backend: Backend = backend or ("numba" if self.device.type == "cpu" else "torch")
+        if self._backend == "torch" and self.processes.size > 1:
             raise ConfigError(
                 f"device: several processes: expected cpu, got {self.device.type}: pass --device cpu, or "
                 "start one process"
             )
         self._field = VfrField(config.field.resolved(scene.unbounded, self.device.type)).to(self.device)
-        self._field.grid.backend = backend
+        self._field.grid.backend = self._backend
         self.pilot = Pilot(self._field.config).to(self.device)
         self.n_bad_steps = 0
         # A GPU is done with its steps in minutes.
@@ -111,10 +113,11 @@ class Trainer:
         self._generator = torch.Generator(self.device).manual_seed(config.seed)
         # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
         self._random_background = scene.has_alpha or scene.unbounded
-        self._pixels: PixelSampler
+        self._views = scene.train
+        self._keep_apart(choose_witnesses(scene.train))
         self._guide: Guide
         self._grid_adam: TableAdam
-        if backend == "torch":
+        if self._backend == "torch":
             self._use_torch(scene)
         else:
             self._use_numba(scene)
@@ -125,7 +128,6 @@ class Trainer:
 
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
-        self._pixels = PixelSampler(scene.train, self._generator)
         if scene.unbounded:
             self._guide = ProposalGuide(self.config, self.pace, scene.near)
         else:
@@ -136,7 +138,6 @@ class Trainer:
 
     def _use_torch(self, scene: Scene) -> None:
         self._composite = composite_on_device
-        self._pixels = DevicePixelSampler(scene.train, self._generator)
         if scene.unbounded:
             self._guide = DeviceProposalGuide(self.config, self.pace, scene.near, self.device)
         else:
@@ -148,6 +149,13 @@ class Trainer:
             density.logits = torch.compile(density.logits, dynamic=True)  # type: ignore[method-assign]
             self._field.head.compile(dynamic=True)
             self.pilot.compile(dynamic=True)
+
+    def _keep_apart(self, witnesses: Witnesses) -> None:
+        """Draw every pixel of the training views but `witnesses` from now on."""
+        sampler = DevicePixelSampler if self._backend == "torch" else PixelSampler
+        self.witnesses = witnesses
+        """The pixels of the training views that no step learns from."""
+        self._pixels = sampler(self._views, self._generator, witnesses)
 
     def _step_length(self) -> float:
         return 2.0 * self.config.step_cells / self._field.config.max_resolution
@@ -300,6 +308,7 @@ class Trainer:
             "adam": self._adam.state_dict(),
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
+            "witnesses": witness_content(self.witnesses),
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
 
@@ -313,6 +322,7 @@ class Trainer:
         self._adam.load_state_dict(state["adam"])
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
+        self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
 
 
 def choose_device(name: str) -> torch.device:

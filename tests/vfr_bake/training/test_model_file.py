@@ -11,13 +11,15 @@ import pytest
 import torch
 
 from player.cameras.camera import Camera
-from player.errors import FormatError, VersionError
+from player.errors import ConfigError, FormatError, VersionError
 from vfr_bake.config import FieldConfig
+from vfr_bake.data.witnesses import N_WITNESSES, Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model, load_model, save_model
+from vfr_bake.training.witness_tensors import witness_content
 
 CONFIG = FieldConfig(n_levels=2, base_resolution=4, max_resolution=8, log2_table_size=10, head_width=8)
 
@@ -29,8 +31,16 @@ def model() -> Model:
     occupancy.set_occupied(np.random.default_rng(0).random((16, 16, 16)) < 0.5)
     world = np.diag([2.0, 2, 2, 1])
     world[:3, 3] = 1, 2, 3
-    camera = Camera("./train/r_0", np.eye(4), 8, 6, 9.0, 9.0, 4.0, 3.0)
-    return Model(VfrField(CONFIG), occupancy, world, [camera], True, {"steps": 3}, {"test_psnr": 30.0})
+    cameras = [Camera(f"./train/r_{i}", np.eye(4), 8, 6 + i, 9.0, 9.0, 4.0, 3.0 + i) for i in range(2)]
+    figures = {"test_psnr": 30.0}
+    return Model(VfrField(CONFIG), occupancy, world, cameras, True, {"steps": 3}, figures, some_witnesses())
+
+
+def some_witnesses() -> Witnesses:
+    rgba = np.arange(20, dtype=np.uint8).reshape(5, 4)
+    parts = [2, 3], [0, 47, 0, 1, 55]
+    counts, pixels = (np.array(part, np.int32) for part in parts)
+    return Witnesses(counts, pixels, rgba, np.array([1], np.int32))
 
 
 @pytest.fixture
@@ -48,14 +58,64 @@ def sampler(**values: object) -> dict:
     return whole | values
 
 
+def witnesses(**values: object) -> dict:
+    """Those of the model in tensors, some replaced; a list stands for 32-bit integers, or floats."""
+    whole = {"counts": [2, 3], "pixels": [0, 47, 0, 1, 55], "whole": [1]} | values
+    tensors = {name: torch.tensor(value) for name, value in whole.items() if isinstance(value, list)}
+    tensors = {name: value.int() if value.dtype == torch.int64 else value for name, value in tensors.items()}
+    return {"rgba": torch.zeros(5, 4, dtype=torch.uint8)} | whole | tensors
+
+
 def test_round_trip(model: Model, saved: Path) -> None:
     again = load_model(saved)
     for name, tensor in model.field.state_dict().items():
         assert torch.equal(tensor, again.field.state_dict()[name])
     assert np.array_equal(model.occupancy.occupied, again.occupancy.occupied)
     assert np.array_equal(model.world_from_model, again.world_from_model)
-    assert [c.name for c in again.cameras] == ["./train/r_0"] and again.cameras[0].fx == 9
+    assert [c.name for c in again.cameras] == ["./train/r_0", "./train/r_1"] and again.cameras[0].fx == 9
+    assert again.witnesses is not None and model.witnesses is not None
+    for name in ("counts", "pixels", "rgba", "whole"):
+        one, other = getattr(model.witnesses, name), getattr(again.witnesses, name)
+        assert np.array_equal(one, other) and one.dtype == other.dtype
     assert (again.train, again.figures, again.occupancy.step) == ({"steps": 3}, {"test_psnr": 30.0}, 0.01)
+
+
+def test_a_model_of_before_there_were_witnesses_still_loads(saved: Path) -> None:
+    content = torch.load(saved, weights_only=True)
+    del content["witnesses"]
+    torch.save(content | {"version": [2, 0]}, saved)
+    again = load_model(saved)
+    assert again.witnesses is None and len(again.model_cameras()) == 2
+    with pytest.raises(ConfigError, match="witnesses: expected some, got none"):
+        again.witness_rays()
+
+
+def test_as_many_witnesses_as_there_may_be_take_less_than_500_kb(model: Model, tmp_path: Path) -> None:
+    camera = Camera("large", np.eye(4), 1000, 1000, 900.0, 900.0, 500.0, 500.0)
+    counts, pixels = np.array([N_WITNESSES, 0], np.int32), np.arange(N_WITNESSES, dtype=np.int32)
+    many = Witnesses(counts, pixels, np.zeros((N_WITNESSES, 4), np.uint8), np.zeros(0, np.int32))
+    sizes = []
+    for witnesses in (many, None):
+        save_model(tmp_path / "m.pt", replace(model, cameras=[camera] * 2, witnesses=witnesses))
+        assert (load_model(tmp_path / "m.pt").witnesses is None) == (witnesses is None)
+        sizes.append((tmp_path / "m.pt").stat().st_size)
+    assert 0 < sizes[0] - sizes[1] < 500_000
+    content = torch.load(tmp_path / "m.pt", weights_only=True)
+    more = {"pixels": torch.arange(N_WITNESSES + 1, dtype=torch.int32)}
+    torch.save(content | {"witnesses": witness_content(many) | more}, tmp_path / "m.pt")
+    with pytest.raises(FormatError, match="pixels: expected at most 60,000, got 60,001"):
+        load_model(tmp_path / "m.pt")
+
+
+def test_rays_of_witnesses_are_those_of_their_pixels(model: Model) -> None:
+    """And the cameras that were learned from are those of the views that are not whole."""
+    rays = [camera.transformed(np.linalg.inv(model.world_from_model)).rays() for camera in model.cameras]
+    views, pixels = [0, 0, 1, 1, 1], [0, 47, 0, 1, 55]
+    for k, found in enumerate(model.witness_rays()):
+        assert np.array_equal(
+            found, [rays[view][k][pixel] for view, pixel in zip(views, pixels, strict=True)]
+        )
+    assert [camera.name for camera in model.model_cameras()] == ["./train/r_0"]
 
 
 def test_what_lies_behind_surroundings_is_their_mean_colour(model: Model) -> None:
@@ -69,7 +129,7 @@ def test_what_lies_behind_surroundings_is_their_mean_colour(model: Model) -> Non
     camera = Camera("a", np.eye(4), 48, 24, 12.0, 12.0, 24.0, 12.0)
     surroundings = replace(
         model, field=field, sampler=ProposalSampler(0.1), world_from_model=np.eye(4), cameras=[camera] * 40,
-        has_alpha=False,
+        has_alpha=False, witnesses=None,
     )  # fmt: skip
     picture = render_image(field, surroundings.sampler, camera, np.ones(3))
     assert np.ptp(picture, axis=(0, 1)).max() > 0.01 and np.ptp(picture.mean(axis=(0, 1))) > 0.01
@@ -124,6 +184,22 @@ def test_cut_short(saved: Path, share: float) -> None:
         ({"world_from_model": torch.zeros(3, 3)}, "world_from_model: expected 4 x 4"),
         ({"cameras": "{}"}, "cameras: frames"),
         ({"state": {}}, "the tensors do not fit"),
+        ({"witnesses": None}, "witnesses: expected dict, got NoneType"),
+        ({"witnesses": {}}, "witnesses: counts: expected Tensor, got NoneType"),
+        ({"witnesses": witnesses(counts=[2.0, 3.0])}, "counts: expected a plain tensor of 32-bit integers"),
+        ({"witnesses": witnesses(counts=[5])}, r"counts: expected \[2\], got \[1\]"),
+        ({"witnesses": witnesses(counts=[6, -1])}, "counts: expected 5 pixels of 2 views"),
+        ({"witnesses": witnesses(counts=[2**31 - 1, 2**31 - 1])}, "counts: expected 5 pixels of 2 views"),
+        ({"witnesses": witnesses(pixels=[0, 48, 0, 1, 55])}, "pixels: expected ascending ones inside"),
+        ({"witnesses": witnesses(pixels=[-1, 47, 0, 1, 55])}, "pixels: expected ascending ones inside"),
+        ({"witnesses": witnesses(pixels=[0, 47, 0, 1, 56])}, "pixels: expected ascending ones inside"),
+        ({"witnesses": witnesses(pixels=[0, 47, 1, 1, 55])}, "pixels: expected ascending ones inside"),
+        ({"witnesses": witnesses(rgba=torch.zeros(5, 3, dtype=torch.uint8))}, r"rgba: expected \[5, 4\]"),
+        ({"witnesses": witnesses(rgba=torch.zeros(5, 4))}, "rgba: expected a plain tensor of bytes"),
+        ({"witnesses": witnesses(whole=[2])}, "whole: expected ascending numbers of some of 2 views"),
+        ({"witnesses": witnesses(whole=[-1])}, "whole: expected ascending numbers"),
+        ({"witnesses": witnesses(whole=[0, 1])}, "whole: expected ascending numbers"),
+        ({"witnesses": witnesses(whole=[[0]])}, "whole: expected ascending numbers"),
     ],
 )
 def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:

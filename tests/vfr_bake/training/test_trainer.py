@@ -13,12 +13,14 @@ import pytest
 import torch
 
 from player.errors import ConfigError, FormatError, TrainingError
-from vfr_bake.config import FieldOptions, TrainConfig
+from vfr_bake.config import FieldOptions, SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.model_file import trained_model
+from vfr_bake.training.rays import RayBatch
 from vfr_bake.training.trainer import Trainer, scale_near_gradients
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
@@ -137,6 +139,60 @@ def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(kind: str, tmp
     assert [report.loss for report in again.run()] == losses[18:]
     for name, tensor in whole.field.state_dict().items():
         assert torch.equal(tensor, again.field.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize("kind", ["object", "unbounded", "downscale", "opaque"])
+def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every picture's pixels carry their number, and what the steps were given is looked through."""
+    capture = demo_capture(size=48, n_train=20, n_test=2)
+    unbounded_kind: SceneKind = "unbounded" if kind == "unbounded" else "object"
+    scene = build_scene(capture, unbounded_kind, 2 if kind == "downscale" else 1)
+    side = scene.train.images[0].shape[0]
+    numbers = np.arange(20 * side * side).reshape(20, side, side)
+    alpha = np.full_like(numbers, 255 if kind == "opaque" else 200)
+    images = np.stack([numbers % 256, numbers // 256 % 256, numbers // 65536, alpha], axis=-1)
+    train = type(scene.train)(scene.train.cameras, list(images.astype(np.uint8)))
+    trainer = Trainer(
+        replace(scene, train=train, has_alpha=kind != "opaque"),
+        config(steps=12, pilot_steps=6, batch_rays=256, batch_samples=4096),
+        backend=backend,
+    )
+    drawn: list[np.ndarray] = []
+    draw = trainer._pixels.draw
+
+    def spy(n_rays: int) -> RayBatch:
+        batch = draw(n_rays)
+        rgb = (batch.rgba[:, :3] * 255).round().long().numpy()
+        drawn.append(rgb @ np.array([1, 256, 65536]))
+        return batch
+
+    monkeypatch.setattr(trainer._pixels, "draw", spy)
+    for _ in trainer.run():
+        pass
+    found = np.concatenate(drawn)
+    assert len(drawn) == 12 and len(found) > 300
+    witnesses = trainer.witnesses
+    kept = witnesses.views() * side * side + witnesses.pixels
+    assert len(kept) > side * side and not np.isin(found, kept).any()
+    assert witnesses.whole.tolist() == [10] and not (found // side**2 == 10).any()
+
+
+def test_a_run_goes_on_with_the_witnesses_that_it_began_with(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where another version would choose others: what was learned from cannot be a witness any more."""
+    trainer = Trainer(scene, config(steps=3))
+    save_checkpoint(tmp_path / "c", trainer)
+    monkeypatch.setattr("vfr_bake.data.witnesses.SEED", 21)
+    again = Trainer(scene, config(steps=9))
+    assert not np.array_equal(trainer.witnesses.pixels, again.witnesses.pixels)
+    load_checkpoint(tmp_path / "c", again)
+    assert np.array_equal(trainer.witnesses.pixels, again.witnesses.pixels)
+    drawn = [each._draw(3000).rgba for each in (trainer, again)]
+    assert torch.equal(*drawn)
+    model = trained_model(again, scene, {})
+    assert model.witnesses is again.witnesses and len(model.model_cameras()) == 19
 
 
 def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:
