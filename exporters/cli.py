@@ -115,8 +115,8 @@ def make_parser() -> argparse.ArgumentParser:
     faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
     value("--faces", "N", "simplify the mesh to N faces, or as few as can be reached", type=faces)
     value("--lods", "N", "levels of detail: N files, each of half the faces of the last", type=lods)
-    methods = ("density", "tsdf")
-    add("--method", choices=methods, help="make the surface again: marching cubes, or fused depth")
+    methods = ("baked", "density", "tsdf")
+    add("--method", choices=methods, help="the baked mesh; marching cubes in all voxels; fused depth")
     density, seconds = number("a density", "12.5"), number("seconds", "300")
     value("--level", "X", "density of the surface, 1/model unit (half opaque: two steps)", type=density)
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
@@ -180,7 +180,8 @@ def _sentence(summary: dict[str, Any]) -> str:
         parts.append(f"{level['file']} of {level['faces']} faces")
     if "method" in summary:
         parts.append(
-            f"{summary['unseen_faces_removed']} faces that no training camera sees and "
+            f"{summary['unseen_faces_removed']} faces that no training camera sees, "
+            f"{summary['haze_faces_removed']} of haze and "
             f"{summary['floaters_removed']} floating parts ({summary['floater_faces_removed']} faces) removed"
         )
     if "removed" in summary:

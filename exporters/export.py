@@ -57,7 +57,8 @@ def export_asset(
         JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
         in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
         `faces_asked`, `texture` (its size), `lods` (`file`, `faces`, `bytes` of each), and of a surface that
-        was made again `method`, `unseen_faces_removed`, `floaters_removed`, `floater_faces_removed`;
+        was made again `method`, `unseen_faces_removed`, `haze_faces_removed`, `floaters_removed`,
+        `floater_faces_removed`;
         `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit of the frame;
         `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
 

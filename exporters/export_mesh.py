@@ -22,6 +22,8 @@ from exporters.progress import Report
 from exporters.shapes.crop import crop_mesh, parse_crop
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import AssetSurface
+from exporters.surface.depth_views import FEW_PIXELS, SMALL_PIXELS
+from exporters.surface.few_faces import few_faces
 from player.asset.asset import Asset
 from player.files.files import write_together
 
@@ -58,7 +60,8 @@ def export_mesh(
         matrix: [4, 4] what takes the world to the coordinates of the file.
         report: called with (stage, done, of).
     """
-    surface = AssetSurface(asset, report)
+    is_few = options.method is None and options.level is None and options.texture is None
+    surface = AssetSurface(asset, report, FEW_PIXELS if is_few else SMALL_PIXELS)
     finest, facts = world_mesh(surface, options)
     n_faces = options.faces or (TEXTURE_FACES if options.texture is not None else None)
     if n_faces is not None:
@@ -89,16 +92,21 @@ def export_mesh(
 def world_mesh(surface: AssetSurface, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh in the world's coordinates, cropped, and what to say about it.
 
-    It is as baked, unless `method` or `level` asks for it to be made again: then it is white, and what is
-    said has a `method`.
+    `method` "baked" takes it as it lies in the asset. All others make it again, and then it is white, and
+    what is said has a `method`: by default with the faces of a grid of
+    `exporters.surface.few_faces.RESOLUTION`, with a method or a level with all that there are.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     facts: dict[str, Any] = {"frame": options.coordinates}
-    if options.method is None and options.level is None:
+    if options.method == "baked":
         mesh = ply.parse_ply(surface.asset.read("mesh.ply"), str(surface.asset.path("mesh.ply")))
     else:
-        is_fused = options.method == "tsdf"
-        mesh, removed = surface.from_depth() if is_fused else surface.from_density(options.level)
+        if options.method == "tsdf":
+            mesh, removed = surface.from_depth()
+        elif options.method is None and options.level is None:
+            mesh, removed = few_faces(surface)
+        else:
+            mesh, removed = surface.from_density(options.level)
         facts["method"] = options.method or "density"
         facts |= {f"{what}_removed": count for what, count in removed._asdict().items()}
     if box is not None:

@@ -9,7 +9,7 @@ from typing import Literal
 from player.errors import ConfigError
 
 Coordinates = Literal["world", "model", "gltf", "blender"]
-Method = Literal["density", "tsdf"]
+Method = Literal["baked", "density", "tsdf"]
 
 FORMATS = {
     ".ply": "binary PLY; colours are sRGB bytes. With --points N a point cloud instead of a mesh",
@@ -65,7 +65,8 @@ class ExportOptions:
     crop: str | None = None
     """The box to keep, as `exporters.shapes.crop` reads it; None keeps all."""
     method: Method | None = None
-    """Makes the surface again, by marching cubes on the density or from fused depth; None is as baked."""
+    """Where the surface is from: the asset's own small mesh, marching cubes on the density in all its voxels,
+    or fused depth; None is marching cubes in fewer faces."""
     level: float | None = None
     """Density of the surface, 1/model unit; given, the surface is made again."""
     faces: int | None = None
@@ -159,8 +160,8 @@ def _check_ranges(options: ExportOptions) -> None:
         raise ConfigError(f"--time-limit: expected seconds > 0, got {options.time_limit:g}")
     if options.time_limit is not None and options.texture is None:
         raise ConfigError("--time-limit: expected it with --texture, got it alone")
-    if options.level is not None and options.method == "tsdf":
-        raise ConfigError("--level: expected --method density, got tsdf, which has no level")
+    if options.level is not None and options.method not in (None, "density"):
+        raise ConfigError(f"--level: expected --method density, got {options.method}, which has no level")
 
 
 def kind_name(name: str, kind: str) -> str:

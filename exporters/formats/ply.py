@@ -1,17 +1,20 @@
 """PLY, binary little endian: the mesh inside an asset, and the format that every mesh program reads.
 
 Vertex: x y z nx ny nz float, red green blue alpha uchar (sRGB; the names are what makes Blender and MeshLab
-show the colour). Face: a list of three int. `read_ply` reads this layout alone, and accounts for every byte.
+show the colour). Face: a list of three int. The mesh inside an asset has no normals and no alpha: readers
+make normals of the faces, and 13 of 28 bytes a vertex are saved. `read_ply` reads these two layouts alone,
+and accounts for every byte.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.mesh import TriangleMesh, unit_normals
 from player.errors import FormatError, IntegrityError, VfrError
 from player.files.files import read_bytes
 
@@ -19,6 +22,8 @@ MAX_BYTES = 4 << 30
 """A hundred million faces. What an asset's mesh may take is compared with its budget when it is opened."""
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 4)])
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
+
+SMALL_VERTEX = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
 
 HEADER = """\
 ply
@@ -38,7 +43,14 @@ element face {n_faces}
 property list uchar int vertex_indices
 end_header
 """
-_PATTERN = re.compile(HEADER.format(n_vertices="(0|[1-9][0-9]{0,9})", n_faces="(0|[1-9][0-9]{0,9})").encode())
+SMALL_HEADER = "".join(
+    line for line in HEADER.splitlines(True) if line.split()[-1] not in ("nx", "ny", "nz", "alpha")
+)
+_NUMBER = "(0|[1-9][0-9]{0,9})"
+_PATTERNS = [
+    (vertex, re.compile(header.format(n_vertices=_NUMBER, n_faces=_NUMBER).encode()))
+    for vertex, header in ((VERTEX, HEADER), (SMALL_VERTEX, SMALL_HEADER))
+]
 
 
 def ply_bytes(mesh: TriangleMesh) -> bytes:
@@ -49,11 +61,33 @@ def ply_bytes(mesh: TriangleMesh) -> bytes:
     >>> ply_bytes(mesh).startswith(b"ply")
     True
     """
-    vertices = vertex_rows(mesh)
-    faces = np.empty(len(mesh.faces), FACE)
-    faces["n"], faces["corners"] = 3, mesh.faces
-    header = HEADER.format(n_vertices=len(vertices), n_faces=len(faces)).encode()
-    return header + vertices.tobytes() + faces.tobytes()
+    return _file(HEADER, vertex_rows(mesh), mesh.faces)
+
+
+def small_ply_bytes(mesh: TriangleMesh) -> bytes:
+    """The content of an asset's `mesh.ply`, which has no normals and no alpha.
+
+    >>> corners = np.zeros((4, 3))
+    >>> up = np.tile([0.0, 0, 1], (4, 1))
+    >>> mesh = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, np.full((4, 4), 255, np.uint8))
+    >>> len(small_ply_bytes(mesh)) == small_ply_size(4, 1), len(ply_bytes(mesh)) > small_ply_size(4, 1)
+    (True, True)
+    """
+    rows = np.empty(len(mesh.vertices), SMALL_VERTEX)
+    rows["position"], rows["colour"] = mesh.vertices, mesh.colours[:, :3]
+    return _file(SMALL_HEADER, rows, mesh.faces)
+
+
+def small_ply_size(n_vertices: int, n_faces: int) -> int:
+    """Bytes of `small_ply_bytes`."""
+    header = len(SMALL_HEADER.format(n_vertices=n_vertices, n_faces=n_faces))
+    return header + n_vertices * SMALL_VERTEX.itemsize + n_faces * FACE.itemsize
+
+
+def _file(header: str, rows: np.ndarray, corners: np.ndarray) -> bytes:
+    faces = np.empty(len(corners), FACE)
+    faces["n"], faces["corners"] = 3, corners
+    return header.format(n_vertices=len(rows), n_faces=len(faces)).encode() + rows.tobytes() + faces.tobytes()
 
 
 def vertex_rows(mesh: TriangleMesh) -> np.ndarray:
@@ -64,7 +98,8 @@ def vertex_rows(mesh: TriangleMesh) -> np.ndarray:
 
 
 def read_ply(path: Path) -> TriangleMesh:
-    """The mesh in a file that `ply_bytes` wrote.
+    """The mesh in a file that `ply_bytes` or `small_ply_bytes` wrote. Without normals it gets those of its
+    faces, by area.
 
     Raises:
         FormatError: the file cannot be read, its header is another one, or its content is not a mesh.
@@ -75,28 +110,32 @@ def read_ply(path: Path) -> TriangleMesh:
 
 def parse_ply(data: bytes, where: str) -> TriangleMesh:
     """The mesh in `data`; `where` names it in an error message."""
-    match = _PATTERN.match(data)
+    matches = ((vertex, pattern.match(data)) for vertex, pattern in _PATTERNS)
+    vertex, match = next((found for found in matches if found[1]), (VERTEX, None))
     if match is None:
         raise FormatError(
             f"{where}: header: expected a binary PLY as `vfr-bake` writes it, got {bytes(data[:40])!r}"
         )
     n_vertices, n_faces = int(match[1]), int(match[2])
     body = match.end()
-    expected = body + n_vertices * VERTEX.itemsize + n_faces * FACE.itemsize
+    expected = body + n_vertices * vertex.itemsize + n_faces * FACE.itemsize
     if len(data) != expected:
         raise IntegrityError(f"{where}: size: expected {expected} bytes, got {len(data)}")
-    vertices = np.frombuffer(data, VERTEX, n_vertices, body)
-    faces = np.frombuffer(data, FACE, n_faces, body + n_vertices * VERTEX.itemsize)
+    vertices = np.frombuffer(data, vertex, n_vertices, body)
+    faces = np.frombuffer(data, FACE, n_faces, body + n_vertices * vertex.itemsize)
     if (faces["n"] != 3).any():
         raise FormatError(
             f"{where}: faces: expected triangles, got a face of {faces['n'][faces['n'] != 3][0]} corners"
         )
+    positions = np.ascontiguousarray(vertices["position"], np.float32)
+    corners = np.ascontiguousarray(faces["corners"], np.int32)
     try:
-        return TriangleMesh(
-            np.ascontiguousarray(vertices["position"], np.float32),
-            np.ascontiguousarray(faces["corners"], np.int32),
-            np.ascontiguousarray(vertices["normal"], np.float32),
-            np.ascontiguousarray(vertices["colour"]),
-        )
+        if vertex is VERTEX:
+            normals = np.ascontiguousarray(vertices["normal"], np.float32)
+            return TriangleMesh(positions, corners, normals, np.ascontiguousarray(vertices["colour"]))
+        colours = np.pad(vertices["colour"], ((0, 0), (0, 1)), constant_values=255)
+        up = np.tile(np.array([0, 0, 1], np.float32), (len(positions), 1))
+        flat = TriangleMesh(positions, corners, up, colours)  # checks what normals are then made of
+        return replace(flat, normals=unit_normals(np.zeros(positions.shape), positions, corners))
     except VfrError as error:
         raise FormatError(f"{where}: {error}") from error

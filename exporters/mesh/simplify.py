@@ -52,8 +52,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     source.vertex_normals = open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.normals, np.float64))
     source.vertex_colors = open3d.utility.Vector3dVector(mesh.colours[:, :3] / 255)
     if len(mesh.faces) > 2 * FIRST * n_faces:
-        a, b = mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]]
-        edge = float(np.linalg.norm(b - a, axis=1).mean())
+        edge = mean_edge(mesh.vertices, mesh.faces)
         average = open3d.geometry.SimplificationContraction.Average
         source = source.simplify_vertex_clustering(
             edge * (len(mesh.faces) / (FIRST * n_faces)) ** 0.5, average
@@ -71,6 +70,36 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     colours[:, 3] = _alpha(mesh, vertices)
     normals = unit_normals(np.asarray(result.vertex_normals)[used], vertices, faces, 1e-6)
     return TriangleMesh(vertices, faces, normals, colours)
+
+
+def clustered(vertices: np.ndarray, faces: np.ndarray, cube: float) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with all vertices in the same cube made one, at their mean.
+
+    Args:
+        vertices: [n_vertices, 3] float64.
+        faces: [n_faces, 3] int32.
+        cube: edge of the cubes, in the vertices' unit.
+
+    Returns:
+        Vertices [m, 3] float64, and the faces [k, 3] int32 that still have three corners.
+
+    Raises MissingExtraError: Open3D is not installed.
+    """
+    open3d = require_open3d("the mesh")
+    source = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(np.ascontiguousarray(vertices, np.float64)),
+        open3d.utility.Vector3iVector(np.ascontiguousarray(faces, np.int32)),
+    )
+    average = open3d.geometry.SimplificationContraction.Average
+    result = source.simplify_vertex_clustering(cube, average)
+    few = np.asarray(result.triangles, np.int32).reshape(-1, 3)
+    used, numbers = np.unique(few[has_three_corners(few)], return_inverse=True)
+    return np.asarray(result.vertices)[used], numbers.reshape(-1, 3).astype(np.int32)
+
+
+def mean_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Mean length of the first edge of each face."""
+    return float(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1).mean())
 
 
 def _alpha(mesh: TriangleMesh, vertices: np.ndarray) -> np.ndarray:

@@ -18,14 +18,15 @@ from exporters.shapes.mesh import Surface, TriangleMesh, take_faces
 from exporters.surface.components import remove_small_components
 from exporters.surface.depth_views import (
     FULL_PIXELS,
+    MAX_VIEWS,
     SMALL_PIXELS,
     TOLERANCE,
     DepthView,
     depth_views,
-    seen_vertices,
+    sightings,
 )
 from exporters.surface.fitted_colours import fit_colours
-from exporters.surface.marching_cubes import extract_asset_surface, voxel_size
+from exporters.surface.marching_cubes import cut_surface, settled, voxel_size
 from exporters.surface.shaded_colours import surface_colours
 from exporters.surface.tsdf import fuse_depth
 from player.asset.asset import Asset
@@ -37,12 +38,18 @@ FLOATER_FRACTION = 1e-4
 FIT_TOLERANCE = 3.0
 """Voxels between a pixel's depth and the mesh at which the pixel's colour still counts for it."""
 
+SOLID_SHARE = 0.25
+"""A corner is haze where less than this share of the views that see it show something solid there. On good
+models hardly anything is between 0 and a half (lego: 0.3 % of the faces)."""
+
 
 class Removed(NamedTuple):
     """What cleaning took away."""
 
     unseen_faces: int
     """Faces that no training camera sees."""
+    haze_faces: int
+    """Faces that training cameras see through: what they show is behind them, or nothing solid."""
     floaters: int
     """Parts that were too small."""
     floater_faces: int
@@ -53,11 +60,15 @@ class AssetSurface:
     """Meshes of an asset's surface, in the world. The training cameras are played once, when somebody first
     asks what they see."""
 
-    def __init__(self, asset: Asset, report: Report, max_pixels: int = SMALL_PIXELS) -> None:
+    def __init__(
+        self, asset: Asset, report: Report, max_pixels: int = SMALL_PIXELS, max_views: int = MAX_VIEWS
+    ) -> None:
         self.asset = asset
         self.report = report
         self.max_pixels = max_pixels
         """Pixels of each view that is played, at most."""
+        self.max_views = max_views
+        """Views that are played, at most."""
 
     @cached_property
     def views(self) -> list[DepthView]:
@@ -69,25 +80,23 @@ class AssetSurface:
         """Edge of the asset's voxels, world units."""
         return voxel_size(self.asset.grid) * self.asset.scale
 
-    def from_density(self, level: float | None = None, stride: int = 1) -> tuple[TriangleMesh, Removed]:
+    def from_density(self, level: float | None = None) -> tuple[TriangleMesh, Removed]:
         """The surface by marching cubes on the asset's density, white, and what was removed of it.
 
         Args:
-            level: density of the surface, 1/model unit.
-            stride: see `exporters.surface.marching_cubes.extract_asset_surface`, which has the defaults.
+            level: density of the surface, 1/model unit; `exporters.surface.marching_cubes` has the default.
 
         Raises:
             ConfigError: a level outside the data.
             DataError: there is no surface, or nothing of it is seen.
             MissingExtraError: scikit-image or scipy is not installed.
         """
-        surface = extract_asset_surface(
-            self.asset.grid, level, lambda share: self.report("surface", round(share * 100), 100), stride
-        )
-        matrix = self.asset.world_from_model
-        vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        normals = surface.normals @ matrix[:3, :3].T / self.asset.scale
-        return self._cleaned(Surface(vertices, surface.faces, normals))
+        grid = self.asset.grid
+        return self.cleaned(settled(grid, cut_surface(grid, level, self.on_cut)))
+
+    def on_cut(self, share: float) -> None:
+        """Report that this share of the grid has been cut."""
+        self.report("surface", round(share * 100), 100)
 
     def from_depth(self) -> tuple[TriangleMesh, Removed]:
         """The surface that the training cameras' pictures of depth agree on, white, and what was removed of
@@ -98,7 +107,7 @@ class AssetSurface:
             MissingExtraError: Open3D or scipy is not installed.
         """
         views = self._played(FULL_PIXELS)
-        return self._cleaned(fuse_depth(views, self.voxel, partial(self.report, "fusion")))
+        return self._in_world(fuse_depth(views, self.voxel, partial(self.report, "fusion")))
 
     def shaded(self, points: np.ndarray, normals: np.ndarray) -> KnownColours:
         """What the asset's head says of points [n, 3] on the surface with unit normals [n, 3]
@@ -121,41 +130,64 @@ class AssetSurface:
         return replace(mesh, colours=_from_around(colours, known, mesh.faces))
 
     def _played(self, max_pixels: int) -> list[DepthView]:
-        return depth_views(self.asset, max_pixels, partial(self.report, "views"))
+        return depth_views(self.asset, max_pixels, self.max_views, partial(self.report, "views"))
 
-    def _cleaned(self, surface: Surface) -> tuple[TriangleMesh, Removed]:
+    def cleaned(self, surface: Surface) -> tuple[TriangleMesh, Removed]:
+        """A surface (model frame) as a white mesh in the world, and what was removed of it."""
+        matrix = self.asset.world_from_model
+        vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        normals = surface.normals @ matrix[:3, :3].T / self.asset.scale
+        return self._in_world(Surface(vertices, surface.faces, normals))
+
+    def _in_world(self, surface: Surface) -> tuple[TriangleMesh, Removed]:
         white = np.full((len(surface.vertices), 4), 255, np.uint8)
         return cleaned(TriangleMesh(*surface, white), self.views, TOLERANCE * self.voxel)
 
 
 def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tuple[TriangleMesh, Removed]:
-    """A mesh (world frame) without the faces that no view sees and without floaters, and what went.
+    """A mesh (world frame) without the faces that no view sees, without haze and without floaters, and what
+    went.
 
     A face is seen if a corner of it is: by a view that has nothing before it (`tolerance`: see
-    `exporters.surface.depth_views.seen_vertices`), or because a pixel hits a face there. The second keeps
-    what fills a hole, from whichever side it is seen; it needs Open3D, and where that is not to be had, it
-    goes.
+    `exporters.surface.depth_views.sightings`), or because a pixel hits a face there. The second keeps what
+    fills a hole, from whichever side it is seen; it needs Open3D, and where that is not to be had, it goes.
+    A face that is seen is haze if no corner of it is solid for SOLID_SHARE of the views that see it; where
+    pixels alone see it, if none of them shows something at its depth or before.
 
-    Raises DataError: no face is seen.
+    Raises DataError: no face is seen, or all that is seen is haze.
     """
-    seen = seen_vertices(views, mesh.vertices, mesh.normals, tolerance)
+    found = sightings(views, mesh.vertices, mesh.normals, tolerance)
+    seen = found.seen > 0
+    solid = seen & (found.solid >= SOLID_SHARE * found.seen)
     with suppress(MissingExtraError):
-        seen |= _hit_vertices(mesh, views)
-    keep: np.ndarray = np.asarray(seen[mesh.faces].any(axis=1))
+        hit, hit_solid = _hit_vertices(mesh, views, tolerance)
+        solid |= hit_solid & ~seen
+        seen |= hit
+    is_seen, keep = (np.asarray(corners[mesh.faces].any(axis=1)) for corners in (seen, solid))
     if not keep.any():
-        raise DataError(f"surface: expected some of {len(keep)} faces in a training camera's view, got none")
+        what = "haze that is seen through" if is_seen.any() else "none"
+        raise DataError(
+            f"surface: expected some of {len(keep)} faces in a training camera's view, got {what}"
+        )
     part = mesh if keep.all() else take_faces(mesh, keep)
     whole, n_floaters = remove_small_components(part, FLOATER_FRACTION)
-    return whole, Removed(int((~keep).sum()), n_floaters, len(part.faces) - len(whole.faces))
+    n_unseen, n_gone = int((~is_seen).sum()), int((~keep).sum())
+    return whole, Removed(n_unseen, n_gone - n_unseen, n_floaters, len(part.faces) - len(whole.faces))
 
 
-def _hit_vertices(mesh: TriangleMesh, views: list[DepthView]) -> np.ndarray:
-    """[n_vertices] bool: corners of the faces that pixels of the views hit."""
+def _hit_vertices(
+    mesh: TriangleMesh, views: list[DepthView], tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the faces that pixels of the views hit, [n_vertices] bool, and of those that they hit no
+    farther than `tolerance` before what the pixel shows."""
     rays = MeshRays(mesh)
-    seen = np.zeros(len(mesh.vertices), bool)
+    seen, solid = np.zeros((2, len(mesh.vertices)), bool)
     for view in views:
-        seen[mesh.faces[rays.seen_by(view.camera).faces]] = True
-    return seen
+        hits = rays.seen_by(view.camera)
+        seen[mesh.faces[hits.faces]] = True
+        shown = hits.distance >= view.distance.reshape(-1)[hits.pixels] - tolerance
+        solid[mesh.faces[hits.faces[shown]]] = True
+    return seen, solid
 
 
 def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> np.ndarray:

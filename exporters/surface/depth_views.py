@@ -8,6 +8,7 @@ has there, plus a tolerance; where the picture is less than half opaque nothing 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from player.cameras.views import asset_cameras
 from player.render import Renderer
 
 MAX_VIEWS = 100
-"""The most views that are played; they are spread over all of the training cameras."""
+"""The most views that are played, unless fewer do; they are spread over all of the training cameras."""
 SMALL_PIXELS = 90_000
 """The most pixels of a view that is played to tell what is seen, and in which colour."""
+FEW_PIXELS = 22_500
+"""The same for a mesh in few faces, each as large as several of these pixels."""
 FULL_PIXELS = 1 << 18
 """The most pixels of a view that is played for its depth, which becomes a surface."""
 SOLID = 0.5
@@ -41,13 +44,15 @@ class DepthView:
     """[height, width, 3] uint8 sRGB, straight: not mixed with what is behind."""
 
 
-def depth_views(asset: Asset, max_pixels: int = SMALL_PIXELS, progress: Progress = silent) -> list[DepthView]:
-    """The training cameras' pictures, at most MAX_VIEWS of `max_pixels` each.
+def depth_views(
+    asset: Asset, max_pixels: int = SMALL_PIXELS, max_views: int = MAX_VIEWS, progress: Progress = silent
+) -> list[DepthView]:
+    """The training cameras' pictures, at most `max_views` of `max_pixels` each.
 
     Raises FormatError if the asset's cameras are damaged.
     """
     cameras = asset_cameras(asset)
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), max_views)).round().astype(int))
     views = []
     with Renderer(asset) as renderer:
         for index in chosen:
@@ -68,11 +73,55 @@ def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, to
         normals: [n, 3] unit, world frame.
         tolerance: how far behind the depth of the pixels around it a point may be, world units.
     """
-    camera = view.camera
+    result = np.zeros(len(points), np.float32)
+    at = _projected(view.camera, points, normals)
+    seen = at.distance <= _farthest_around(view.distance)[at.corners] + tolerance
+    result[at.points[seen]] = at.cosines[seen]
+    return result
+
+
+class Sightings(NamedTuple):
+    """How often views see points, and how often they show something there."""
+
+    seen: np.ndarray
+    """[n] int32, the views that have nothing before the point."""
+    solid: np.ndarray
+    """[n] int32, those of them whose picture is solid at the point's depth; the others see through it."""
+
+
+def sightings(views: list[DepthView], points: np.ndarray, normals: np.ndarray, tolerance: float) -> Sightings:
+    """How often views see each point; the arguments are those of `cosines_in_view`. A point is within
+    `tolerance` of what a picture shows if it is no farther than that before the nearest, and behind the
+    farthest, of the pixels around it."""
+    seen, solid = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for view in views:
+        at = _projected(view.camera, points, normals)
+        farthest = _farthest_around(view.distance)[at.corners]
+        nearest = -_farthest_around(-view.distance)[at.corners]
+        in_sight = at.distance <= farthest + tolerance
+        seen[at.points[in_sight]] += 1
+        shown = in_sight & np.isfinite(farthest) & (at.distance >= nearest - tolerance)
+        solid[at.points[shown]] += 1
+    return Sightings(seen, solid)
+
+
+class _Projected(NamedTuple):
+    """The points that face a camera and are inside its picture."""
+
+    points: np.ndarray
+    """[m] their numbers."""
+    distance: np.ndarray
+    """[m] from the camera, world units."""
+    cosines: np.ndarray
+    """[m] between their normals and the direction to the camera, above 0."""
+    corners: tuple[np.ndarray, np.ndarray]
+    """Row and column [m] of the corner of pixels that is nearest to where each is seen."""
+
+
+def _projected(camera: Camera, points: np.ndarray, normals: np.ndarray) -> _Projected:
     towards = camera.c2w[:3, 3] - points
     distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
     cosines = np.einsum("ij,ij->i", towards, normals) / np.maximum(distance, 1e-30)
-    result = np.zeros(len(points), np.float32)
     front = np.flatnonzero(cosines > 0)
     local = -towards[front] @ camera.c2w[:3, :3]
     depth = -local[:, 2]
@@ -81,32 +130,18 @@ def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, to
     row = camera.cy - camera.fy * local[:, 1] / ahead
     inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     front, column, row = front[inside], column[inside], row[inside]
-    left, top = np.floor(column - 0.5).astype(int), np.floor(row - 0.5).astype(int)
-    reach = _farthest_around(view.distance)[top + 1, left + 1]
-    seen = distance[front] <= reach + tolerance
-    result[front[seen]] = cosines[front[seen]]
-    return result
-
-
-def seen_vertices(
-    views: list[DepthView], points: np.ndarray, normals: np.ndarray, tolerance: float
-) -> np.ndarray:
-    """[n] bool: whether any view sees each point; the arguments are those of `cosines_in_view`."""
-    seen = np.zeros(len(points), bool)
-    for view in views:
-        rest = np.flatnonzero(~seen)
-        seen[rest] = cosines_in_view(view, points[rest], normals[rest], tolerance) > 0
-    return seen
+    corners = np.floor(row + 0.5).astype(int), np.floor(column + 0.5).astype(int)
+    return _Projected(front, distance[front], cosines[front], corners)
 
 
 def _farthest_around(distance: np.ndarray) -> np.ndarray:
     """[height + 1, width + 1] distances at the corners of pixels: the largest of the up to four pixels around
-    that hit something, so that nothing inside a solid is seen past its outline; else infinite."""
-    padded = np.pad(np.where(np.isfinite(distance), distance, np.float32(-1)), 1, constant_values=-1)
+    that are finite, so that nothing inside a solid is seen past its outline; infinite where none is."""
+    padded = np.pad(np.where(np.isfinite(distance), distance, -np.inf), 1, constant_values=-np.inf)
     farthest = np.maximum(
         np.maximum(padded[:-1, :-1], padded[1:, :-1]), np.maximum(padded[:-1, 1:], padded[1:, 1:])
     )
-    return np.where(farthest < 0, np.float32(np.inf), farthest)
+    return np.where(np.isfinite(farthest), farthest, np.float32(np.inf))
 
 
 def _small(camera: Camera, max_pixels: int) -> Camera:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,13 +38,26 @@ _REACH = 0.5  # the most voxels that a vertex is moved by
 _AT_ONCE = 1 << 18  # points looked at together
 
 
-def extract_asset_surface(
+class Cut(NamedTuple):
+    """A surface as marching cubes cuts it, before its corners are moved onto the level."""
+
+    g: np.ndarray
+    """[n_vertices, 3] float64, grid coordinates."""
+    faces: np.ndarray
+    """[n_faces, 3] int32, counter-clockwise seen from where the density is lower."""
+    code_level: float
+    """The level, as a density code."""
+    stride: int
+    """Voxels between the vertices of the grid that were looked at."""
+
+
+def cut_surface(
     grid: SparseGrid,
     level: float | None = None,
     progress: Callable[[float], object] = silent,
     stride: int = 1,
-) -> Surface:
-    """The surface where a grid's density equals `level`.
+) -> Cut:
+    """Where a grid's density equals `level`, roughly: `settled` makes the surface of it.
 
     Args:
         grid: the sparse grid, cubic voxels.
@@ -51,15 +65,11 @@ def extract_asset_surface(
             nothing is that dense.
         progress: called with the share done in (0, 1] after each block.
         stride: 2 looks at every second vertex along each axis only, and makes a quarter of the faces; a power
-            of two up to BLOCK. Vertices are on the level all the same.
-
-    Returns:
-        The surface in the model frame, its vertices on the level to a hundredth of a voxel where the density
-        has a slope there, its normals along the falling density.
+            of two up to BLOCK.
 
     Raises:
         ConfigError: a level outside the stored densities; the message has their range.
-        DataError: no live cell.
+        DataError: no live cell, or no surface in those that there are.
         MissingExtraError: scikit-image is not installed.
     """
     code_level = _code_level(grid, level)
@@ -76,9 +86,15 @@ def extract_asset_surface(
     if not n_corners:
         raise DataError("surface: expected a surface at this level, got none")
     g, triangles = _joined(np.concatenate(corners), np.concatenate(faces))
-    g = onto_level(grid, g * stride, code_level, stride)
+    return Cut(g * stride, triangles, code_level, stride)
+
+
+def settled(grid: SparseGrid, cut: Cut) -> Surface:
+    """The surface of a cut, in the model frame: its vertices on the level to a hundredth of a voxel where the
+    density has a slope there, its normals along the falling density."""
+    g = onto_level(grid, cut.g, cut.code_level, cut.stride)
     vertices = grid.aabb_min.astype(np.float64) + g / grid.cells_per_unit.astype(np.float64)
-    return Surface(vertices, triangles, _normals(grid, g, triangles, code_level))
+    return Surface(vertices, cut.faces, _normals(grid, g, cut.faces, cut.code_level))
 
 
 def voxel_size(grid: SparseGrid) -> float:

@@ -56,7 +56,7 @@ def asset(tmp_path: Path) -> Path:
 
 def test_writes_world_coordinates(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "mesh.ply"
-    assert cli.main([str(asset), str(target)]) == 0
+    assert cli.main([str(asset), str(target), "--method", "baked"]) == 0
     mesh = read_ply(target)
     assert np.array_equal(mesh.vertices, tetrahedron().vertices)
     assert target.read_bytes() == (asset / "mesh.ply").read_bytes()
@@ -70,7 +70,7 @@ def test_glb_is_y_up_and_json_is_one_line(
     asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "MESH.GLB"
-    assert cli.main([str(asset), str(target), "--json"]) == 0
+    assert cli.main([str(asset), str(target), "--method", "baked", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["file"] == str(target) and summary["format"] == "glb" and summary["faces"] == 4
     assert summary["bytes"] == target.stat().st_size
@@ -87,7 +87,7 @@ def test_existing_target(asset: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert target.read_text() == "mine"
     error = capsys.readouterr().err
     assert error == f"vfr-export: error: {target}: already exists: add --force to replace it\n"
-    assert cli.main([str(asset), str(target), "--force"]) == 0
+    assert cli.main([str(asset), str(target), "--method", "baked", "--force"]) == 0
     assert target.read_text().startswith("# vfr-bake")
 
 
@@ -113,7 +113,7 @@ def test_damaged_mesh_leaves_nothing_behind(
         (asset / "mesh.ply").write_bytes(data[:-1])
     elif damage == "changed":
         (asset / "mesh.ply").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    assert cli.main([str(asset), str(tmp_path / "mesh.glb")]) == 1
+    assert cli.main([str(asset), str(tmp_path / "mesh.glb"), "--method", "baked"]) == 1
     error = capsys.readouterr().err
     assert ("mesh.ply: sha256: expected" if damage == "changed" else "mesh.ply: size: expected") in error
     assert error.count("\n") == 1

@@ -37,7 +37,7 @@ def test_crop_and_what_it_prints(
 ) -> None:
     """A centre that begins with a minus too: argparse would take it for an option."""
     target = tmp_path / "part.ply"
-    arguments = [str(shells_asset), str(target), "--crop", "-8.5,2.375,3.5,20,4,4"]
+    arguments = [str(shells_asset), str(target), "--crop", "-8.5,2.375,3.5,20,4,4", "--method", "baked"]
     assert cli.main(arguments) == 0
     captured = capsys.readouterr()
     assert "the crop removed 83.3% of the faces" in captured.out  # the two triangles at x = 1.25 stay
@@ -51,14 +51,16 @@ def test_crop_and_what_it_prints(
 def test_crop_is_in_world_units_in_every_frame(shells_asset: Path, tmp_path: Path) -> None:
     for frame in ("world", "model", "gltf"):
         summary = export.export_asset(
-            shells_asset, tmp_path / f"{frame}.stl", ExportOptions(frame=frame, crop="0,2.375,3.5,3,4,4")
+            shells_asset,
+            tmp_path / f"{frame}.stl",
+            ExportOptions(frame=frame, crop="0,2.375,3.5,3,4,4", method="baked"),
         )
         assert summary["faces"] == 2 and summary["bounds"][1][0] == 1.25
 
 
 def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None:
     target = tmp_path / "mesh.bin"
-    assert cli.main([str(shells_asset), str(target), "--format", "stl"]) == 0
+    assert cli.main([str(shells_asset), str(target), "--format", "stl", "--method", "baked"]) == 0
     assert target.read_bytes().startswith(b"vfr-bake: binary STL")
 
 

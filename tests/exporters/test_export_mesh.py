@@ -47,7 +47,7 @@ def test_what_was_removed_is_said(
     arguments = [str(cube_asset.folder), str(target), "--method", "density"]
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
-    assert "faces that no training camera sees and 0 floating parts (0 faces) removed" in out
+    assert "faces that no training camera sees, 0 of haze and 0 floating parts (0 faces) removed" in out
     assert cli.main([*arguments, "--force", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["method"] == "density" and summary["unseen_faces_removed"] >= 0
@@ -104,6 +104,7 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
         ("a.ply --level 1e9", "--level: expected a density between"),
         ("a.ply --level 0", "--level: expected a density between"),
         ("a.ply --level 5 --method tsdf", "--level: expected --method density, got tsdf"),
+        ("a.ply --level 5 --method baked", "--level: expected --method density, got baked"),
         ("a.ply --level 20 --crop 90,9,9,1,1,1", "--crop: expected a box with some of the mesh in it"),
         ("a.ply --lods 1", "--lods: expected 2 to 10, got 1"),
         ("a.glb --texture 8", "--texture: expected 16 to 16384, got 8"),

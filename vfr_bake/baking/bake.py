@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from exporters.formats.ply import ply_bytes
+from exporters.formats.ply import small_ply_bytes
 from exporters.head.onnx_head import head_onnx
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
@@ -51,7 +51,7 @@ from vfr_bake.baking.limits import (
     keep_to_time,
     unwritten_asset,
 )
-from vfr_bake.baking.mesh import bake_mesh, mesh_size
+from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import REFINED_BY, make_plan
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
@@ -135,29 +135,28 @@ class _Bake:
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
         arrays = layout.arrays(stored.density, stored.features)
-        mesh, removed = self._mesh(layout, arrays, head)
-        if not len(mesh.faces):
-            self.left_out["mesh"] = "all of it: nowhere is the field dense enough for a surface"
-        elif layout.contracted:
-            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
-        figures = {
+        figures: dict[str, Any] = {
             "n_vertices": len(layout.densities),
             "n_feature_vertices": len(layout.features),
-            "mesh_faces": len(mesh.faces),
-            "mesh_floaters_removed": removed.floaters,
             "stages": self.held_out.table(),
         }
         missed: list[str] = []
 
         def finish(new: Path) -> dict[str, bytes]:
-            report = self._judge(new, folder.name)
+            """The mesh, which may take a part of the bytes that the other files take, and the report.
+            `figures` are in the manifest, which is written again after this."""
+            asset = Asset.open(new, verify=True)
+            mesh, removed = self._mesh(asset, file_sizes(new))
+            figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
+            data = small_ply_bytes(mesh)
+            report = self._judge(asset, file_sizes(new) | {"mesh.ply": len(data)}, folder.name)
             missed.extend(report.missed)
-            return {"report.json": report.json(), "report.html": report.html()}
+            return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
 
         with self._part("writing and checking"):
             manifest = self._manifest(layout, arrays, figures)
             cameras = write_cameras(self.model.cameras)
-            write_asset(folder, manifest, arrays, head, ply_bytes(mesh), cameras, force, finish)
+            write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
         last = self.held_out.stages[-1]
         figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
@@ -187,16 +186,17 @@ class _Bake:
         layout = make_layout(visible, step, plan.resolutions, model.field.config.unbounded, near)
         return layout, plan.n_rays(n_cells)
 
-    def _mesh(self, layout: Layout, arrays: GridArrays, head: bytes) -> tuple[TriangleMesh, Removed]:
-        """The mesh of what is about to be written."""
-        manifest = self._manifest(layout, arrays, {})
-        with self._part("mesh"), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            files = {"head.onnx": head, "cameras.json": write_cameras(self.model.cameras)}
-            asset = unwritten_asset(Path(folder), manifest, arrays, files)
-            return bake_mesh(asset, self._mesh_resolution(layout), self._report)
-
-    def _mesh_resolution(self, layout: Layout) -> int:
-        return self.choice.mesh_resolution or layout.densities.resolution
+    def _mesh(self, asset: Asset, sizes: dict[str, int]) -> tuple[TriangleMesh, Removed]:
+        """The mesh of an asset that has everything else, whose files have these sizes."""
+        most = mesh_bytes(sum(sizes.values()) - sizes["mesh.ply"], self.config.max_mb)
+        resolution = self.choice.mesh_resolution or asset.manifest.resolution
+        with self._part("mesh"):
+            mesh, removed = bake_mesh(asset, resolution, most, self._report)
+        if not len(mesh.faces):
+            self.left_out["mesh"] = "all of it: nowhere is the field dense enough for a surface"
+        elif asset.manifest.contracted:
+            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
+        return mesh, removed
 
     def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
@@ -246,7 +246,7 @@ class _Bake:
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
-        mesh = mesh_size(layout.grid(density, features), self._mesh_resolution(layout))
+        mesh = mesh_bytes(round(self.config.max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
         rest = bytes_beside_features(arrays, mesh, len(write_cameras(self.model.cameras)), head)
@@ -299,12 +299,11 @@ class _Bake:
             },
         )
 
-    def _judge(self, folder: Path, name: str) -> BakeReport:
-        """Play the written files; raises TrainingError where they miss what was asked."""
-        asset = Asset.open(folder, verify=True)
+    def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
+        """Play the written files, which have these sizes; raises TrainingError where they miss what was
+        asked."""
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
-        n_bytes = file_sizes(folder)
         if last.loss_db > PLAYS_NOTHING:
             raise TrainingError(
                 f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
@@ -332,8 +331,10 @@ class _Bake:
 
     @contextmanager
     def _part(self, name: str) -> Iterator[None]:
-        begin = time.monotonic()
+        """Time what is done here; parts within this one are not counted twice."""
+        begin, others = time.monotonic(), sum(self.seconds.values())
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin
+            inside = sum(self.seconds.values()) - others
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin - inside

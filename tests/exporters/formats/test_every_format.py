@@ -26,6 +26,7 @@ from tests.exporters.test_export import fails
 
 WAYS = {
     "ply": "a.ply",
+    "baked": "a.ply --method baked",
     "obj": "a.obj",
     "glb": "a.glb",
     "stl": "a.stl",

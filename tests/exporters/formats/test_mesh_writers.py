@@ -15,11 +15,11 @@ import trimesh
 from exporters.formats.glb import glb_bytes, parse_glb, y_up
 from exporters.formats.obj import obj_bytes
 from exporters.formats.parity import check_mesh_bytes
-from exporters.formats.ply import parse_ply, ply_bytes, read_ply
+from exporters.formats.ply import parse_ply, ply_bytes, read_ply, small_ply_bytes, small_ply_size
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
 from player.errors import ConfigError, FormatError, IntegrityError, ParityError
-from tests.exporters.meshes import random_mesh, tetrahedron
+from tests.exporters.meshes import random_mesh, sphere, tetrahedron
 
 WRITERS = {".ply": ply_bytes, ".obj": obj_bytes, ".glb": glb_bytes}
 
@@ -160,6 +160,24 @@ def test_read_ply_gives_back_what_was_written(tmp_path: Path) -> None:
     assert np.array_equal(read.vertices, mesh.vertices.astype(np.float32))
     assert np.array_equal(read.faces, mesh.faces) and np.array_equal(read.colours, mesh.colours)
     assert ply_bytes(read) == path.read_bytes()
+
+
+def test_the_mesh_of_an_asset_is_small_and_gets_the_normals_of_its_faces() -> None:
+    """trimesh reads it as it lies there; positions, faces and colours come back, normals from the faces."""
+    mesh = sphere(20)
+    data = small_ply_bytes(mesh)
+    assert len(data) == small_ply_size(len(mesh.vertices), len(mesh.faces)) < 0.8 * len(ply_bytes(mesh))
+    read = parse_ply(data, "mesh.ply")
+    assert np.array_equal(read.vertices, mesh.vertices.astype(np.float32))
+    assert np.array_equal(read.faces, mesh.faces) and np.array_equal(read.colours, mesh.colours)
+    assert (read.normals * mesh.normals).sum(axis=-1).min() > 0.98
+    other = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
+    assert np.array_equal(other.faces, mesh.faces)
+    assert np.array_equal(other.visual.vertex_colors[:, :3], mesh.colours[:, :3])
+    with pytest.raises(IntegrityError, match="size"):
+        parse_ply(data[:-1], "a.ply")
+    with pytest.raises(FormatError, match=r"a\.ply: mesh: faces: expected vertex numbers"):
+        parse_ply(data[:-4] + b"\xff\xff\xff\x7f", "a.ply")
 
 
 def test_damaged_ply() -> None:

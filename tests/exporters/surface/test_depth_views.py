@@ -9,7 +9,7 @@ import pytest
 
 from exporters.shapes.mesh import TriangleMesh, take_faces
 from exporters.surface.asset_surface import AssetSurface, Removed, cleaned
-from exporters.surface.depth_views import DepthView, cosines_in_view, depth_views, seen_vertices
+from exporters.surface.depth_views import DepthView, cosines_in_view, depth_views, sightings
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import DataError
@@ -56,12 +56,12 @@ def test_before_behind_beside_and_turned_away() -> None:
 
 def test_half_of_a_ball_is_seen_from_one_side() -> None:
     mesh = sphere(40)
-    seen = seen_vertices([sphere_view((0.0, 0.001, 5.0), 1.0)], mesh.vertices, mesh.normals, 0.02)
+    seen = sightings([sphere_view((0.0, 0.001, 5.0), 1.0)], mesh.vertices, mesh.normals, 0.02).seen > 0
     height = mesh.vertices[:, 2]  # tangents from (0, 0, 5) touch at z = 1/5
     assert not seen[height < 1 / 5 - 0.05].any()
     # A pixel inside the outline, 0.05 wide here, the ball is sqrt(2 * 0.05) higher.
     assert seen[height > 1 / 5 + 0.35].all()
-    assert seen_vertices(all_around(1.0), mesh.vertices, mesh.normals, 0.02).all()
+    assert sightings(all_around(1.0), mesh.vertices, mesh.normals, 0.02).seen.all()
 
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:
@@ -85,7 +85,7 @@ def test_what_is_hidden_and_what_floats_goes() -> None:
     floater = TriangleMesh(tiny, np.array([[0, 1, 2]], np.int32), out, np.full((3, 4), 255, np.uint8))
     mesh = joined(outer, inner, wall, floater)
     kept, removed = cleaned(mesh, all_around(1.0), 0.02)
-    assert removed == Removed(len(inner.faces) + len(wall.faces), 1, 1)
+    assert removed == Removed(len(inner.faces) + len(wall.faces), 1, 0, 0)
     assert len(kept.faces) == len(outer.faces) and np.array_equal(kept.vertices, outer.vertices)
     with pytest.raises(DataError, match=r"expected some of \d+ faces in a training camera's view, got none"):
         cleaned(replace(inner, vertices=inner.vertices + 100), all_around(1.0), 0.02)
@@ -102,9 +102,29 @@ def test_what_fills_a_hole_stays() -> None:
     assert removed.unseen_faces > 0.9 * len(inner.faces)
 
 
+def test_views_that_show_something_at_a_point_and_views_that_see_through_it() -> None:
+    """A ball of radius 1 and points on it, before it and where the pictures show nothing; by hand."""
+    points = np.array([[0.0, 0, 1], [0, 0, 1.5], [0, 0, 0.99], [0, 0, 0.5], [1.25, 0, 0]])
+    out = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
+    found = sightings([sphere_view((0.0, 0.001, 4.0), 1.0)] * 3, points, out, 0.05)
+    assert found.seen.tolist() == [3, 3, 3, 0, 3]
+    assert found.solid.tolist() == [3, 0, 3, 0, 0]
+
+
+def test_haze_goes() -> None:
+    """A shell of haze around the ball that the pictures show, closed and with more faces than the ball; the
+    same shell alone, which nothing is seen of, is no surface."""
+    ball, haze = sphere(60), sphere(120)
+    haze = replace(haze, vertices=haze.vertices * 1.3)
+    kept, removed = cleaned(joined(haze, ball), all_around(1.0), 0.02)
+    assert removed == Removed(0, len(haze.faces), 0, 0) and np.array_equal(kept.vertices, ball.vertices)
+    with pytest.raises(DataError, match="got haze that is seen through"):
+        cleaned(haze, all_around(1.0), 0.02)
+
+
 def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
     shares: list[tuple[int, int]] = []
-    views = depth_views(ball_asset, 32 * 32, lambda done, of: shares.append((done, of)))
+    views = depth_views(ball_asset, 32 * 32, progress=lambda done, of: shares.append((done, of)))
     assert len(views) == 12 and shares[-1] == (12, 12) and views[0].camera.width == 32
     centre = np.array(WORLD_FROM_MODEL)[:3] @ [*BALL_CENTRE, 1]
     for view in views:
@@ -112,6 +132,7 @@ def test_depth_views_of_a_ball(ball_asset: Asset) -> None:
         assert np.isfinite(view.distance).any() and np.isinf(view.distance).any()
         assert view.distance.min() == pytest.approx(middle, abs=0.1)  # a voxel is 0.056 here
     assert depth_views(ball_asset)[0].camera.width == 64
+    assert len(depth_views(ball_asset, 32 * 32, 5)) == 5
 
 
 def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:

@@ -10,26 +10,33 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from exporters.shapes.mesh import Surface
 from exporters.surface import marching_cubes as asset_surface
 from exporters.surface.marching_cubes import (
     code_and_slope,
-    extract_asset_surface,
+    cut_surface,
     half_opaque,
     onto_level,
+    settled,
     voxel_size,
 )
 from player.asset.asset import Asset
+from player.asset.grid import SparseGrid
 from player.errors import ConfigError, MissingExtraError
 from player.march.normals import code_gradient
 from tests.exporters.conftest import BALL_CENTRE, BALL_RADIUS, CUBE_HIGH, CUBE_LOW
 from tests.exporters.solids import ball, offset_of, write_solid
 
 
+def surface_of(grid: SparseGrid, level: float | None = None, stride: int = 1) -> Surface:
+    return settled(grid, cut_surface(grid, level, stride=stride))
+
+
 @pytest.mark.parametrize("factor", [None, 2.0, 5.0])
 def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor: float | None) -> None:
     grid, voxel = ball_asset.grid, 2 / 72
     level = half_opaque(grid) * (factor or 1)
-    vertices, faces, normals = extract_asset_surface(grid, None if factor is None else level)
+    vertices, faces, normals = surface_of(grid, None if factor is None else level)
     outward = vertices - BALL_CENTRE
     distance = np.linalg.norm(outward, axis=-1)
     # A code is 0.02 of a voxel, and between vertices the distance bends by voxel^2 / (8 radius).
@@ -45,7 +52,7 @@ def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor
 def test_every_second_vertex_gives_the_same_ball_in_a_quarter_of_the_faces(ball_asset: Asset) -> None:
     """And a wall where nothing is stored any more, inside, which no camera sees."""
     grid = ball_asset.grid
-    vertices, faces, normals = extract_asset_surface(grid, stride=2)
+    vertices, faces, normals = surface_of(grid, stride=2)
     outward = vertices - BALL_CENTRE
     distance = np.linalg.norm(outward, axis=-1)
     outside = distance > BALL_RADIUS
@@ -54,22 +61,22 @@ def test_every_second_vertex_gives_the_same_ball_in_a_quarter_of_the_faces(ball_
     shell = faces[outside[faces].all(axis=1)]
     assert outside[faces].any(axis=1).sum() == len(shell), "and the two do not meet"
     assert outside.sum() - len(shell) / 2 == 2
-    assert len(shell) == pytest.approx(len(extract_asset_surface(grid)[1]) / 4, rel=0.1)
+    assert len(shell) == pytest.approx(len(surface_of(grid)[1]) / 4, rel=0.1)
     assert (normals * outward)[outside].sum(-1).min() > 0
 
 
 def test_blocks_do_not_show(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = extract_asset_surface(ball_asset.grid)
+    one = surface_of(ball_asset.grid)
     for size in (16, 128):
         monkeypatch.setattr(asset_surface, "BLOCK", size)
-        other = extract_asset_surface(ball_asset.grid)
+        other = surface_of(ball_asset.grid)
         assert len(other[0]) == len(one[0]) and len(other[1]) == len(one[1])
         apart, nearest = KDTree(one[0]).query(other[0])
         assert apart.max() < 1e-6 and len(np.unique(nearest)) == len(one[0])
 
 
 def test_a_box_keeps_its_place_and_size(cube_asset: Asset) -> None:
-    vertices, faces, _ = extract_asset_surface(cube_asset.grid)
+    vertices, faces, _ = surface_of(cube_asset.grid)
     offset = offset_of(half_opaque(cube_asset.grid), 48)
     np.testing.assert_allclose(vertices.min(0), np.array(CUBE_LOW) - offset, rtol=0, atol=0.1 * 2 / 48)
     np.testing.assert_allclose(vertices.max(0), np.array(CUBE_HIGH) + offset, rtol=0, atol=0.1 * 2 / 48)
@@ -109,17 +116,17 @@ def test_a_thin_fog_still_has_a_surface(tmp_path: Path) -> None:
     asset = write_solid(tmp_path / "fog", ball((0, 0, 0), 0.5), 12)
     grid = asset.grid
     thin = type(grid)(**{**vars(grid), "density_low": np.float32(grid.density_low - 6)})
-    vertices, _, _ = extract_asset_surface(thin)
+    vertices, _, _ = surface_of(thin)
     assert len(vertices) > 50
 
 
 def test_refusals(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     for level in (0.0, -3.0, 1e-9, 1e9, math.nan, math.inf):
         with pytest.raises(ConfigError, match=r"--level: expected a density between .* and .*, the range of"):
-            extract_asset_surface(ball_asset.grid, level)
+            surface_of(ball_asset.grid, level)
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(MissingExtraError, match=r"scikit-image: pip install 'vfr-bake\[export\]'"):
-        extract_asset_surface(ball_asset.grid)
+        surface_of(ball_asset.grid)
 
 
 def test_voxel_size(ball_asset: Asset) -> None:

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 
+from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.errors import TrainingError
+from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.limits import keep_to_time
+from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.plan import MESH_SECONDS, N_RAYS, expected_seconds, make_plan
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
@@ -121,3 +123,19 @@ def test_more_work_is_expected_to_take_longer(model: Model) -> None:
 
     # Ten times the least difference in work: what the machine's noise does to a rate is far less.
     assert seconds(refine_steps=1_000_000) > 10 * seconds()
+
+
+@pytest.mark.needs("open3d")
+def test_the_mesh_is_at_most_a_tenth_of_the_asset(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(baked_mesh, "FEWEST_BYTES", 5_000)
+    settings = BakeConfig(resolution=96, mesh_resolution=0, refine_steps=0, check_views=1)
+    result = bake(model, tmp_path / "asset", settings, quiet)
+    asset = Asset.open(tmp_path / "asset", verify=True)
+    sizes = file_sizes(tmp_path / "asset")
+    total = sum(sizes.values())
+    assert 0.05 * total < sizes["mesh.ply"] <= 0.1 * total
+    assert len(read_ply(tmp_path / "asset" / "mesh.ply").faces) == result.figures["mesh_faces"]
+    assert asset.manifest.provenance["baked"]["mesh_faces"] == result.figures["mesh_faces"]
+    assert result.seconds >= result.figures["time"]["mesh"] > 0
