@@ -1,0 +1,67 @@
+"""Specks of synthetic pictures: what counts, and what does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from player.errors import ShapeError
+from vfr_bake.bench.specks import speck_mask
+
+
+def median_by_hand(picture: np.ndarray, y: int, x: int, channel: int) -> float:
+    """The fifth of the nine values around a pixel, in order; the nearest pixel stands for one outside."""
+    height, width = picture.shape[:2]
+    nine = [
+        picture[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1), channel]
+        for dy in (-1, 0, 1)
+        for dx in (-1, 0, 1)
+    ]
+    return sorted(nine)[4]
+
+
+def test_every_pixel_by_hand() -> None:
+    random = np.random.default_rng(0)
+    wanted = random.random((9, 7, 3)) * 0.2
+    picture = wanted + random.random((9, 7, 3)) * 0.3
+    expected = np.zeros((9, 7), bool)
+    for y, x, channel in np.ndindex(9, 7, 3):
+        apart = abs(picture[y, x, channel] - median_by_hand(picture, y, x, channel))
+        calm = abs(wanted[y, x, channel] - median_by_hand(wanted, y, x, channel))
+        expected[y, x] |= apart > 0.1 and calm <= 0.05
+    assert 0 < expected.sum() < expected.size
+    assert np.array_equal(speck_mask(picture, wanted), expected)
+
+
+def test_specks_count_where_they_are_and_in_any_channel() -> None:
+    wanted = np.full((20, 30, 3), 0.1)
+    picture = wanted.copy()
+    places = [(0, 0), (19, 29), (5, 7), (5, 20)]
+    for number, (y, x) in enumerate(places):
+        picture[y, x, number % 3] += 0.101
+    # a corner repeats itself to four of nine
+    assert {tuple(place) for place in np.argwhere(speck_mask(picture, wanted)).tolist()} == set(places)
+    assert not speck_mask(picture, wanted, 0.11).any(), "below the threshold"
+    assert not speck_mask(wanted, picture).any(), "what is missing in the picture is calm there"
+
+
+def test_wires_highlights_edges_and_patches_do_not_count() -> None:
+    wanted = np.ones((20, 20, 3))
+    wanted[:, 5] = 0  # a wire
+    wanted[3, 12] = 0  # a highlight, or a dot
+    wanted[10:, 8:] = 0.3  # edges and a corner
+    assert not speck_mask(wanted, wanted).any()
+    shifted = wanted.copy()
+    shifted[9:, 7:] = 0.3  # edges a pixel further, which are wrong but no specks, but for their corner
+    assert np.argwhere(speck_mask(shifted, wanted)[6:, 7:]).tolist() == [[3, 0]]
+    broken = wanted.copy()
+    broken[10, 5] = 1  # a hole in the wire: the median of the nine is white there, as it is
+    assert not speck_mask(broken, wanted)[10, 5]
+    patch = wanted.copy()
+    patch[14:18, 13:17] = 0.9
+    assert not speck_mask(patch, wanted)[14:18, 13:17][1:-1, 1:-1].any()
+
+
+def test_pictures_of_two_sizes() -> None:
+    with pytest.raises(ShapeError, match="specks: expected two pictures"):
+        speck_mask(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
