@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras.camera import Camera
 from player.errors import ConfigError
 from vfr_bake.baking.cells import (
     BLOCK,
@@ -23,6 +22,8 @@ from vfr_bake.baking.cells import (
     rays_of_contracted_views,
     rays_of_views,
 )
+from vfr_bake.baking.distillation import render_teacher
+from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.refinement import BATCH
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
@@ -46,15 +47,18 @@ DENSITY_BYTES = 40
 REFINED_BY = 0.8
 """Share of a bake's time after which refinement ends: then the mesh is made, and the written files are
 played."""
-N_TIMED, VIEWS_TIMED = 2048, 16
-"""Rays that are timed to tell how fast the model answers, and the number of views they come from, roughly."""
-STEP_COST, VERTEX_COST = {False: 2.5, True: 0.2}, 0.12
+VIEWS_TIMED = 4
+"""Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
+rays than those for which it was compiled. What these have read is in cache, which makes them several times as
+fast as the millions of a bake."""
+STEP_COST, VERTEX_COST, SEEN_COST = {False: 1.2, True: 0.2}, 0.16, {False: 0.12, True: 1.0}
 """Time of a training ray in a step of refinement, by whether the scene is unbounded (whose model takes its
-time for a ray), and time of a vertex; the unit is the time that the model takes for a ray."""
+time for a ray), of a vertex, and of a ray that marks the cells it sees, by the same; the unit is the time
+that the teacher takes for a ray. Those of an object follow from the parts of lego's bake."""
 OWN_HEAD = 4
 """How many times as long a step takes with the model's own head."""
-MESH_SECONDS = 40.0
-"""Seconds for what hardly depends on the scene: the mesh, and playing the written files."""
+MESH_COST = {False: 800_000, True: 200_000}
+"""Time of the mesh and of playing the written files, which hardly depends on the scene, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -148,35 +152,24 @@ def _cells(model: Model, resolution: int) -> float:
 
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
-    """How long the bake will take, from how long some of the model's own rays take here."""
+    """How long the bake will take, seconds, from how long the teacher takes for some rays here."""
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
-    rays_o, rays_d = _some_rays(model.model_cameras())
-    times = []
-    for _ in range(2):  # the first compiles
-        begin = time.perf_counter()
-        model.sampler.composited_features(model.field, rays_o, rays_d)
-        times.append(time.perf_counter() - begin)
+    every = model.model_cameras()
+    views = every[:: -(-len(every) // VIEWS_TIMED)]
+    n_rays = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1) * len(views)
+    render_teacher(model, views, n_rays, 0, lambda done, of: None)  # compiles
+    begin = time.perf_counter()
+    render_teacher(model, views, n_rays, 1, lambda done, of: None)
+    ray_seconds = (time.perf_counter() - begin) / n_rays
     fine, coarse = plan.resolutions
     work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + (fine / coarse) ** 3)
     if unbounded:
-        work += rays_of_contracted_views(model, coarse)
+        work += SEEN_COST[True] * rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
-        work += max(model.occupancy.step * coarse / 2, 1.0) * rays_of_views(model, coarse)
+        steps = max(model.occupancy.step * coarse / 2, 1.0)
+        work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
     steps = (3 if choice.head_width else 2 * OWN_HEAD) * choice.refine_steps
-    ray_seconds = times[-1] / len(rays_o)
     before, refinement = ray_seconds * work, ray_seconds * steps * BATCH * STEP_COST[unbounded]
     if config.refine_steps is None:
         refinement = min(refinement, max(60 * REFINED_BY * choice.minutes - before, 0.0))
-    return before + refinement + MESH_SECONDS
-
-
-def _some_rays(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """About N_TIMED rays of some of the pictures."""
-    parts = []
-    chosen = cameras[:: max(len(cameras) // VIEWS_TIMED, 1)]
-    for camera in chosen:
-        rays_o, rays_d = camera.rays()
-        some = np.random.default_rng(len(parts)).integers(0, len(rays_o), -(-N_TIMED // len(chosen)))
-        parts.append((rays_o[some], rays_d[some]))
-    rays_o, rays_d = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return rays_o, rays_d
+    return before + refinement + ray_seconds * MESH_COST[unbounded]
