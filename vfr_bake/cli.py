@@ -235,9 +235,15 @@ def _bake(options: Any) -> int:
         written | result.figures,
         f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
         f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; as played it agrees "
-        f"with the full model to {result.figures['psnr_to_full_model']:.1f} dB, an expected loss of "
-        f"{result.figures['expected_loss_db']:.2f} dB: see {options.asset / 'report.html'}",
+        f"with the full model to {result.figures['psnr_to_full_model']:.1f} dB and loses {result.loss} "
+        f"against photographs: see {options.asset / 'report.html'}",
     )
+    if result.loss.spread is None:
+        print(
+            "vfr-bake: the model has no witnesses (docs/train.md), so that the loss is estimated from its "
+            "own pictures: train again to have it measured against photographs",
+            file=sys.stderr,
+        )
     for missed in result.missed:
         print(f"vfr-bake: warning: {missed}: see report.html for where it goes", file=sys.stderr)
     return 0

@@ -27,7 +27,7 @@ from vfr_bake.data.scene import PosedImages
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.evaluation import RenderedView
 from vfr_bake.training.metrics import over_background, psnr, to_8_bit
-from vfr_bake.training.model_file import Model, load_model
+from vfr_bake.training.model_file import Model, load_model, save_model
 from vfr_bake.training.trainer import MINUTES
 
 SMALL = [
@@ -209,8 +209,17 @@ def test_bake_needs_no_data_set_and_refuses_to_replace(
     one_error(capsys, str(tmp_path / "asset"), "already exists", "--force")
     assert (tmp_path / "asset" / "manifest.json").read_bytes() == before
     coarse = [*arguments[:2], "--resolution", "24", "--refine-steps", "0", "--force"]
+    capsys.readouterr()
     assert bake_main(coarse) == 0
     assert Asset.open(tmp_path / "asset").manifest.resolution == 24
+    said = capsys.readouterr()
+    assert "no witnesses" not in said.err and re.search(r"loses -?[\d.]+ dB \(give or take", said.out)
+    old = replace(load_model(model), witnesses=None)
+    save_model(tmp_path / "old.pt", old)
+    assert bake_main([str(tmp_path / "old.pt"), *coarse[1:], "--json", "-"]) == 0
+    said = capsys.readouterr()
+    assert said.err.count("the model has no witnesses") == 1 and "train again" in said.err
+    assert json.loads(said.out)["loss_db_spread"] is None
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """The bake, step by step: what is seen, what of it is stored, the head, the mesh, and what each step loses.
 
-Everything is measured on views that nothing else looks at (`vfr_bake.baking.held_out`), the end result by
-playing the written files.
+Everything is measured on photographs' pixels and on views that nothing else looks at
+(`vfr_bake.baking.held_out`), the end result by playing the written files.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import REFINED_BY, make_plan
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
+from vfr_bake.baking.witness_loss import Loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
 from vfr_bake.rendering.proposals import ProposalSampler
@@ -65,7 +66,7 @@ Report = Callable[[str, int, int], object]
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
 PLAYS_NOTHING = 6.0
-"""Expected loss in dB over which the asset does not show what the model shows."""
+"""Loss in dB over which the asset does not show what the model shows."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ class BakeResult:
     n_bytes: int
     """Without the report."""
     seconds: float
+    loss: Loss
+    """Loss against photographs, compared with the trained model."""
     figures: dict[str, Any]
     missed: list[str]
     """What the preset aims at and was not reached, in words."""
@@ -158,10 +161,11 @@ class _Bake:
             cameras = write_cameras(self.model.cameras)
             write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
         last = self.held_out.stages[-1]
-        figures |= {"psnr_to_full_model": last.psnr, "expected_loss_db": last.loss_db, "time": self.seconds}
+        figures |= {"psnr_to_full_model": last.psnr, "loss_db": last.loss.db, "time": self.seconds}
+        figures |= {"loss_db_spread": last.loss.spread}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
         n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
-        return BakeResult(len(layout.densities), n_bytes, seconds, figures, missed)
+        return BakeResult(len(layout.densities), n_bytes, seconds, last.loss, figures, missed)
 
     def _cells(self) -> tuple[Layout, int]:
         """Where densities and features are stored, and the number of training rays for which that leaves
@@ -237,7 +241,8 @@ class _Bake:
         if self.config.n_channels is not None:
             return every
         for projection in map(every.first, range(1, most)):
-            if self.held_out.channel_loss(projection.back @ projection.matrix) <= self.choice.channel_loss_db:
+            lost = self.held_out.channel_loss(projection.back @ projection.matrix)
+            if lost.most <= self.choice.channel_loss_db:
                 return projection
         return every
 
@@ -304,7 +309,7 @@ class _Bake:
         asked."""
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
-        if last.loss_db > PLAYS_NOTHING:
+        if last.loss.db > PLAYS_NOTHING:
             raise TrainingError(
                 f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
                 "to its pictures: it is empty or a fog, or too little is stored: train longer, or lower "
@@ -313,17 +318,18 @@ class _Bake:
         megabytes = sum(n_bytes.values()) / 1e6
         timed = self.config.target_ms is not None
         ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
-        check_budget(self.config, last.loss_db, megabytes, ms)
+        check_budget(self.config, last.loss.db, megabytes, ms)
         missed = []
-        if last.loss_db > self.choice.target_loss_db:
+        if last.loss.least > self.choice.target_loss_db:
             missed.append(
                 f"preset {self.config.preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
-                f"got {last.loss_db:.2f} dB"
+                f"got {last.loss}"
             )
         asked = asdict(self.config) | asdict(self.choice)
         return BakeReport(
-            f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(), n_bytes,
-            self.seconds, self.left_out, self.lookups, missed, list(side_by_side(self.model, asset)),
+            f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(),
+            self.held_out.measured_on(), n_bytes, self.seconds, self.left_out, self.lookups, missed,
+            list(side_by_side(self.model, asset)),
         )  # fmt: skip
 
     def _progress(self, name: str) -> Callable[[int, int], object]:

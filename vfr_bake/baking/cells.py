@@ -20,7 +20,7 @@ import torch
 
 from player.errors import TrainingError
 from player.march.contracted import MAX_SPEED
-from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, views_between, widened
+from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, Shown, views_between, widened
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
@@ -105,7 +105,7 @@ class CulledCells:
     floor: float = 0.0
     """The weight that a sample must have; 0 where every cell that may hold matter is stored."""
     lost: dict[float, float] = field(default_factory=dict)
-    """Expected loss in dB of each floor that was tried, on its own."""
+    """Loss in dB of each floor that was tried, on its own."""
     removed: float = 0.0
     """Share of the cells that may hold matter which are not stored."""
 
@@ -116,7 +116,7 @@ class CulledCells:
             return f"none: leaving out what weighs little loses too much ({tried or 'nothing weighs enough'})"
         return (
             f"{self.removed:.0%} of the cells that the model may hold matter in: no view gives them a weight "
-            f"of {self.floor:g}; expected loss by the floor of weight, part of that after 'grid': {tried}"
+            f"of {self.floor:g}; loss by the floor of weight, part of that after 'grid': {tried}"
         )
 
 
@@ -126,20 +126,21 @@ def cull(
     """The cells of a grid of `resolution` that weigh something in some view, gaps of one cell between them
     closed.
 
-    `floor` is the weight that they must have, or None for the highest of FLOORS that is expected to lose no
-    more than `most_db`. Raises TrainingError when no cell weighs a `floor` that was asked for.
+    `floor` is the weight that they must have, or None for the highest of FLOORS that loses no more than
+    `most_db`. Raises TrainingError when no cell weighs a `floor` that was asked for.
     """
     held = occupied_cells(model, resolution)
     floors = FLOORS if floor is None else (floor,)
     marks = marked_cells(model, resolution, floors, progress)
-    least = _loss(model, held_out, held)
+    least = _shown(model, held_out, held)
     lost: dict[float, float] = {}
     for level, tried in enumerate(floors):
         visible = close_gaps(np.ascontiguousarray(marks[..., level]).view(bool))
         if not visible.any():
             continue
-        lost[tried] = max(_loss(model, held_out, visible) - least, 0.0)
-        if lost[tried] <= most_db or floor is not None:
+        loss = held_out.lost(least, _shown(model, held_out, visible))
+        lost[tried] = loss.db
+        if loss.most <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)
             return CulledCells(visible, tried, lost, max(removed, 0.0))
     if floor is not None:
@@ -154,8 +155,8 @@ def _nothing_seen(floor: float) -> TrainingError:
     )
 
 
-def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
-    """Expected loss in dB of the model where only `cells` [n, n, n] bool hold matter."""
+def _shown(model: Model, held_out: HeldOut, cells: np.ndarray) -> Shown:
+    """What the model shows where only `cells` [n, n, n] bool hold matter."""
     distance = np.empty(cells.shape, np.uint8)
     chebyshev_distance(cells, distance)
     features = np.zeros((len(held_out.rays_o), model.field.config.n_channels), np.float32)
@@ -164,7 +165,7 @@ def _loss(model: Model, held_out: HeldOut, cells: np.ndarray) -> float:
         held_out.rays_o, held_out.rays_d, np.float32(model.occupancy.step), distance,
         model.field.arrays(), LIMITS, features, opacity, depth,
     )  # fmt: skip
-    return held_out.loss_of(features, opacity)
+    return held_out.compare(features, opacity)
 
 
 def marked_cells(

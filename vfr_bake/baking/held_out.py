@@ -1,17 +1,22 @@
-"""Views between the training cameras, which a bake is trained and measured on without a data set, and what
-each of its steps loses on some of them that nothing else looks at.
+"""What a bake is measured on: the model's witnesses, and views between the training cameras.
 
-The full model is the teacher, so that what is measured is the mean square difference e to its pictures.
-Against photographs the model itself is off by E (its PSNR from training). The two errors have little to do
-with each other, so that the baked pictures are off by e + E, which is 10 log10(1 + e / E) dB worse: the
-expected loss.
+The *witnesses* are pixels of photographs that training has not learned from (`vfr_bake.data.witnesses`). What
+the asset loses there, compared with the model, is the loss of the bake, and the bake chooses by it.
+
+On the *views between*, the model's own pictures are what should be seen. How well a stage agrees with them is
+told as a PSNR, and decides where the witnesses see no difference.
+
+A model without witnesses was trained before there were any. Its loss can only be expected: the mean square
+difference to its pictures is e, and the model itself is off by E from photographs (its PSNR on what it was
+trained on). If the two errors have nothing to do with each other, the baked pictures are off by e + E, which
+is 10 log10(1 + e / E) dB worse.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +26,7 @@ from player.cameras.keyframes import smooth_path
 from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
+from vfr_bake.baking.witness_loss import Loss, WitnessLoss
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
@@ -41,6 +47,8 @@ A held-out view of can, which stands that far from the others, lost 5 dB to cell
 were not stored."""
 RAYS_OF_A_VIEW = 20_000
 """Most rays of a view that is measured."""
+RAYS_BESIDE_WITNESSES = 5_000
+"""The same where there are witnesses: with them there are about as many rays."""
 N_DIRECTIONS = 6
 """Other directions from which a colour is looked at, to see whether it depends on them."""
 SEED = 2
@@ -107,31 +115,48 @@ def widened(camera: Camera) -> Camera:
     return replace(camera, **size, cx=camera.cx + x, cy=camera.cy + y)
 
 
+class Shown(NamedTuple):
+    """How far some pictures are off."""
+
+    error: float
+    """Mean square error to the model's pictures on the views between; not rounded to 8 bits."""
+    errors: np.ndarray | None
+    """[n_witnesses] float64: mean square error of each witness to its photograph; None without witnesses."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """The pictures after a step of the bake, compared with the model's."""
 
     name: str
     psnr: float
-    """PSNR in dB against the model's pictures, not rounded to 8 bits."""
-    loss_db: float
-    """Expected loss in dB against photographs, compared with the trained model."""
+    """PSNR in dB against the model's pictures on the views between, not rounded to 8 bits."""
+    loss: Loss
+    """Loss against photographs, compared with the trained model; expected where there are no witnesses."""
     samples_median: float
     """Median number of density samples of a ray that hits."""
     samples_p95: float
     """95th percentile of the same."""
+    shown: Shown
+    """What the figures were made of."""
 
 
 class HeldOut:
-    """Rays of views between the training cameras, with the model's colours over its background."""
+    """Rays of views between the training cameras, and then those of the witnesses, with the model's colours
+    over its background."""
 
     def __init__(self, model: Model, n_views: int) -> None:
+        witnesses = model.witnesses if model.witnesses is not None and len(model.witnesses.pixels) else None
+        n_of_view = RAYS_OF_A_VIEW if witnesses is None else RAYS_BESIDE_WITNESSES
         random = np.random.default_rng(SEED)
         rays = []
         for camera in views_between(model, n_views, SEED):
             rays_o, rays_d = camera.rays()
-            some = random.choice(len(rays_o), min(RAYS_OF_A_VIEW, len(rays_o)), replace=False)
+            some = random.choice(len(rays_o), min(n_of_view, len(rays_o)), replace=False)
             rays.append((rays_o[some], rays_d[some]))
+        self._n_between = sum(len(rays_o) for rays_o, _ in rays)
+        if witnesses is not None:
+            rays.append(model.witness_rays())
         self.rays_o, self.rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         self.background = model.background
         features, opacity, _ = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
@@ -144,22 +169,44 @@ class HeldOut:
             )
         self.wanted = (1 - opacity[:, None]) * self.background
         self.wanted[self._hits] += self._opacity * self._colours(self._features)
-        self.model_psnr = float(
-            model.figures.get("test_psnr") or model.figures.get("training_psnr") or DEFAULT_PSNR
-        )
+        self._witnesses = None if witnesses is None else WitnessLoss(witnesses, self.background)
+        self._own = self._compared(self.wanted)
+        self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
         self.stages: list[Stage] = []
+
+    def measured_on(self) -> str:
+        """What losses are measured on, or estimated from, in a sentence."""
+        if self._witnesses is None:
+            return (
+                "The model has no witnesses, which are pixels that it did not learn from. So the loss is "
+                "estimated from its own pictures: train again to have it measured."
+            )
+        return self._witnesses.described()
+
+    def lost(self, before: Shown, after: Shown) -> Loss:
+        """What `after` loses, compared with `before`."""
+        if self._witnesses is not None and before.errors is not None and after.errors is not None:
+            return self._witnesses.loss(before.errors, after.errors)
+        first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
+        return Loss(second - first, None)
+
+    def is_better(self, before: Shown, after: Shown) -> bool:
+        """Whether `after` loses less than `before`; where the witnesses see no difference beyond chance,
+        whether it agrees better with the model's pictures."""
+        loss = self.lost(before, after)
+        measured = loss.spread is None or abs(loss.db) > loss.spread
+        return loss.db < 0 if measured else after.error < before.error
 
     def _colours(self, features: np.ndarray) -> np.ndarray:
         return head_colours(self._field, features, self.rays_d[self._hits])
 
-    def channel_loss(self, kept: np.ndarray) -> float:
-        """Expected loss in dB if the model's own rendered features x went through `kept` [n_channels,
-        n_channels], a projection of them."""
+    def channel_loss(self, kept: np.ndarray) -> Loss:
+        """The loss if the model's own rendered features x went through `kept` [n_channels, n_channels], a
+        projection of them."""
         return self._loss_of_colours(self._colours((self._features @ kept.T).astype(np.float32)))
 
-    def direction_loss(self) -> float:
-        """Expected loss in dB if every colour were the mean of those seen from N_DIRECTIONS other rays'
-        directions."""
+    def direction_loss(self) -> Loss:
+        """The loss if every colour were the mean of those seen from N_DIRECTIONS other rays' directions."""
         random = np.random.default_rng(SEED)
         mean = np.zeros((len(self._hits), 3), np.float32)
         for _ in range(N_DIRECTIONS):
@@ -167,24 +214,30 @@ class HeldOut:
             mean += head_colours(self._field, self._features, others) / N_DIRECTIONS
         return self._loss_of_colours(mean)
 
-    def _loss_of_colours(self, colours: np.ndarray) -> float:
-        """Expected loss in dB if the rays that hit had these colours [n_hits, 3] instead of the model's."""
-        off = self._opacity * (colours - self._colours(self._features))
-        error = float(np.sum(off.astype(np.float64) ** 2)) / self.wanted.size
-        return expected_loss(error, self.model_psnr)
+    def _loss_of_colours(self, colours: np.ndarray) -> Loss:
+        """The loss if the rays that hit had these colours [n_hits, 3] instead of the model's."""
+        rgb = self.wanted.copy()
+        rgb[self._hits] += self._opacity * (colours - self._colours(self._features))
+        return self.lost(self._own, self._compared(rgb))
 
-    def loss_of(self, features: np.ndarray, opacity: np.ndarray) -> float:
-        """Expected loss in dB if every ray had composited `features` [n, n_channels] and `opacity` [n], and
-        the model's own head."""
+    def compare(self, features: np.ndarray, opacity: np.ndarray) -> Shown:
+        """What is seen if every ray composites `features` [n, n_channels] and `opacity` [n], with the model's
+        own head."""
         met = np.flatnonzero(opacity > 0)
         colours = head_colours(self._field, features[met], self.rays_d[met])
-        return expected_loss(self._error(met, colours, opacity), self.model_psnr)
+        return self._compared(self._pictures(met, colours, opacity))
 
-    def _error(self, hits: np.ndarray, colours: np.ndarray, opacity: np.ndarray) -> float:
-        """Mean square error of pictures with `colours` [n_hits, 3] at the rays `hits`, and `opacity` [n]."""
+    def _pictures(self, hits: np.ndarray, colours: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+        """[n, 3] over the background, with `colours` [n_hits, 3] at the rays `hits`, and `opacity` [n]."""
         rgb = (1 - opacity[:, None]) * self.background
         rgb[hits] += colours * opacity[hits, None]
-        return float(np.mean((rgb.astype(np.float64) - self.wanted) ** 2))
+        return rgb
+
+    def _compared(self, rgb: np.ndarray) -> Shown:
+        """How far the pictures [n, 3] of all rays are off."""
+        between, of_witnesses = slice(self._n_between), slice(self._n_between, None)
+        error = float(np.mean((rgb[between].astype(np.float64) - self.wanted[between]) ** 2))
+        return Shown(error, None if self._witnesses is None else self._witnesses.errors(rgb[of_witnesses]))
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the player composes on the rays."""
@@ -205,23 +258,36 @@ class HeldOut:
 
     def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
         hits = played.hits
-        error = self._error(hits, head(played.features, self.rays_d[hits]), played.opacity)
+        colours = head(played.features, self.rays_d[hits])
+        shown = self._compared(self._pictures(hits, colours, played.opacity))
         samples = played.n_density_samples[hits] if len(hits) else np.zeros(1)
         return Stage(
             name,
-            -10 * float(np.log10(max(error, 1e-12))),
-            expected_loss(error, self.model_psnr),
+            -10 * float(np.log10(max(shown.error, 1e-12))),
+            self.lost(self._own, shown),
             float(np.median(samples)),
             float(np.percentile(samples, 95)),
+            shown,
         )
 
     def table(self) -> list[dict[str, Any]]:
         """The stages so far, for a report."""
-        return [asdict(stage) for stage in self.stages]
+        return [
+            {
+                "name": stage.name,
+                "psnr": stage.psnr,
+                "loss_db": stage.loss.db,
+                "loss_db_spread": stage.loss.spread,
+                "samples_median": stage.samples_median,
+                "samples_p95": stage.samples_p95,
+            }
+            for stage in self.stages
+        ]
 
 
 def expected_loss(error: float, model_psnr: float) -> float:
-    """dB that a mean square `error` to the model's pictures costs a model of `model_psnr` dB.
+    """dB that a mean square `error` to the model's pictures costs a model of `model_psnr` dB, if its own
+    errors have nothing to do with it.
 
     >>> round(expected_loss(10 ** (-4.57), 29.53), 2)  # k = 5 of docs: 45.7 dB to the full render
     0.1

@@ -96,7 +96,7 @@ class Tuning:
         self.ranges: tuple[Range, ...] | None = None
         """Ranges of the head's activations, if it multiplies in 8 bits."""
         self.lookups: dict[str, float] = {}
-        """Expected loss in dB by the lookups that were tried."""
+        """Loss in dB by the lookups that were tried, against every sample."""
         self.left_out: dict[str, str] = {}
         """What the scene does not need, and what that changed."""
         self._config, self._choice = config, choice
@@ -160,19 +160,19 @@ class Tuning:
             )
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
-        """Whether less is lost than before, on views that nothing is trained on."""
-        if after.loss_db < before.loss_db:
+        """Whether less is lost than before, on pixels that nothing is trained on."""
+        if self._held_out.is_better(before.shown, after.shown):
             return True
-        self.left_out[name] = "all of it: it lost more on views that it has not seen"
+        self.left_out[name] = "all of it: it lost more on what it has not seen"
         return False
 
     def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
         """A small head that is not trained yet; without directions where the colours do not need them."""
         choice, n_bands = self._choice, min(self._choice.head_bands, own.sh_degree)
         lost = self._held_out.direction_loss()
-        if lost < DIRECTION_SHARE * choice.target_loss_db:
+        if lost.most < DIRECTION_SHARE * choice.target_loss_db:
             n_bands = 1
-            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost:.3f} dB"
+            self.left_out["directions"] = f"all of them: colours do not depend on them but for {lost}"
         elif n_bands < own.sh_degree:
             self.left_out["directions"] = f"{own.sh_degree - n_bands} of {own.sh_degree} bands of harmonics"
         return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
@@ -186,12 +186,12 @@ class Tuning:
         rays = collect_training_rays(teacher.some(N_CALIBRATION), grid, self.n_fetches)
         ranges = activation_ranges(stored.head, rays.composed(stored.features), rays.dirs)
         after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_fetches)
-        lost = after.loss_db - before.loss_db
-        if lost * ROUNDING_LEFT > self._choice.target_loss_db:
-            self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost:.3f} dB"
+        lost = self._held_out.lost(before.shown, after.shown)
+        if lost.most * ROUNDING_LEFT > self._choice.target_loss_db:
+            self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost}"
             return before
         self.ranges = ranges
-        self.left_out["head bits"] = f"24 of 32 bits of its wide layers, {lost:.3f} dB before refinement"
+        self.left_out["head bits"] = f"24 of 32 bits of its wide layers, {lost} before refinement"
         return after
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
@@ -200,11 +200,12 @@ class Tuning:
         most = self._choice.n_fetches
         run = runner(head)
         if self._config.k == "auto":
-            every = self._held_out.look("all", grid, run, 0).loss_db
+            every = self._held_out.look("all", grid, run, 0).shown
             for k in (*(k for k in LOOKUPS if k < most), most):
                 self.n_fetches = k
-                self.lookups[str(k)] = self._held_out.look(str(k), grid, run, k).loss_db - every
-                if self.lookups[str(k)] <= self._choice.sample_loss_db:
+                lost = self._held_out.lost(every, self._held_out.look(str(k), grid, run, k).shown)
+                self.lookups[str(k)] = lost.db
+                if lost.most <= self._choice.sample_loss_db:
                     break
         if not self.n_fetches:
             return self._held_out.look("all", grid, run, 0)

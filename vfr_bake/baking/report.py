@@ -63,7 +63,9 @@ class BakeReport:
     asked: dict[str, Any]
     """Preset and settings as resolved, and the limits that were asked for."""
     stages: list[dict[str, Any]]
-    """`vfr_bake.baking.held_out.Stage` after each step, in order."""
+    """`vfr_bake.baking.held_out.HeldOut.table`: what each step shows and loses, in order."""
+    measured_on: str
+    """What the losses are measured on, or estimated from, in a sentence."""
     n_bytes: dict[str, int]
     """Bytes of each file."""
     seconds: dict[str, float]
@@ -79,8 +81,9 @@ class BakeReport:
 
     def json(self) -> bytes:
         """The content of report.json."""
-        names = ("asked", "stages", "seconds", "left_out", "lookups", "missed")
+        names = ("asked", "stages", "measured_on", "seconds", "left_out", "lookups", "missed")
         document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
+        document |= {name: self.stages[-1][name] for name in ("loss_db", "loss_db_spread")}
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
     def html(self) -> bytes:
@@ -88,21 +91,25 @@ class BakeReport:
         last = self.stages[-1]
         megabytes = sum(self.n_bytes.values()) / 1e6
         lookups = f"<h2>Lookups a ray: loss against all</h2>{bars(self.lookups, 'dB', 3)}"
-        columns = {"psnr": 2, "loss_db": 3, "samples_median": 0, "samples_p95": 0}
-        titles = ["after", "dB to the model's pictures", "expected loss, dB", "samples a ray, median"]
+        measured = last["loss_db_spread"] is not None
+        loss = "loss" if measured else "expected loss"
+        columns = {"psnr": 2, "loss_db": 3, "loss_db_spread": 3, "samples_median": 0, "samples_p95": 0}
+        titles = ["after", "dB to the model's pictures", f"{loss}, dB", "give or take, dB"]
+        titles += ["samples a ray, median", "95th percentile"]
         stages = [
-            row(stage["name"], *(f"{stage[key]:.{digits}f}" for key, digits in columns.items()))
+            row(stage["name"], *(_number(stage[key], digits) for key, digits in columns.items()))
             for stage in self.stages
         ]
+        spread = f" (give or take {last['loss_db_spread']:.2f} dB)" if measured else ""
         return page(
             self.title,
             f"<p>{megabytes:.1f} MB, baked in {sum(self.seconds.values()):.0f} s; the written files play "
-            f"{last['psnr']:.1f} dB from the model's own pictures, an expected loss of "
-            f"{last['loss_db']:.2f} dB against photographs.</p>",
+            f"{last['psnr']:.1f} dB from the model's own pictures, {'a' if measured else 'an'} {loss} of "
+            f"{last['loss_db']:.2f} dB{spread} against photographs. {escape(self.measured_on)}</p>",
             *(f'<p class="missed">Missed: {escape(text)}</p>' for text in self.missed),
             "<h2>Loss, stage by stage</h2>",
             bars({stage["name"]: stage["loss_db"] for stage in self.stages}, "dB", 3),
-            table([title_row(*titles, "95th percentile"), *stages]),
+            table([title_row(*titles), *stages]),
             lookups if self.lookups else "",
             f"<h2>Bytes</h2>{bars({name: size / 1e6 for name, size in self.n_bytes.items()}, 'MB', 2)}",
             f"<h2>Time</h2>{bars(self.seconds, 's', 0)}",
@@ -164,6 +171,10 @@ def bars(values: dict[str, float], unit: str, digits: int) -> str:
         )
     height = 24 * len(values)
     return f'<svg width="{BAR_WIDTH + 320}" height="{height}" role="img">{"".join(rows)}</svg>'
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _pairs(values: dict[str, str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from player.asset.asset import Asset
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.cells import FLOORS, close_gaps, cull, marked_cells, occupied_cells
+from vfr_bake.baking.cells import FLOORS, _shown, close_gaps, cull, marked_cells, occupied_cells
 from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.density import LIMITS
@@ -75,6 +76,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against a sum in float64 over the model's own samples, those in cells below the floor left out."""
+    model = replace(model, witnesses=None)
     held_out, floor = HeldOut(model, 1), 0.1
     monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", LIMITS._replace(opaque_depth=np.float32(1e9)))
     cells = cull(model, 96, held_out, floor, 0.0, quiet)
@@ -99,7 +101,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
         met = opacity > 0
         rgb = (1 - opacity[:, None]) * held_out.background
         rgb[met] += opacity[met, None] * head_colours(model.field, features[met], held_out.rays_d[met])
-        return expected_loss(float(np.mean((rgb - held_out.wanted) ** 2)), held_out.model_psnr)
+        return expected_loss(float(np.mean((rgb - held_out.wanted) ** 2)), 30.0)
 
     expected = loss(visible) - loss(occupied_cells(model, 96))
     assert expected > 0.05, "a floor this high loses something"
@@ -108,13 +110,28 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
 
 
 def test_the_highest_floor_that_loses_little_is_taken(model: Model) -> None:
-    held_out = HeldOut(model, 1)
+    held_out = HeldOut(replace(model, witnesses=None), 1)
     losses = {floor: cull(model, 64, held_out, floor, 0.0, quiet).lost[floor] for floor in FLOORS}
     assert losses[FLOORS[0]] > losses[FLOORS[-1]]
     for floor, loss in losses.items():
         chosen = cull(model, 64, held_out, None, loss * 1.001 + 1e-9, quiet)
         assert losses[chosen.floor] <= loss * 1.001 + 1e-9 and chosen.floor >= floor
         assert f"{chosen.floor:g}" in chosen.report()
+
+
+def test_with_witnesses_a_floor_must_not_lose_more_even_by_chance(model: Model) -> None:
+    """The first floor is taken whose loss is below what is allowed by more than its standard error."""
+    held_out = HeldOut(model, 1)
+    everything = cull(model, 64, held_out, None, -9.0, quiet)
+    assert everything.floor == 0 and list(everything.lost) == list(FLOORS), "no floor gains 9 dB"
+    shown = [_shown(model, held_out, occupied_cells(model, 64))]
+    marks = marked_cells(model, 64, FLOORS[:1], quiet)
+    shown.append(_shown(model, held_out, close_gaps(marks[..., 0].view(bool))))
+    loss = held_out.lost(*shown)
+    assert loss.spread and everything.lost[FLOORS[0]] == loss.db
+    for most_db, taken in ((loss.most + 1e-6, True), (loss.most - 1e-6, False)):
+        chosen = cull(model, 64, held_out, None, most_db, quiet)
+        assert (chosen.floor == FLOORS[0]) == taken, "between the loss and one standard error above it"
 
 
 def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path: Path) -> None:

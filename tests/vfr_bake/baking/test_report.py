@@ -11,7 +11,7 @@ import pytest
 from vfr_bake.baking.held_out import expected_loss
 from vfr_bake.baking.report import BakeReport, Pictures, bars
 
-STAGE = {"psnr": 40.0, "loss_db": 0.5, "samples_median": 5.0, "samples_p95": 9.0}
+STAGE = {"psnr": 40.0, "loss_db": 0.5, "loss_db_spread": 0.03, "samples_median": 5.0, "samples_p95": 9.0}
 
 
 def report(**changes: object) -> BakeReport:
@@ -19,6 +19,7 @@ def report(**changes: object) -> BakeReport:
         "title": "a <scene> & more",
         "asked": {"preset": "fast"},
         "stages": [{"name": "grid", **STAGE}, {"name": "files", **STAGE, "loss_db": 0.25}],
+        "measured_on": "Measured on <7> pixels.",
         "n_bytes": {"features.codes": 2_000_000},
         "seconds": {"grid": 1.5},
         "left_out": {"head": "256 wide, this one is <64>"},
@@ -59,6 +60,9 @@ def test_the_page_is_whole_and_escapes_what_it_is_given() -> None:
     text = " ".join(tags.texts)
     for said in ("a <scene> & more", "size: <1 MB", "this one is <64>", "0.250 dB", "2.00 MB", "0.125 dB"):
         assert said in text, said
+    for said in ("a loss of 0.25 dB (give or take 0.03 dB)", "Measured on <7> pixels.", "0.030"):
+        assert said in text, said
+    assert "expected loss" not in text
     assert "Missed" not in report().html().decode()
 
 
@@ -66,8 +70,17 @@ def test_the_json_says_the_same() -> None:
     said = json.loads(report().json())
     assert [stage["name"] for stage in said["stages"]] == ["grid", "files"]
     assert said["bytes"] == {"features.codes": 2_000_000} and said["missed"] == []
+    assert (said["loss_db"], said["loss_db_spread"]) == (0.25, 0.03)
+    assert said["measured_on"] == "Measured on <7> pixels."
     with pytest.raises(ValueError, match="not JSON compliant"):
         report(seconds={"grid": float("nan")}).json()
+
+
+def test_a_loss_that_is_not_measured_is_called_expected() -> None:
+    estimated = report(stages=[{"name": "files", **STAGE, "loss_db_spread": None}])
+    page = estimated.html().decode()
+    assert "an expected loss of 0.50 dB against" in page and "expected loss, dB" in page
+    assert json.loads(estimated.json())["loss_db_spread"] is None
 
 
 def test_bars_of_nothing_and_of_zeros() -> None:

@@ -1,0 +1,128 @@
+"""What a bake measures itself on: witnesses where the model has some, and else its own pictures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset
+from player.files.images import to_8_bit
+from player.render import render
+from vfr_bake.baking.bake import BakeResult, bake
+from vfr_bake.baking.held_out import HeldOut, Shown, expected_loss
+from vfr_bake.baking.witness_loss import SINGLE_WEIGHT, Loss
+from vfr_bake.config import BakeConfig
+from vfr_bake.rendering.render import render_image
+from vfr_bake.training.metrics import over_background
+from vfr_bake.training.model_file import Model
+
+SMALL = BakeConfig(
+    preset="fast", resolution=64, mesh_resolution=16, refine_steps=40, check_views=1, n_channels=2, k=1
+)
+
+
+def quiet(*_: object) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def baked(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BakeResult]:
+    folder = tmp_path_factory.mktemp("baked") / "asset"
+    return folder, bake(model, folder, SMALL, quiet)
+
+
+def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
+    model: Model, baked: tuple[Path, BakeResult]
+) -> None:
+    """The player's pictures of every training view and the model's, both against the photographs' pixels."""
+    folder, result = baked
+    witnesses, asset = model.witnesses, Asset.open(folder)
+    assert witnesses is not None and len(witnesses.whole) == 1
+    model_from_world = np.linalg.inv(model.world_from_model)
+    first, means = 0, {"model": {True: [], False: []}, "asset": {True: [], False: []}}
+    for view, (camera, count) in enumerate(zip(model.cameras, witnesses.counts.tolist(), strict=True)):
+        rows = slice(first, first := first + count)
+        photograph = to_8_bit(over_background(witnesses.rgba[rows], model.background)) / 255
+        in_model = camera.transformed(model_from_world)
+        pictures = {
+            "model": render_image(model.field, model.sampler, in_model, model.background),
+            "asset": render(asset, camera).rgb,
+        }
+        for name, picture in pictures.items():
+            shown = to_8_bit(picture.reshape(-1, 3)[witnesses.pixels[rows]]) / 255
+            means[name][view in witnesses.whole].append(((shown - photograph) ** 2).mean(axis=1))
+    errors = {
+        name: SINGLE_WEIGHT * np.concatenate(kinds[False]).mean()
+        + (1 - SINGLE_WEIGHT) * np.concatenate(kinds[True]).mean()
+        for name, kinds in means.items()
+    }
+    loss = 10 * np.log10(errors["asset"] / errors["model"])
+    assert abs(loss) > 0.05, "so few channels change the pictures"
+    # A frame's rays are rounded otherwise, which moves single samples.
+    assert result.loss.db == pytest.approx(loss, abs=0.01)
+
+
+def test_figures_and_report_have_the_loss_with_its_spread(baked: tuple[Path, BakeResult]) -> None:
+    folder, result = baked
+    said = json.loads((folder / "report.json").read_text())
+    assert result.loss.spread is not None and 0 < result.loss.spread < 2
+    for figures in (said, result.figures):
+        assert (figures["loss_db"], figures["loss_db_spread"]) == tuple(result.loss)
+        assert figures["stages"][-1]["loss_db"] == result.loss.db
+    assert said["measured_on"].startswith("The loss is measured on 5,959 pixels")
+    assert "expected loss" not in (folder / "report.html").read_text()
+
+
+def test_a_model_without_witnesses_is_baked_by_its_own_pictures(model: Model, tmp_path: Path) -> None:
+    own = replace(model, witnesses=None, figures={"training_psnr": 24.0, "test_psnr": 90.0})
+    result = bake(own, tmp_path / "asset", SMALL, quiet)
+    said = json.loads((tmp_path / "asset" / "report.json").read_text())
+    assert result.loss.spread is None and said["loss_db_spread"] is None
+    error = 10 ** (-result.figures["psnr_to_full_model"] / 10)
+    assert said["loss_db"] == pytest.approx(expected_loss(error, 24.0), rel=1e-6), "by the training split"
+    assert said["measured_on"].startswith("The model has no witnesses")
+    assert "an expected loss of" in (tmp_path / "asset" / "report.html").read_text()
+
+
+def test_the_cameras_of_whole_views_are_not_looked_through(model: Model) -> None:
+    """Else the bake would know the views that it is measured on."""
+    assert model.witnesses is not None
+    (whole,) = model.witnesses.whole.tolist()
+    names = [camera.name for camera in model.cameras]
+    assert [camera.name for camera in model.model_cameras()] == names[:whole] + names[whole + 1 :]
+
+
+def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
+    held_out = HeldOut(model, 1)
+    features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
+    own = held_out.compare(features, opacity)
+    assert own.error < 1e-12 and held_out.channel_loss(np.eye(features.shape[1])).db == 0
+    dimmed = held_out.compare(features, 0.5 * opacity)
+    loss = held_out.lost(own, dimmed)
+    assert loss.least > 1, "half of the opacity is a loss beyond chance"
+    assert held_out.lost(dimmed, own).db == pytest.approx(-loss.db)
+    assert held_out.is_better(dimmed, own) and not held_out.is_better(own, dimmed)
+
+
+@pytest.mark.parametrize(
+    ("lost", "closer", "better"),
+    [
+        (Loss(-0.1, 0.05), False, True),
+        (Loss(0.1, 0.05), True, False),
+        (Loss(0.04, 0.05), True, True),
+        (Loss(-0.04, 0.05), False, False),
+        (Loss(-0.001, None), False, True),
+        (Loss(0.001, None), True, False),
+    ],
+)
+def test_where_the_witnesses_see_no_difference_the_models_pictures_decide(
+    lost: Loss, closer: bool, better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held_out = object.__new__(HeldOut)
+    monkeypatch.setattr(held_out, "lost", lambda before, after: lost)
+    before, after = Shown(2e-4, None), Shown(1e-4 if closer else 3e-4, None)
+    assert held_out.is_better(before, after) == better

@@ -1,0 +1,133 @@
+"""What is lost at the witnesses, against sums in float64 written out, and against losses that are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vfr_bake.baking.witness_loss import BLOCKS_OF_A_VIEW, SINGLE_WEIGHT, Loss, WitnessLoss
+from vfr_bake.data.witnesses import Witnesses
+
+WHITE = np.ones(3, np.float32)
+
+
+def some_witnesses(counts: list[int], whole: list[int], seed: int = 0) -> Witnesses:
+    random = np.random.default_rng(seed)
+    pixels = np.concatenate([np.arange(n) for n in counts]).astype(np.int32)
+    rgba = random.integers(0, 256, (sum(counts), 4)).astype(np.uint8)
+    return Witnesses(np.array(counts, np.int32), pixels, rgba, np.array(whole, np.int32))
+
+
+def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """(loss, standard error) by loops over blocks: views, and parts of the only whole view."""
+    blocks: dict[tuple, list[int]] = {}
+    views = witnesses.views()
+    for i, view in enumerate(views):
+        if view not in witnesses.whole:
+            blocks.setdefault(("single", view), []).append(i)
+        elif len(witnesses.whole) > 1:
+            blocks.setdefault(("whole", view), []).append(i)
+        else:
+            place = i - int(np.flatnonzero(views == view)[0])
+            part = place * BLOCKS_OF_A_VIEW // int((views == view).sum())
+            blocks.setdefault(("whole", part), []).append(i)
+
+    def loss(left_out: tuple | None) -> float:
+        means = {}
+        for kind in ("single", "whole"):
+            rows = [i for key, rows in blocks.items() if key[0] == kind and key != left_out for i in rows]
+            if rows:
+                means[kind] = [math.fsum(e[i] for i in rows) / len(rows) for e in (before, after)]
+        if len(means) == 2:
+            first, second = (
+                SINGLE_WEIGHT * means["single"][k] + (1 - SINGLE_WEIGHT) * means["whole"][k] for k in (0, 1)
+            )
+        else:
+            ((first, second),) = means.values()
+        return 10 * math.log10(second / first)
+
+    variance = 0.0
+    for kind in ("single", "whole"):
+        keys = [key for key in blocks if key[0] == kind]
+        if len(keys) > 1:
+            lost = [loss(key) for key in keys]
+            mean = sum(lost) / len(lost)
+            variance += (len(lost) - 1) / len(lost) * sum((each - mean) ** 2 for each in lost)
+    return loss(None), math.sqrt(variance)
+
+
+@pytest.mark.parametrize(
+    ("counts", "whole"),
+    [
+        ([7, 5, 40, 6, 0, 9], [2]),
+        ([7, 30, 6, 33, 9], [1, 3]),
+        ([5, 6, 7], []),
+        ([4], []),
+        ([0, 3, 0], [1]),
+        ([9, 20, 9], [1]),
+    ],
+)
+def test_loss_and_spread_are_those_written_out(counts: list[int], whole: list[int]) -> None:
+    witnesses = some_witnesses(counts, whole)
+    measured = WitnessLoss(witnesses, WHITE)
+    random = np.random.default_rng(1)
+    for scale in (1e-9, 0.01, 1.0):
+        before, after = random.exponential(scale, (2, sum(counts)))
+        loss, spread = written_out(witnesses, before, after)
+        found = measured.loss(before, after)
+        assert found.db == pytest.approx(loss, abs=1e-9)
+        assert found.spread == pytest.approx(spread, abs=1e-9)
+        assert (found.most, found.least) == pytest.approx((loss + spread, loss - spread))
+
+
+def test_errors_are_between_8_bit_pictures_over_the_background() -> None:
+    """Clipped and rounded as an evaluation does, against integers."""
+    witnesses = some_witnesses([50], [])
+    background = np.array([0.213, 0.531, 0.917], np.float32)
+    rgb = np.random.default_rng(2).uniform(-0.2, 1.2, (50, 3)).astype(np.float32)
+    expected = []
+    for colour, rgba in zip(rgb.astype(float), witnesses.rgba.astype(float), strict=True):
+        alpha = rgba[3] / 255
+        shown = [min(max(math.floor(255 * value + 0.5), 0), 255) for value in colour]
+        taken = [
+            math.floor(255 * (value / 255 * alpha + (1 - alpha) * float(behind)) + 0.5)
+            for value, behind in zip(rgba[:3], background, strict=True)
+        ]
+        expected.append(sum(((a - b) / 255) ** 2 for a, b in zip(shown, taken, strict=True)) / 3)
+    errors = WitnessLoss(witnesses, background).errors(rgb)
+    np.testing.assert_allclose(errors, expected, atol=1e-12)
+
+
+def test_no_change_is_no_loss_and_a_better_picture_loses_less_than_nothing() -> None:
+    measured = WitnessLoss(some_witnesses([50, 60, 70], []), WHITE)
+    errors = np.random.default_rng(3).exponential(0.01, 180)
+    assert measured.loss(errors, errors) == (0.0, 0.0)
+    found = measured.loss(errors, errors / 2)
+    assert found.db == pytest.approx(-10 * math.log10(2)) and found.spread == pytest.approx(0, abs=1e-9)
+    nothing = np.zeros(180)
+    assert measured.loss(nothing, nothing) == (0.0, 0.0)
+    assert math.isfinite(measured.loss(nothing, errors).db)
+
+
+def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> None:
+    """Drawn anew a thousand times, views and all: errors of a view have a factor in common."""
+    counts, whole = [30] * 40 + [400] * 4, [40, 41, 42, 43]
+    measured = WitnessLoss(some_witnesses(counts, whole), WHITE)
+    views = np.repeat(np.arange(44), counts)
+    random = np.random.default_rng(4)
+    losses, spreads = [], []
+    for _ in range(1000):
+        before = random.exponential(0.01, len(views))
+        after = before * random.lognormal(0.1, 0.2, 44)[views]
+        found = measured.loss(before, after)
+        losses.append(found.db)
+        spreads.append(found.spread)
+    # 1000 draws know a standard deviation to 2 %, and a jackknife of four views is off by some more.
+    assert np.mean(spreads) == pytest.approx(np.std(losses), rel=0.12)
+
+
+def test_a_loss_in_words() -> None:
+    assert str(Loss(0.1234, 0.02)) == "0.12 dB (give or take 0.02)"
+    assert str(Loss(0.1234, None)) == "an expected 0.12 dB" and Loss(0.5, None).most == 0.5
