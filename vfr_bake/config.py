@@ -282,7 +282,7 @@ class BakeConfig:
     The player can be asked for another number."""
     weight_floor: float | None = None
     """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
-    a few that loses next to nothing on views kept apart, or none."""
+    a few that loses next to nothing on what is kept apart, or none."""
     no_cull: bool = False
     """Store what no view sees as well: every cell that the model holds matter in."""
     code_levels: int | None = None
@@ -298,8 +298,7 @@ class BakeConfig:
     mesh_resolution: int | None = None
     """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
     max_loss_db: float | None = None
-    """Fail, and write nothing, if the written files are expected to lose more than this against
-    photographs."""
+    """Fail, and write nothing, if the written files lose more than this against photographs."""
     max_mb: float | None = None
     """Take so many channels as fit into this many megabytes, the report not counted; fail, and write nothing,
     if the asset takes more all the same."""
@@ -310,7 +309,8 @@ class BakeConfig:
     """Gigabytes of memory that the bake may take: rays that are learned from and cells that are stored follow
     from it."""
     check_views: int = 4
-    """Views between the training cameras on which each step of the bake is measured."""
+    """Views between the training cameras on which each step of the bake is compared with the model's own
+    pictures."""
 
     def __post_init__(self) -> None:
         check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")

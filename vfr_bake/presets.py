@@ -50,7 +50,7 @@ class BakeChoice:
     mesh_resolution: int
     """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
     target_loss_db: float
-    """Expected loss that the preset aims at, dB."""
+    """Loss that the preset aims at, dB."""
 
 
 PRESETS: dict[Preset, BakeChoice] = {
