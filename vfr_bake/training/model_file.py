@@ -78,7 +78,8 @@ class Model:
         mean of what their cameras see, for what is missing there is a hole in a wall and no white."""
         if self.has_alpha or not self.field.config.unbounded:
             return np.ones(3, np.float32)
-        some = self.model_cameras()[:: max(1, len(self.cameras) // N_MEAN_VIEWS)]
+        cameras = self.model_cameras()
+        some = cameras[:: max(1, len(cameras) // N_MEAN_VIEWS)]
         seen = mean_colour(self.field, self.sampler, some)
         return (np.round(255 * seen) / 255).astype(np.float32)
 

@@ -114,6 +114,7 @@ def model_target(work: Path) -> Target:
     import torch
 
     from vfr_bake.config import FieldConfig
+    from vfr_bake.data.witnesses import Witnesses
     from vfr_bake.field.field import VfrField
     from vfr_bake.rendering.occupancy import OccupancyGrid
     from vfr_bake.training.model_file import Model, load_model, save_model
@@ -121,7 +122,12 @@ def model_target(work: Path) -> Target:
     path = work / "model.pt"
     cameras = read_cameras(written(work / "model_cameras.json", cameras_bytes()))
     field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
-    save_model(path, Model(field, OccupancyGrid(8, 0.2, seed=0), np.eye(4), cameras, False, {}, {}))
+    counts = np.zeros(len(cameras), np.int32)
+    counts[0] = 3
+    rgba, whole = np.zeros((3, 4), np.uint8), np.array([len(cameras) - 1], np.int32)
+    witnesses = Witnesses(counts, np.arange(3, dtype=np.int32), rgba, whole)
+    grid = OccupancyGrid(8, 0.2, seed=0)
+    save_model(path, Model(field, grid, np.eye(4), cameras, False, {}, {}, witnesses))
     load_model(path)  # compiles, or reads what was compiled before
     whole = path.read_bytes()
     content = torch.load(path, weights_only=True)
