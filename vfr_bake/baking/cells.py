@@ -3,7 +3,7 @@
 In an object's box, cells are stored that matter to the pictures. A sample's own weight says little about
 that: in a fog every sample of a ray weighs next to nothing, and all of them together are the picture. What
 counts is the sum along a ray. So cells whose samples weigh less than a floor in every view are left out only
-where the pictures without them lose next to nothing, measured on views that nothing else looks at.
+where the pictures without them lose next to nothing, measured on what nothing is learned from.
 
 An unbounded scene has no occupancy grid: where no view has ever put a sample, the field holds untrained
 values. A cell is stored only if the intervals that the proposals chose on some ray have weight in it.

@@ -9,9 +9,9 @@ loses compared with `before` is
 the difference of two PSNRs. Where there is one kind only, E is its mean.
 
 A bake adds much the same error to single pixels as to views that the model does not know, but the model's own
-error there is smaller: single pixels alone tell a larger loss than there is (docs/notes/2026-11-23-witnesses.md).
-Whole views have both errors as test views have them, but four views are few: one that is hard counts too
-much. The weights are those that came nearest to the loss on all test views, over several scenes.
+error there is smaller: single pixels alone tell a larger loss than there is. Whole views have both errors as
+test views have them, but four views are few: one that is hard counts too much. The weights are those that
+came nearest to the loss on all test views, over several scenes (docs/notes/2026-11-23-witnesses.md).
 """
 
 from __future__ import annotations
