@@ -24,6 +24,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import parse_transforms, transforms_cameras, write_cameras
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
+from player.march.pixels import rays_of_pixels
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
@@ -97,13 +98,11 @@ class Model:
             raise ConfigError(
                 "model: witnesses: expected some, got none: it was trained before there were any"
             )
-        ends = np.cumsum(self.witnesses.counts)[:-1]
-        rays = [
-            tuple(column[pixels] for column in camera.rays())
-            for camera, pixels in zip(
-                self._in_model_frame(), np.split(self.witnesses.pixels, ends), strict=True
-            )
-        ]
+        of_views = np.split(self.witnesses.pixels, np.cumsum(self.witnesses.counts)[:-1])
+        rays = []
+        for camera, pixels in zip(self._in_model_frame(), of_views, strict=True):
+            rows, columns = np.divmod(pixels, camera.width)
+            rays.append(rays_of_pixels(camera, columns, rows, 0.0))
         rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         return rays_o, rays_d
 
