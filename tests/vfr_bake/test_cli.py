@@ -202,8 +202,9 @@ def test_bake_needs_no_data_set_and_refuses_to_replace(
     ]
     assert bake_main([*arguments, "--json", str(tmp_path / "bake.json")]) == 0
     figures = json.loads((tmp_path / "bake.json").read_text())
-    # After 150 steps the model is half fog, of which no floor of visibility may take much.
-    assert figures["megabytes"] > 0 and figures["psnr_to_full_model"] > 40
+    # After 150 steps the model is half fog, which the photographs do not show and which may be left out.
+    assert figures["megabytes"] > 0 and figures["psnr_to_full_model"] > 20
+    assert figures["loss_db"] - figures["loss_db_spread"] < 0.1
     assert "vertices" in capsys.readouterr().out
     before = (tmp_path / "asset" / "manifest.json").read_bytes()
     assert bake_main(arguments) == 1
