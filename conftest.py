@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 # Before player is imported, here and in every process that a test starts: compiled code that writes beside
-# its arrays is found out (`player.compiled.scratch`).
+# its arrays is found out (`player.scratch`).
 os.environ["VFR_CANARIES"] = "1"
 
 LACKING = {

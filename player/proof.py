@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from player.child import python_command
-from player.compiled.compiling import SOURCES, available, first_use, not_kept
+from player.compiling import SOURCES, available, first_use, not_kept
 
 RIGHT, WRONG = "right", "wrong: "
 DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
@@ -66,8 +66,8 @@ def _known() -> str | None:
 
 def _record() -> Path | None:
     """The file of the verdict; None where nothing can be kept."""
-    from player.compiled.kept_code import place
     from player.compiled.processor import target
+    from player.kept_code import place
 
     folder = place(SOURCES).folder
     key = hashlib.sha256(repr(target()).encode()).hexdigest()[:16]

@@ -289,8 +289,7 @@ def choose_march(name: March) -> tuple[str, ModuleType]:
     Raises MissingExtraError: `name` is "numba", which is not installed or does not run here.
     """
     if name != "numpy":
-        from player import proof
-        from player.compiled import compiling
+        from player import compiling, proof
 
         if compiling.available() and not proof.refuted():
             from player.compiled import march as march_compiled

@@ -38,8 +38,6 @@ TOP_LEVEL_EXCEPTIONS = {
     *(
         (f"player/compiled/{name}.py", "numba")
         for name in (
-            "compiling",
-            "kept_code",
             "processor",
             "lanes",
             "packets",
@@ -48,6 +46,7 @@ TOP_LEVEL_EXCEPTIONS = {
             "add_rows",
         )
     ),
+    *((f"player/{name}.py", "numba") for name in ("compiling", "kept_code")),
     *((f"player/head/{name}.py", "numba") for name in ("activations", "dense_tiles")),
     ("vfr_bake/options.py", "tyro"),
     ("player/viewer/guard.py", "websockets"),

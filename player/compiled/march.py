@@ -13,7 +13,6 @@ import numpy as np
 
 from player.asset.grid import SparseGrid
 from player.compiled.add_rows import CHANNELS, add_rows
-from player.compiled.compiling import compiled, inlined
 from player.compiled.fetches import Stored, choose_fetches, stored_corners
 from player.compiled.lanes import LANES
 from player.compiled.packets import (
@@ -34,11 +33,12 @@ from player.compiled.packets import (
     place_fetches,
 )
 from player.compiled.prefetch import prefetch
-from player.compiled.scratch import check_scratch, scratch
+from player.compiling import compiled, inlined
 from player.march.box import Bounds
 from player.march.contracted import MAX_SPEED, enter_space
 from player.march.fetches import MIN_TOTAL
 from player.march.march import MIN_OPACITY, MarchResult
+from player.scratch import check_scratch, scratch
 
 F32 = np.float32
 

@@ -11,10 +11,10 @@ import math
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.compiled.compiling import compiled
-from player.compiled.scratch import check_scratch, scratch
+from player.compiling import compiled
 from player.march.march import MarchResult
 from player.march.pixels import Planes
+from player.scratch import check_scratch, scratch
 
 F32 = np.float32
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.compiled.compiling import compiled
-from player.compiled.scratch import check_scratch, scratch
+from player.compiling import compiled
 from player.head.activations import (
     GELU,
     SIGMOID,
@@ -39,6 +38,7 @@ from player.head.program import (
     ROUND,
     Program,
 )
+from player.scratch import check_scratch, scratch
 
 
 class CompiledHead:

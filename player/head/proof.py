@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from player.compiled.compiling import compiled
+from player.compiling import compiled
 from player.head.activations import gelu_lanes, quantize_lanes, sigmoid_lanes
 from player.head.dense_tiles import (
     LANES,

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from player import proof
+from player import kept_code, proof
 from player.app.cli import main
 from player.asset.asset import Asset
 from player.cameras.transforms import read_cameras
-from player.compiled import kept_code
 from player.compiled import march as march_compiled
 from player.errors import MissingExtraError
 from player.head import proof as proof_head

@@ -144,7 +144,7 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
         render(asset, camera, n_fetches=-1)
     with pytest.raises(ConfigError, match="threads: expected at least 1, got 0"):
         Renderer(asset, 0)
-    monkeypatch.setattr("player.compiled.compiling.numba", None)
+    monkeypatch.setattr("player.compiling.numba", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[fast\]'"):
         Renderer(asset, 1, "numba")
     with Renderer(asset, 1) as renderer:

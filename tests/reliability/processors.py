@@ -31,7 +31,7 @@ TESTS = (
     ),
     *(
         "tests/player/head/test_head_compiled.py",
-        "tests/player/compiled/test_scratch.py",
+        "tests/player/test_scratch.py",
         "tests/player/test_render.py",
     ),
     *("tests/numerics", "tests/vfr_bake/field", "tests/vfr_bake/rendering"),

@@ -14,7 +14,7 @@ import numba
 from numba import config
 
 import player
-from player.compiled.kept_code import keep
+from player.kept_code import keep
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
@@ -26,7 +26,7 @@ SOURCES = Path(__file__).parent, Path(player.__file__).parent
 
 def njit(cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile with `numba.njit`; with `cache`, compiled code is kept until one of `SOURCES` changes
-    (`player.compiled.kept_code`)."""
+    (`player.kept_code`)."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)

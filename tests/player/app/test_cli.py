@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from player import compiling
 from player.app import cli
-from player.compiled import compiling
 from player.files import files
 from player.render import Renderer
 

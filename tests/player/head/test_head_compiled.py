@@ -10,13 +10,13 @@ import pytest
 
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
-from player.compiled.scratch import CANARIES
 from player.errors import FormatError
 from player.head.compiled import CompiledHead
 from player.head.dense_tiles import MULTIPLIES_BYTES
 from player.head.graph import read_head
 from player.head.head import CHUNK, Head
 from player.head.program import BLOCK, DENSE_BYTES, QUANTIZE, ROUND, program_of
+from player.scratch import CANARIES
 from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.player.head.heads import head_onnx_of_before, play_in_integers
 

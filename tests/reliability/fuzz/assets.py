@@ -27,7 +27,7 @@ from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
 from player.asset.packing import pack_codes, pack_masks
 from player.asset.unpacking import PLACES
-from player.compiled.compiling import available
+from player.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
 from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value

@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 
 from exporters.head.onnx_head import head_onnx
-from player.compiled.compiling import available
+from player.compiling import available
 from player.head.head import Head
 from tests.exporters.head.test_onnx_head import random_head
 from tests.reliability.fuzz.broken import broken_bytes

@@ -255,8 +255,7 @@ def is_compiled(site: Site) -> bool:
     """Whether numba compiles the file anew: those take longest, and are run last."""
     text = (REPOSITORY / site.path).read_text(encoding="utf-8")
     return any(
-        word in text
-        for word in ("import njit", "player.compiled.compiling", "player.compiled.lanes", "llvmlite")
+        word in text for word in ("import njit", "player.compiling", "player.compiled.lanes", "llvmlite")
     )
 
 

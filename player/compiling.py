@@ -11,9 +11,9 @@ try:
 except ImportError:  # an extra: without it the numpy twin of whatever is compiled runs
     numba = None
 else:
-    from player.compiled.kept_code import keep, place
+    from player.kept_code import keep, place
 
-SOURCES = Path(__file__).parent.parent
+SOURCES = Path(__file__).parent
 """The sources of all compiled code of the player: whatever lies in this folder and below."""
 
 

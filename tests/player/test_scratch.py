@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from player import scratch
 from player.asset.asset import Asset
-from player.compiled import march, scratch
-from player.compiled.compiling import compiled
-from player.compiled.scratch import check_scratch
+from player.compiled import march
+from player.compiling import compiled
+from player.scratch import check_scratch
 from tests.player.march.contracted_scene import contracted_grid
 from tests.player.march.test_contracted_march import bumps, some_rays
 from tests.player.march.test_march import random_rays
@@ -110,7 +111,7 @@ def test_a_march_looks_beside_every_array_that_it_writes(
 
 def test_without_canaries_there_is_the_array_alone() -> None:
     program = (
-        "from player.compiled.scratch import scratch, check_scratch; "
+        "from player.scratch import scratch, check_scratch; "
         "a = scratch((2, 3), 'i4', 5); check_scratch(a); "
         "print(a.base is None, a.tolist(), scratch(2, 'f4', 0).tolist())"
     )

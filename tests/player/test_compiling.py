@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 from numba.core import registry
 
-from player.compiled import compiling, kept_code
-from player.compiled.kept_code import N_KEPT, Place, place, sources_digest
+from player import compiling, kept_code
 from player.compiled.processor import target
+from player.kept_code import N_KEPT, Place, place, sources_digest
 
 USER = """
 import sys
 from pathlib import Path
 import numba
-from player.compiled import kept_code
+from player import kept_code
 from other import part
 
 @numba.njit
