@@ -1,0 +1,377 @@
+"""The entropy coder: a decoder of plain integers, twins that agree on everything, and broken bytes."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from player import compiling
+from player.asset.coder import arrays, coder
+from player.asset.coder.coder import MAX_LANES, Decoder, decode, encode
+from player.asset.coder.lanes import Lanes, Neighbours
+from player.asset.coder.tables import (
+    CONTEXT_OF_SUM,
+    END,
+    MIXED,
+    N_CONTEXTS,
+    N_SYMBOLS,
+    TOTAL,
+    context,
+    fit_tables,
+    unpack_tables,
+)
+from player.errors import FormatError, ShapeError
+
+TWINS = ["numpy", "numba"]
+
+
+@pytest.fixture(params=TWINS)
+def twin(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return use(request.param, monkeypatch)
+
+
+def use(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Decode with this twin alone."""
+    from player.asset.coder import compiled
+
+    assert compiling.available()
+    module = arrays if name == "numpy" else compiled
+    monkeypatch.setattr(coder, "_twin", lambda: module)
+    return module
+
+
+def test_compiled_code_is_chosen_where_there_is_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert coder._twin().__name__ == "player.asset.coder.compiled"
+    monkeypatch.setattr(compiling, "numba", None)
+    assert coder._twin() is arrays
+
+
+class Oracle:
+    """A section, read one symbol at a time with Python's integers, by the text of `docs/format.md`."""
+
+    def __init__(self, data: bytes, neighbours: Neighbours, n_channels: int, n_classes: int) -> None:
+        self.n, self.rows = neighbours.n, neighbours.rows.tolist()
+        self.n_lanes, n_packed, n_words = struct.unpack_from("<III", data)
+        content = zlib.decompress(data[12 : 12 + n_packed])
+        n_named = n_channels * n_classes * 81
+        self.named, n_tables = content[:n_named], content[n_named]
+        at = n_named + 1 + 2 * n_tables
+        self.tables = []
+        for table in range(n_tables):
+            first, n_symbols = content[n_named + 1 + 2 * table : n_named + 3 + 2 * table]
+            counts = struct.unpack_from(f"<{n_symbols}H", content, at)
+            at += 2 * n_symbols
+            places = [(first - 63 + i, place) for i, c in enumerate(counts) for place in range(c)]
+            self.tables.append((places, {first - 63 + i: c for i, c in enumerate(counts)}))
+        at = 12 + n_packed
+        self.states = list(struct.unpack_from(f"<{self.n_lanes}I", data, at))
+        at += 4 * self.n_lanes
+        self.words = list(struct.unpack_from(f"<{n_words}H", data, at))[::-1]
+        self.beyond = list(data[at + 2 * n_words :])[::-1]
+        self.n_classes = n_classes
+
+    def channel(self, number: int, classes: list[int]) -> list[int]:
+        found: dict[int, int] = {}
+        runs, row = [], 0
+        for lane in range(self.n_lanes):
+            length = self.n // self.n_lanes + (lane < self.n % self.n_lanes)
+            runs.append(range(row, row + length))
+            row += length
+        for step in range(len(runs[0])):
+            coded = {}
+            for lane, run in enumerate(runs):
+                if step < len(run):
+                    coded[run[step]] = self.symbol(lane, number, run[step], classes, found)
+            found |= coded
+        for row in range(self.n):
+            if abs(found[row]) == 63:
+                found[row] += (1 if found[row] > 0 else -1) * self.beyond.pop()
+        return [found[row] for row in range(self.n)]
+
+    def symbol(self, lane: int, channel: int, row: int, classes: list[int], found: dict[int, int]) -> int:
+        near = [max(-15, min(15, found.get(rows[row], 0))) for rows in self.rows]
+        total, lean = sum(map(abs, near)), sum(near)
+        side = sum(bound <= abs(lean) for bound in (1, 2, 4, 8)) * (1 if lean > 0 else -1)
+        rise = sum(bound <= total for bound in (1, 2, 3, 5, 8, 12, 18, 30))
+        name = (channel * self.n_classes + classes[row]) * 81 + rise * 9 + side + 4
+        places, counts = self.tables[self.named[name]]
+        x = self.states[lane]
+        symbol, place = places[x % 4096]
+        x = counts[symbol] * (x // 4096) + place
+        if x < 65536:
+            x = x * 65536 + self.words.pop()
+        self.states[lane] = x
+        return symbol
+
+
+def oracle(data: bytes, neighbours: Neighbours, classes: list[np.ndarray], n_classes: int) -> np.ndarray:
+    read = Oracle(data, neighbours, len(classes), n_classes)
+    found = [read.channel(i, each.tolist()) for i, each in enumerate(classes)]
+    assert not read.words and not read.beyond and set(read.states) == {65536}
+    return np.array(found).T
+
+
+def case(
+    n: int, n_channels: int, scale: float, seed: int = 0, n_classes: int = 3
+) -> tuple[np.ndarray, Neighbours, list[np.ndarray], int]:
+    """Symbols that lean on their neighbours; every tenth neighbour is not there, some come later."""
+    random = np.random.default_rng(seed)
+    rows = np.arange(n)[None] - np.array([[1], [7], [40]])
+    rows = np.where(random.random((3, n)) < 0.05, random.integers(0, max(n, 1), (3, n)), rows)
+    rows = np.where((rows < 0) | (random.random((3, n)) < 0.1), -1, rows).astype(np.int32)
+    classes = [random.integers(0, n_classes, n).astype(np.uint8) for _ in range(n_channels)]
+    width = scale * (1 + 2 * np.stack(classes, axis=-1)) if n_channels else np.zeros((n, 0))
+    smooth = np.cumsum(random.normal(0, 0.3, (n, n_channels)), axis=0)
+    symbols = np.rint(random.laplace(0, 1, (n, n_channels)) * width + scale * np.sin(smooth))
+    return np.clip(symbols, -255, 255).astype(np.int16), Neighbours(rows), classes, n_classes
+
+
+CASES = {
+    "nothing": (0, 3, 1.0),
+    "no channels": (5, 0, 1.0),
+    "one": (1, 1, 1.0),
+    "fewer rows than lanes would be": (255, 2, 1.0),
+    "a row more than lanes": (513, 2, 1.0),
+    "zeros": (3000, 2, 0.0),
+    "few": (3000, 3, 0.1),
+    "many": (5000, 2, 3.0),
+    "ends and beyond": (2000, 2, 120.0),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_was_encoded_is_decoded(name: str, twin: ModuleType) -> None:
+    symbols, neighbours, classes, n_classes = case(*CASES[name])
+    data = encode(symbols, neighbours, classes, n_classes)
+    found = decode(data, neighbours, classes, n_classes, "here")
+    assert found.dtype == np.int16 and found.shape == symbols.shape
+    assert np.array_equal(found, symbols)
+    if symbols.size:
+        assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+    else:
+        assert data == b""
+
+
+@pytest.mark.parametrize("value", [-255, -64, -63, -62, 62, 63, 64, 255])
+def test_ends(value: int, twin: ModuleType) -> None:
+    symbols, neighbours, classes, n_classes = case(700, 2, 1.0)
+    symbols[::9, 0], symbols[5:9, 1] = value, value
+    data = encode(symbols, neighbours, classes, n_classes)
+    assert np.array_equal(decode(data, neighbours, classes, n_classes, "here"), symbols)
+    assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+
+
+@given(
+    n=st.integers(1, 900),
+    n_channels=st.integers(1, 3),
+    scale=st.sampled_from([0.01, 0.3, 2.0, 30.0]),
+    seed=st.integers(0, 1000),
+)
+@example(n=512, n_channels=1, scale=0.3, seed=0)
+@settings(max_examples=60, deadline=None)
+def test_any_symbols(n: int, n_channels: int, scale: float, seed: int) -> None:
+    symbols, neighbours, classes, n_classes = case(n, n_channels, scale, seed)
+    data = encode(symbols, neighbours, classes, n_classes)
+    for name in TWINS:
+        with pytest.MonkeyPatch.context() as patch:
+            use(name, patch)
+            assert np.array_equal(decode(data, neighbours, classes, n_classes, "here"), symbols)
+    assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+
+
+def test_bytes_are_as_few_as_the_contexts_allow() -> None:
+    symbols, neighbours, classes, n_classes = case(200_000, 1, 1.0)
+    data = encode(symbols, neighbours, classes, n_classes)
+    share = np.bincount(symbols[:, 0] + 255) / len(symbols)
+    order_0 = -(share[share > 0] * np.log2(share[share > 0])).sum() * len(symbols) / 8
+    assert len(data) < 0.97 * order_0
+    # a section of one symbol alone costs its tables and four bytes a lane
+    zeros = encode(np.zeros_like(symbols), neighbours, classes, n_classes)
+    assert len(zeros) < 4 * (200_000 >> 12) + 80
+
+
+def test_contexts_by_their_sums() -> None:
+    random = np.random.default_rng(0)
+    symbols = random.integers(-END, END + 1, (3, 10000)) // random.integers(1, 40, 10000)
+    sums = MIXED[symbols + END].astype(int).sum(axis=0)
+    assert np.array_equal(CONTEXT_OF_SUM[sums + 64], context(symbols))
+    assert context(np.full((3, 1), END)) == 80 and context(np.full((3, 1), -END)) == 72
+
+
+def test_tables_cost_what_they_say() -> None:
+    random = np.random.default_rng(0)
+    seen = random.poisson(3 * np.exp(-np.abs(np.arange(-END, END + 1)) / 2), (2, 3, N_CONTEXTS, N_SYMBOLS))
+    seen[:, 1] = 0  # contexts that never come
+    seen[0, 0, 5, 0] = 10**6  # and one that comes for nothing else
+    tables, n_bits = fit_tables(seen)
+    assert (tables.counts.sum(axis=1) == TOTAL).all()
+    counts = tables.counts[tables.of_context].astype(float)
+    assert (counts[seen > 0] > 0).all()
+    assert n_bits == pytest.approx((seen[seen > 0] * (12 - np.log2(counts[seen > 0]))).sum())
+    again = unpack_tables(tables.packed(), 2, 3, "here")
+    assert all(np.array_equal(*pair) for pair in zip(again, tables, strict=True))
+
+
+def test_lanes_are_runs_of_rows() -> None:
+    for n, n_lanes in ((1, 1), (7, 3), (9, 3), (10, 10), (11, 10), (4096, 1)):
+        lanes = Lanes(n, n_lanes)
+        order = lanes.in_order(np.arange(n))
+        assert np.array_equal(lanes.by_row(order), np.arange(n))
+        assert np.array_equal(lanes.step()[order], np.arange(n) // n_lanes)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda s, n, c: (s[:-1], n, c, 3),
+        lambda s, n, c: (s, n, c[:-1], 3),
+        lambda s, n, c: (s, n, [each[:-1] for each in c], 3),
+        lambda s, n, c: (s, n, c, 2),
+        lambda s, n, c: (s + 256, n, c, 3),
+        lambda s, n, c: (s - 256, n, c, 3),
+        lambda s, n, c: (s[:, 0], n, c, 3),
+    ],
+)
+def test_what_cannot_be_encoded(wrong: Callable[..., tuple]) -> None:
+    symbols, neighbours, classes, _ = case(100, 2, 1.0)
+    with pytest.raises(ShapeError, match="coder: "):
+        encode(*wrong(symbols, neighbours, classes))
+
+
+# ---------------------------------------------------------------------------------------------- broken bytes
+
+SYMBOLS, ROWS, CLASSES, N_CLASSES = case(1500, 2, 0.8)
+SYMBOLS[3:2000:50] *= 60
+SYMBOLS.clip(-255, 255, out=SYMBOLS)
+WHOLE = encode(SYMBOLS, ROWS, CLASSES, N_CLASSES)
+N_LANES, N_PACKED, N_WORDS = struct.unpack_from("<III", WHOLE)
+STATES = 12 + N_PACKED
+
+
+def outcome(data: bytes, name: str) -> str | bytes:
+    """The symbols, or the message of the error."""
+    with pytest.MonkeyPatch.context() as patch:
+        use(name, patch)
+        try:
+            return decode(data, ROWS, CLASSES, N_CLASSES, "here").tobytes()
+        except FormatError as error:
+            assert str(error).startswith("here: ")
+            return str(error)
+
+
+def refused(data: bytes) -> str:
+    """What both twins say about broken bytes."""
+    found, other = (outcome(data, name) for name in TWINS)
+    assert found == other and isinstance(found, str)
+    return found
+
+
+def with_tables(change: Callable[[bytearray], None]) -> bytes:
+    content = bytearray(zlib.decompress(WHOLE[12:STATES]))
+    change(content)
+    packed = zlib.compress(bytes(content))
+    return struct.pack("<III", N_LANES, len(packed), N_WORDS) + packed + WHOLE[STATES:]
+
+
+N_NAMED = 2 * N_CLASSES * N_CONTEXTS
+
+
+def _put(at: int, value: int) -> Callable[[bytearray], None]:
+    return lambda content: content.__setitem__(at, value)
+
+
+BROKEN = {
+    "nothing": (b"", "header"),
+    "a byte": (b"\x01", "header"),
+    "no lanes": (struct.pack("<I", 0) + WHOLE[4:], "lanes: expected 1 to 1500, got 0"),
+    "more lanes than rows": (struct.pack("<I", 1501) + WHOLE[4:], "lanes: expected 1 to 1500"),
+    "4294967295 lanes": (struct.pack("<I", 2**32 - 1) + WHOLE[4:], "lanes: "),
+    "another number of lanes": (struct.pack("<I", N_LANES - 1) + WHOLE[4:], ""),
+    "more words than bytes": (WHOLE[:8] + struct.pack("<I", 2**32 - 1) + WHOLE[12:], "expected at least"),
+    "longer tables than bytes": (WHOLE[:4] + struct.pack("<I", 2**32 - 1) + WHOLE[8:], "expected at least"),
+    "a word less": (WHOLE[:8] + struct.pack("<I", N_WORDS - 1) + WHOLE[12:], ""),
+    "cut": (WHOLE[:-200], ""),
+    "a byte more": (WHOLE + b"\0", "symbols beyond 63: expected"),
+    "a byte less": (WHOLE[:-1], "symbols beyond 63: expected more than"),
+    "far beyond": (WHOLE[:-1] + b"\xc1", "symbols: expected magnitudes up to 255"),
+    "a low state": (WHOLE[:STATES] + struct.pack("<I", 65535) + WHOLE[STATES + 4 :], "states: "),
+    "another state": (WHOLE[:STATES] + struct.pack("<I", 65536) + WHOLE[STATES + 4 :], ""),
+    "another word": (WHOLE[: STATES + 4 * N_LANES + 40] + b"\x55" + WHOLE[STATES + 4 * N_LANES + 41 :], ""),
+    "no zlib": (WHOLE[:12] + b"\0" + WHOLE[13:], "tables: expected a zlib stream"),
+    "counts that add up to less": (with_tables(_put(-2, 0)), "tables: "),
+    "no tables": (with_tables(_put(N_NAMED, 0)), "tables: "),
+    "65 tables": (with_tables(_put(N_NAMED, 65)), "tables: "),
+    "a table of no symbols": (with_tables(_put(N_NAMED + 2, 0)), "tables: "),
+    "a symbol too large": (with_tables(_put(N_NAMED + 1, 127)), "tables: "),
+    "a context of no table": (with_tables(_put(7, 200)), "tables: "),
+    "fewer contexts": (with_tables(lambda content: content.__delitem__(slice(0, 1))), "tables: "),
+    "a table's byte more": (with_tables(lambda content: content.append(0)), "tables: "),
+    "tables without end": (with_tables(lambda content: content.extend(bytes(10**7))), "tables: "),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_bytes(name: str) -> None:
+    data, said = BROKEN[name]
+    assert said in refused(data)
+
+
+@given(
+    cut=st.integers(0, len(WHOLE)),
+    changes=st.lists(st.tuples(st.integers(0, len(WHOLE) - 1), st.integers(1, 255)), max_size=4),
+    more=st.binary(max_size=20),
+)
+@settings(max_examples=200, deadline=None)
+def test_changed_bytes(cut: int, changes: list[tuple[int, int]], more: bytes) -> None:
+    """Whatever is changed: the twins say the same, and damage to what rANS decodes is seen."""
+    data = bytearray(WHOLE)
+    for at, by in changes:
+        data[at] ^= by
+    data = bytes(data if cut % 3 else data[:cut]) + more
+    found, other = (outcome(data, name) for name in TWINS)
+    assert found == other
+    if isinstance(found, bytes) and data[: len(data) - 40] != WHOLE[: len(data) - 40]:
+        assert found == SYMBOLS.tobytes() or data[:12] == WHOLE[:12]
+
+
+@given(st.binary(max_size=300), st.integers(1, 60))
+@settings(max_examples=200, deadline=None)
+def test_random_bytes(content: bytes, n_lanes: int) -> None:
+    packed = WHOLE[12:STATES]
+    for data in (content, struct.pack("<III", n_lanes, N_PACKED, 7) + packed + content):
+        found, other = (outcome(data, name) for name in TWINS)
+        assert found == other
+
+
+def test_no_damaged_word_passes() -> None:
+    begin = STATES
+    end = len(WHOLE) - int((np.abs(SYMBOLS) >= END).sum())
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        data = bytearray(WHOLE)
+        data[random.integers(begin, end)] ^= 1 << random.integers(0, 8)
+        refused(bytes(data))
+
+
+def test_channels_are_read_one_by_one_and_all_of_them(twin: ModuleType) -> None:
+    decoder = Decoder(WHOLE, ROWS, 2, N_CLASSES, "here")
+    assert np.array_equal(decoder.channel(CLASSES[0]), SYMBOLS[:, 0])
+    with pytest.raises(FormatError, match="words: expected"):
+        decoder.finish()
+    assert np.array_equal(decoder.channel(CLASSES[1]), SYMBOLS[:, 1])
+    decoder.finish()
+
+
+def test_nothing_is_written_for_nothing() -> None:
+    none = Neighbours(np.zeros((3, 0), np.int32))
+    assert decode(b"", none, [np.zeros(0, np.uint8)], 1, "here").shape == (0, 1)
+    with pytest.raises(FormatError, match="here: expected no bytes for no symbols, got 1"):
+        decode(b"\0", none, [np.zeros(0, np.uint8)], 1, "here")
+    assert MAX_LANES == 4096
