@@ -52,7 +52,7 @@ LOW = 1 << 16
 """The lowest state, with which encoding begins."""
 
 _HEADER = struct.Struct("<III")
-_MOST_CODED = 2048
+_MOST_CODED = 1024
 """Lanes that an encoder uses at most: each costs two bytes, and twice as many are hardly faster."""
 _LANE_BITS = 2048
 """Bits that an encoder gives a lane, if there are so many."""
@@ -208,7 +208,8 @@ class Decoder:
         if len(data) < end:
             raise FormatError(f"{where}: expected at least {end} bytes, got {len(data)}")
         tables = unpack_tables(data[_HEADER.size : begin], n_channels, n_classes, where)
-        self._entries, self._of_context = tables.entries(), tables.of_context
+        self._lookup, self._of_context = tables.lookup(), tables.of_context
+        self._has_ends = bool(tables.counts[:, [0, -1]].any())
         self._states = np.frombuffer(data, "<u4", n_lanes, begin).astype(np.uint32)
         if (self._states < LOW).any():
             raise FormatError(f"{where}: states: expected {LOW} or more, got {self._states.min()}")
@@ -226,11 +227,11 @@ class Decoder:
             return np.zeros(self._neighbours.n, np.int16)
         if classes is not self._by_row:
             self._by_row, self._classes = classes, self._lanes.in_order(classes)
-        found, self._at, n_ends = _twin().decode_channel(
+        found, self._at = _twin().decode_channel(
             self._words,
             self._at,
             self._states,
-            self._entries,
+            self._lookup,
             self._of_context[self._channel],
             self._classes,
             self._neighbours.in_order(self._lanes),
@@ -238,11 +239,11 @@ class Decoder:
         if self._at < 0:
             raise FormatError(f"{self._where}: words: expected more than {self._n_words}")
         self._channel += 1
-        if n_ends:
+        if self._has_ends:
             ends = np.flatnonzero(np.abs(found) == END)
-            beyond = self._beyond[self._n_beyond : self._n_beyond + n_ends]
-            self._n_beyond += n_ends
-            if len(beyond) < n_ends:
+            beyond = self._beyond[self._n_beyond : self._n_beyond + len(ends)]
+            self._n_beyond += len(ends)
+            if len(beyond) < len(ends):
                 raise FormatError(
                     f"{self._where}: symbols beyond {END}: expected more than {len(self._beyond)}"
                 )

@@ -21,6 +21,7 @@ BITS = 12
 """Probabilities are whole 4096ths."""
 TOTAL = 1 << BITS
 MAX_TABLES = 64
+SYMBOL_BITS = 7
 
 NEAR = 15
 """Neighbours' symbols count as -15 to 15."""
@@ -78,6 +79,15 @@ CONTEXT_OF_SUM = _contexts_of_sums()
 """[N_MIXED] uint8: `context` by the sum of the three neighbours' `mixed` symbols and 64."""
 
 
+class Lookup(NamedTuple):
+    """Tables as a decoder reads them."""
+
+    symbols: np.ndarray
+    """[n_tables * 4096] uint8: the symbol + 63 at each place."""
+    places: np.ndarray
+    """[n_tables * 128] uint32: for each symbol + 63 its count, times 2^16, and where its places begin."""
+
+
 class Tables(NamedTuple):
     """The tables of a section."""
 
@@ -86,18 +96,13 @@ class Tables(NamedTuple):
     of_context: np.ndarray
     """[n_channels, n_classes, 81] uint8: the table of each context."""
 
-    def entries(self) -> np.ndarray:
-        """[n_tables * 4096] uint32: what a decoder does at each of the 4096 places of each table.
-
-        Bits 24 to 31 are the symbol + 63, bits 12 to 23 its count - 1, bits 0 to 11 how many places of the
-        same symbol come before.
-        """
-        table, symbol = np.nonzero(self.counts)
-        counts = self.counts[table, symbol].astype(np.int64)
-        packed = ((symbol << 24) | ((counts - 1) << BITS)).astype(np.uint32)
-        first = np.cumsum(counts) - counts
-        places = np.arange(len(self.counts) * TOTAL) - np.repeat(first, counts)
-        return np.repeat(packed, counts) | places.astype(np.uint32)
+    def lookup(self) -> Lookup:
+        """The tables as a decoder reads them."""
+        first = np.cumsum(self.counts, axis=1, dtype=np.uint32) - self.counts
+        places = np.zeros((len(self.counts), 1 << SYMBOL_BITS), np.uint32)
+        places[:, :N_SYMBOLS] = (self.counts.astype(np.uint32) << 16) | first
+        symbols = np.tile(np.arange(N_SYMBOLS, dtype=np.uint8), len(self.counts))
+        return Lookup(symbols.repeat(self.counts.reshape(-1)), places.reshape(-1))
 
     def packed(self) -> bytes:
         """The tables as bytes: zlib of the tables' indices by context, the number of tables, the first symbol
