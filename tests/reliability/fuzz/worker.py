@@ -27,6 +27,7 @@ from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.fuzz.assets import BrokenAsset, asset_targets, whole_asset
 from tests.reliability.fuzz.data import camera_targets, colmap_targets, model_target, picture_target
 from tests.reliability.fuzz.heads import head_targets
+from tests.reliability.fuzz.sections import section_targets
 from tests.reliability.fuzz.targets import Target, written
 
 LIMIT_SECONDS = 20.0
@@ -92,6 +93,7 @@ def targets(work: Path) -> list[Target]:
         *camera_targets(work),
         *colmap_targets(work),
         *head_targets(work, head),
+        *section_targets(),
         picture_target(work),
         model_target(work),
     ]
