@@ -85,12 +85,13 @@ class Neighbours:
     def in_order(self, lanes: Lanes) -> np.ndarray:
         """[3, n] uint32: the neighbours of the rows in the order of coding, n for one that is not there; the
         last answer is kept."""
-        if lanes not in self._kept:
+        found = self._kept.get(lanes)
+        if found is None:
             found = np.stack([lanes.in_order(rows) for rows in self.rows]).view(np.uint32)
             np.minimum(found, np.uint32(self.n), out=found)  # -1 is the highest of all
             self._kept.clear()
             self._kept[lanes] = found
-        return self._kept[lanes]
+        return found
 
     def known(self, lanes: Lanes) -> np.ndarray:
         """[3, n] int32: the neighbours of each row that are coded before it, n for the others."""

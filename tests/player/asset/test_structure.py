@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from player.asset.bricks import pack_vertices, stored_bits
+from player.asset.bricks import pack_vertices, stored_bits, unpack_vertices
 from player.asset.coder import coder
+from player.asset.coder.lanes import Neighbours
 from player.asset.pyramid import Bricks, Pyramid, coarser, whole_pyramid
 from player.asset.structure import (
     MUST,
@@ -24,6 +26,7 @@ from player.asset.structure import (
 from player.asset.symbols import N_CLASSES as N_PARITIES
 from player.asset.symbols import decode_level, encode_level, level_rows
 from player.errors import FormatError, ShapeError
+from tests.player.asset.coder.oracle import Oracle
 
 
 def bricks_of(cells: np.ndarray) -> Bricks:
@@ -139,6 +142,85 @@ def test_classes_count_what_is_known() -> None:
 
 
 FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+
+
+def oracle_bricks(pyramid: Pyramid, level: int, data: bytes) -> set[tuple[int, ...]]:
+    """The live cells of a level, by the text of `docs/format.md`, one symbol at a time."""
+    parts, at = [], 0
+    while at < len(data):
+        (length,) = struct.unpack_from("<I", data, at)
+        parts.append(data[at + 4 : at + 4 + length])
+        at += 4 + length
+    if level + 1 < len(pyramid.levels):
+        live = cells_of(pyramid.levels[level + 1])
+        octants = sorted({tuple(i >> 2 for i in cell) for cell in live})
+        flags = oracle_section(parts[0], octants, 1, 1, lambda *_: 0)[0]
+        bricks = [octant for octant, flag in zip(octants, flags, strict=True) if flag]
+        return oracle_children(parts[1], live, bricks)
+    live = {(0, 0, 0)}
+    for part in parts:
+        live = oracle_children(part, live, sorted({tuple(i >> 2 for i in cell) for cell in live}))
+    return live
+
+
+def cells_of(bricks: Bricks) -> set[tuple[int, ...]]:
+    return set(map(tuple, unpack_vertices(bricks.coords, bricks.masks).tolist()))
+
+
+def oracle_section(
+    data: bytes, places: list, n_channels: int, n_classes: int, of: Callable[[int, list, list], int]
+) -> list[list[int]]:
+    """Channels of a section whose rows are at places; `of` gives the class from the channel, the place, and
+    what is decoded."""
+    number = {place: row for row, place in enumerate(places)}
+    rows = [[number.get((x, y, z - 1), -1) for x, y, z in places]]
+    rows += [[number.get((x, y - 1, z), -1) for x, y, z in places]]
+    rows += [[number.get((x - 1, y, z), -1) for x, y, z in places]]
+    read = Oracle(data, Neighbours(np.array(rows, np.int32)), n_channels, n_classes)
+    found: list[list[int]] = []
+    for channel in range(n_channels):
+        found.append(read.channel(channel, [of(channel, place, found) for place in places]))
+    assert not read.words and not read.beyond and set(read.states) == {65536}
+    return found
+
+
+def oracle_children(data: bytes, live: set, bricks: list) -> set[tuple[int, ...]]:
+    """The live children of live cells in octants that have a brick."""
+    refined = set(bricks)
+    parents = [cell for cell in live if tuple(i >> 2 for i in cell) in refined]
+    parents.sort(key=lambda cell: (tuple(i >> 2 for i in cell), tuple(i & 3 for i in cell)))
+    number = {place: row for row, place in enumerate(parents)}
+
+    def status(cell: tuple[int, ...], found: list[list[int]]) -> int | None:
+        x, y, z = cell
+        parent, child = (x >> 1, y >> 1, z >> 1), 4 * (x & 1) + 2 * (y & 1) + (z & 1)
+        if parent not in live:
+            return 0
+        if parent not in number:
+            return 1
+        return found[child][number[parent]] if child < len(found) else None
+
+    def class_of(channel: int, place: tuple[int, ...], found: list[list[int]]) -> int:
+        if channel == 7 and not any(found[other][number[place]] for other in range(7)):
+            return 49
+        x, y, z = (2 * i + (channel >> shift & 1) for i, shift in zip(place, (2, 1, 0), strict=True))
+        known = [status((x + dx, y + dy, z + dz), found) for dx, dy, dz in FACES]
+        return 7 * known.count(1) + known.count(0)
+
+    flags = oracle_section(data, parents, 8, 50, class_of)
+    return {
+        tuple(2 * i + (child >> shift & 1) for i, shift in zip(parent, (2, 1, 0), strict=True))
+        for child in range(8)
+        for parent, flag in zip(parents, flags[child], strict=True)
+        if flag
+    }
+
+
+@pytest.mark.parametrize("name", ["a corner", "a shell of three"])
+def test_structure_is_as_it_is_specified(name: str) -> None:
+    pyramid = PYRAMIDS[name]
+    for level, bricks in enumerate(pyramid.levels):
+        assert oracle_bricks(pyramid, level, encode_structure(pyramid, level)) == cells_of(bricks)
 
 
 def test_what_is_no_pyramid_is_not_encoded() -> None:
