@@ -35,7 +35,7 @@ N_MIXED = (3 * NEAR + 1) << 7
 """Numbers that `mixed` symbols and 64 add up to."""
 HALF = 64
 
-TABLE_BITS = 12.0 * 4
+TABLE_BITS = 48.0
 """What the encoder takes another table to cost, beside a byte for each symbol in it."""
 
 

@@ -128,7 +128,7 @@ def test_classes_count_what_is_known() -> None:
         at = 2 * position + [child >> 2, (child >> 1) & 1, child & 1] + 1
         expected = []
         for x, y, z in at.tolist():
-            faces = [dense[x + dx, y + dy, z + dz] for dx, dy, dz in FACES]
+            faces = [int(dense[x + dx, y + dy, z + dz]) for dx, dy, dz in FACES]
             expected.append(7 * faces.count(1) + faces.count(0))
         if child == 7:
             for row, (x, y, z) in enumerate(at.tolist()):
@@ -168,7 +168,7 @@ def cells_of(bricks: Bricks) -> set[tuple[int, ...]]:
 
 
 def oracle_section(
-    data: bytes, places: list, n_channels: int, n_classes: int, of: Callable[[int, list, list], int]
+    data: bytes, places: list, n_channels: int, n_classes: int, of: Callable[[int, tuple, list], int]
 ) -> list[list[int]]:
     """Channels of a section whose rows are at places; `of` gives the class from the channel, the place, and
     what is decoded."""
