@@ -131,6 +131,7 @@ def _grid(contracted: bool) -> Any:
     """Sixteen vertices an axis of codes and features that vary, some of them not stored."""
     from player.asset.bricks import pack_vertices
     from player.asset.grid import build_grid
+    from player.asset.single_level import VertexBricks, from_vertices
     from player.march.contracted import MAX_SPEED
 
     vertices = np.argwhere(np.ones((16, 16, 16)))
@@ -142,8 +143,8 @@ def _grid(contracted: bool) -> Any:
     half = 2.0 if contracted else 1.0
     box = np.array([[-half] * 3, [half] * 3])
     step = 4 / 48 / float(MAX_SPEED) if contracted else 0.05
-    where, both = (coords, masks), (15, 15)
-    return build_grid((*where, codes), (*where, features), both, box, step, (-3.0, 4.0), contracted)
+    densities, stored = (from_vertices(VertexBricks(coords, masks, n), 15) for n in (codes, features))
+    return build_grid(densities, stored, box, step, (1,), (-3.0, 4.0), contracted)
 
 
 def _rays() -> tuple[np.ndarray, np.ndarray]:

@@ -360,8 +360,8 @@ def _compare_pixels(names: dict[str, Any]) -> None:
     """The page's own reader against the player, on pixels that show something and one that does not."""
     asset, camera = Asset.open("out"), read_views("out/cameras.json")[0]
     frame = render(asset, camera)
-    assert np.array_equal(names["density_codes"][:, 0], asset.arrays.density)
-    assert np.array_equal(names["feature_codes"], asset.arrays.features)
+    assert np.array_equal(names["density_codes"][:, 0], asset.arrays.densities.values[0][:, 0])
+    assert np.array_equal(names["feature_codes"], asset.arrays.features.values[0])
     rays_d = camera.rays()[1].reshape(camera.height, camera.width, 3)
     to_model = np.linalg.inv(asset.world_from_model)
     shown = np.argwhere(frame.opacity > 0.05)

@@ -18,9 +18,9 @@ import numpy as np
 from exporters.shapes.crop import CropBox, nothing_inside
 from exporters.shapes.mesh import unit
 from player.asset.asset import Asset
-from player.asset.bricks import unpack_vertices
 from player.asset.density import decode_density
-from player.asset.grid import SparseGrid, VertexRows, vertex_rows
+from player.asset.grid import SparseGrid
+from player.asset.pyramid import Vertices
 from player.errors import ShapeError
 from player.files.images import to_8_bit
 from player.head.head import Head
@@ -95,14 +95,14 @@ def asset_volume(
 
     Raises ConfigError: no vertex is in the box.
     """
-    manifest, arrays = asset.manifest, asset.arrays
+    manifest, densities = asset.manifest, asset.arrays.densities
     low, high = np.array(manifest.aabb)
     model_from_index = np.eye(4)
     model_from_index[:3, :3] = np.diag((high - low) / manifest.resolution)
     model_from_index[:3, 3] = low
     world_from_index = asset.world_from_model @ model_from_index
     matrix = frame_from_world @ world_from_index
-    index = unpack_vertices(arrays.brick_coords, arrays.brick_masks).astype(np.int32)
+    index = densities.pyramid.vertices[0].index
     keep = np.arange(len(index))
     if box is not None:
         points = index @ world_from_index[:3, :3].T + world_from_index[:3, 3]
@@ -111,7 +111,9 @@ def asset_volume(
             bounds = np.stack([points.min(axis=0), points.max(axis=0)])
             raise nothing_inside("volume", f"{len(index)} vertices; they are", bounds)
     scale = np.cbrt(np.linalg.det((frame_from_world @ asset.world_from_model)[:3, :3]))
-    densities = decode_density(arrays.density[keep], (manifest.density_range[0], manifest.density_range[1]))
+    densities = decode_density(
+        densities.values[0][keep, 0], (manifest.density_range[0], manifest.density_range[1])
+    )
     volume = Volume(
         index[keep],
         (densities / np.float32(scale)).astype(np.float32),
@@ -124,13 +126,12 @@ def asset_volume(
 def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
     """[n, 3] uint8: the features at each vertex through the head, as if it alone were the whole pixel."""
     head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
-    grid, arrays = asset.grid, asset.arrays
-    codes = np.asarray(arrays.density)
-    rows = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
+    grid, densities = asset.grid, asset.arrays.densities
+    codes, vertices = densities.values[0][:, 0], densities.pyramid.vertices[0]
 
     def part(start: int) -> np.ndarray:
         some = slice(start, start + _ROWS)
-        dirs = _slope(grid, rows, codes, index[some])
+        dirs = _slope(grid, vertices, codes, index[some])
         values, total = stored_features(grid, index[some].T.astype(np.float32))
         rgb = head(values / np.maximum(total, MIN_TOTAL)[:, None], dirs)
         return to_8_bit(np.nan_to_num(rgb))
@@ -140,17 +141,17 @@ def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((0, 3), np.uint8), *parts])
 
 
-def _slope(grid: SparseGrid, rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _slope(grid: SparseGrid, vertices: Vertices, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
     """[n, 3] float32 unit directions up the density, which is how a surface is looked at; down where it is
     flat, inside a solid, which nobody sees."""
     slope = np.empty((len(index), 3))
     for axis, step in enumerate(np.eye(3, dtype=np.int64)):
-        rise = _codes_at(rows, codes, index + step) - _codes_at(rows, codes, index - step)
+        rise = _codes_at(vertices, codes, index + step) - _codes_at(vertices, codes, index - step)
         slope[:, axis] = rise * grid.cells_per_unit[axis]
     return unit(slope, [0.0, 0.0, -1.0]).astype(np.float32)
 
 
-def _codes_at(rows: VertexRows, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _codes_at(vertices: Vertices, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
     """[n] float64 codes at vertices that may lie outside; 0 where none is stored."""
-    found = rows.find(index)
+    found = vertices.rows(index)
     return np.where(found >= 0, codes[np.maximum(found, 0)], 0).astype(np.float64)

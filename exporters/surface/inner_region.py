@@ -12,7 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from player.asset.asset import Asset, GridArrays
-from player.asset.bricks import pack_vertices, unpack_vertices
+from player.asset.bricks import pack_vertices
+from player.asset.pyramid import PyramidValues
+from player.asset.single_level import VertexBricks, from_vertices
 from player.errors import DataError
 
 REACH = 2.0
@@ -28,26 +30,22 @@ def inner_region(asset: Asset) -> Asset:
     m, a = asset.manifest, asset.arrays
     if not m.contracted:
         return asset
-    densities = _inside(a.brick_coords, a.brick_masks, a.density, m.resolution, 0.0)
+    densities = _inside(a.densities, 0.0)
     # Cells of features reach over the ball's border, as the density's cells at it do.
-    features = _inside(a.feature_coords, a.feature_masks, a.features, m.feature_resolution, REACH)
-    if not len(densities[2]):
+    features = _inside(a.features, REACH)
+    if not len(densities.values[0]):
         raise DataError(
             f"{asset.folder}: expected an unbounded scene with something in its unit ball, got all "
-            f"{len(a.density)} vertices outside: surroundings without end are not exported"
+            f"{len(a.densities.values[0])} vertices outside: surroundings without end are not exported"
         )
-    return Asset(asset.folder, replace(m, contracted=False, near=0.0), GridArrays(*densities, *features))
+    return Asset(asset.folder, replace(m, contracted=False, near=0.0), GridArrays(densities, features))
 
 
-def _inside(
-    coords: np.ndarray, masks: np.ndarray, codes: np.ndarray, resolution: int, reach: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The bricks' coordinates, masks and codes of the vertices in the unit ball, or within `reach` cells of
-    it."""
-    index = unpack_vertices(coords, masks)
-    edge = (
-        resolution / 4
-    )  # cells along a model unit; the middle of the ball is two model units from the corner
+def _inside(grid: PyramidValues, reach: float) -> PyramidValues:
+    """What is stored in the unit ball, or within `reach` cells of it."""
+    resolution = grid.pyramid.resolution
+    index = grid.pyramid.vertices[0].index
+    edge = resolution / 4  # cells along a model unit; the middle is two model units from the corner
     inside = np.linalg.norm(index / edge - 2, axis=-1) <= 1 + reach / edge
-    kept_coords, kept_masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
-    return kept_coords, kept_masks, np.asarray(codes)[inside]
+    coords, masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
+    return from_vertices(VertexBricks(coords, masks, grid.values[0][inside]), resolution)

@@ -138,12 +138,10 @@ def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int =
 def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The interpolated code [n] at points [n, 3] (grid coordinates), its gradient [n, 3] in codes a voxel,
     and whether the point is in a live cell [n] bool: elsewhere both are 0."""
-    cells = grid.cells(g.T)
-    slots = grid.slots(cells)
-    known = np.all((g >= 0) & (g <= grid.resolution), axis=-1) & grid.are_live(slots, cells)
-    at = corner_number(slots, cells)
-    fraction = g - cells.T
-    share = [(1 - fraction[:, axis], fraction[:, axis]) for axis in range(3)]
+    found = grid.find(g.T)
+    known = np.all((g >= 0) & (g <= grid.resolution), axis=-1) & found.live
+    at = corner_number(found.slots, found.cells)
+    share = [(1 - side, side) for side in found.fractions]
     codes, slopes = np.zeros(len(g)), np.zeros((len(g), 3))
     for x, y, z in np.ndindex(2, 2, 2):
         corner = grid.density.take(at + (x * 81 + y * 9 + z)).astype(np.float64)

@@ -42,9 +42,9 @@ def facts(asset: Asset) -> dict[str, Any]:
     return {
         "bytes": {name: entry.bytes for name, entry in sorted(m.files.items())},
         "bytes_total": sum(entry.bytes for entry in m.files.values()),
-        "n_bricks": len(asset.arrays.brick_coords),
-        "n_vertices": len(asset.arrays.density),
-        "n_feature_vertices": len(asset.arrays.features),
+        "n_bricks": sum(len(bricks) for bricks in asset.arrays.densities.pyramid.levels),
+        "n_vertices": int(asset.arrays.densities.first_rows[-1]),
+        "n_feature_vertices": int(asset.arrays.features.first_rows[-1]),
         "head_parameters": head.n_parameters,
         "n_cameras": len(asset_cameras(asset)),
         "world_box": _world_box(asset),

@@ -15,6 +15,8 @@ import numpy as np
 from player.asset.grid import SparseGrid, build_grid, most_samples
 from player.asset.manifest import MAX_BYTES, NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
 from player.asset.packing import pack_codes, pack_masks
+from player.asset.pyramid import MAX_LEVELS, PyramidValues
+from player.asset.single_level import VertexBricks, from_vertices, to_vertices
 from player.asset.unpacking import (
     DENSITIES,
     DTYPES,
@@ -24,7 +26,7 @@ from player.asset.unpacking import (
     check_bricks,
     check_files,
     check_size,
-    n_vertices,
+    n_set,
     read_arrays,
 )
 from player.errors import FormatError, IntegrityError
@@ -38,43 +40,51 @@ MAX_VERTICES = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class GridArrays:
-    """The arrays of an asset, as `player.asset.manifest` describes them."""
+    """What is stored of the field: the same in memory whatever version of the format it was read from."""
 
-    brick_coords: np.ndarray
-    brick_masks: np.ndarray
-    density: np.ndarray
-    feature_coords: np.ndarray
-    feature_masks: np.ndarray
-    features: np.ndarray
+    densities: PyramidValues
+    """Codes uint8 [n_vertices, 1] of each level."""
+    features: PyramidValues
+    """Codes int8 [n_vertices, n_channels] of each level."""
 
     def check(self, manifest: Manifest, where: str) -> None:
         """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
-        self._check_grid(DENSITIES, (), manifest.resolution, where)
-        self._check_grid(FEATURES, (manifest.n_channels,), manifest.feature_resolution, where)
+        _check_grid(self.densities, DENSITIES, manifest.resolution, 1, where)
+        _check_grid(self.features, FEATURES, manifest.feature_resolution, manifest.n_channels, where)
 
-    def _check_grid(self, names: Names, of_a_vertex: tuple[int, ...], resolution: int, where: str) -> None:
-        coords_name, masks_name, codes_name = names
-        coords, masks = getattr(self, coords_name), getattr(self, masks_name)
-        n_bricks = len(coords) if coords.ndim else 0
-        n_rows = n_vertices(masks) if masks.dtype.kind == "u" else 0
-        if n_rows > MAX_VERTICES:
-            raise FormatError(
-                f"{where}{PLACES[masks_name]}: expected at most {MAX_VERTICES} vertices, got {n_rows}"
-            )
-        shapes = {
-            coords_name: (n_bricks, 3),
-            masks_name: (n_bricks, 8),
-            codes_name: (n_rows, *of_a_vertex),
-        }
-        for name, shape in shapes.items():
-            array = getattr(self, name)
-            dtype = np.dtype(DTYPES[name])
-            if array.dtype != dtype or array.shape != shape:
-                raise FormatError(
-                    f"{where}{PLACES[name]}: expected {dtype.name} {list(shape)}, "
-                    f"got {array.dtype.name} {list(array.shape)}"
-                )
-        check_bricks(coords, masks, names, resolution, where)
+
+def _check_grid(grid: PyramidValues, names: Names, resolution: int, n_channels: int, where: str) -> None:
+    pyramid = grid.pyramid
+    coords_name, masks_name, codes_name = (where + PLACES[name] for name in names)
+    if pyramid.resolution != resolution:
+        raise FormatError(f"{coords_name}: expected {resolution} cells an axis, got {pyramid.resolution}")
+    if not len(pyramid.levels) == len(grid.values) <= MAX_LEVELS:
+        raise FormatError(
+            f"{codes_name}: expected codes for each of at most {MAX_LEVELS} levels, got {len(grid.values)} "
+            f"for {len(pyramid.levels)} levels"
+        )
+    n_cells = sum(n_set(bricks.masks) for bricks in pyramid.levels)
+    if n_cells > MAX_VERTICES:  # there are more vertices than cells
+        raise FormatError(f"{masks_name}: expected at most {MAX_VERTICES} vertices, got {n_cells}")
+    if names is FEATURES and not n_cells:  # every sample that counts is given a feature
+        raise FormatError(f"{masks_name}: expected at least one live cell, got none")
+    for level, bricks in enumerate(pyramid.levels):
+        _check_array(coords_name, bricks.coords, "<u2", (len(bricks), 3))
+        _check_array(masks_name, bricks.masks, "<u8", (len(bricks), 8))
+        check_bricks(bricks.coords, bricks.masks, names, pyramid.cells_per_axis(level) - 1, where, "cells")
+    n_rows = sum(vertices.n for vertices in pyramid.vertices)
+    if n_rows > MAX_VERTICES:
+        raise FormatError(f"{masks_name}: expected at most {MAX_VERTICES} vertices, got {n_rows}")
+    for vertices, values in zip(pyramid.vertices, grid.values, strict=True):
+        _check_array(codes_name, values, DTYPES[names[2]], (vertices.n, n_channels))
+
+
+def _check_array(where: str, array: np.ndarray, kind: str, shape: tuple[int, ...]) -> None:
+    dtype = np.dtype(kind)
+    if array.dtype != dtype or array.shape != shape:
+        raise FormatError(
+            f"{where}: expected {dtype.name} {list(shape)}, got {array.dtype.name} {list(array.shape)}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +116,12 @@ class Asset:
         if verify:
             for name, entry in manifest.files.items():
                 _check_sum(folder, name, entry)
-        return cls(folder, manifest, GridArrays(*read_arrays(folder, manifest, allowed)))
+        densities, features = read_arrays(folder, manifest, allowed)
+        arrays = GridArrays(
+            from_vertices(densities, manifest.resolution),
+            from_vertices(features, manifest.feature_resolution),
+        )
+        return cls(folder, manifest, arrays)
 
     def path(self, name: str) -> Path:
         """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
@@ -130,11 +145,11 @@ class Asset:
         m, a = self.manifest, self.arrays
         low, high = m.density_range
         return build_grid(
-            (a.brick_coords, a.brick_masks, a.density),
-            (a.feature_coords, a.feature_masks, a.features),
-            (m.resolution, m.feature_resolution),
+            a.densities,
+            a.features,
             np.array(m.aabb),
             m.step,
+            (1,) * len(a.densities.pyramid.levels),
             (low, high),
             m.contracted,
             m.near,
@@ -216,14 +231,8 @@ def write_asset(
     """
     arrays.check(manifest, "")
     with new_folder(folder, force) as new:
-        for name in ("brick_coords", "feature_coords"):
-            with (new / PLACES[name]).open("wb") as file:
-                array = np.ascontiguousarray(getattr(arrays, name), DTYPES[name])
-                np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
-        for name in ("brick_masks", "feature_masks"):
-            (new / PLACES[name]).write_bytes(pack_masks(getattr(arrays, name)))
-        for name in ("density", "features"):
-            (new / PLACES[name]).write_bytes(pack_codes(getattr(arrays, name)))
+        for names, grid in ((DENSITIES, arrays.densities), (FEATURES, arrays.features)):
+            _write_grid(new, names, to_vertices(grid))
         for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
             (new / name).write_bytes(data)
         _write_manifest(new, manifest)
@@ -231,6 +240,16 @@ def write_asset(
             for name, data in finish(new).items():
                 (new / name).write_bytes(data)
             _write_manifest(new, manifest)
+
+
+def _write_grid(folder: Path, names: Names, stored: VertexBricks) -> None:
+    """The three files of a grid in version 3.1."""
+    coords_name, masks_name, codes_name = (folder / PLACES[name] for name in names)
+    with coords_name.open("wb") as file:
+        coords = np.ascontiguousarray(stored.coords, "<u2")
+        np.lib.format.write_array(file, coords, version=(1, 0), allow_pickle=False)
+    masks_name.write_bytes(pack_masks(stored.masks))
+    codes_name.write_bytes(pack_codes(stored.values))
 
 
 def _write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -128,7 +128,7 @@ def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: 
     for offset in np.ndindex(2, 2, 2):
         words = some[offset[0]] & (_Y_FIRST if offset[1] else _ALL) & (_Z_FIRST if offset[2] else _ALL)
         before = coords - offset
-        wanted = (words != 0) & (before >= 0).all(axis=1)
+        wanted = (words != 0) & ((before >= 0) & (before < n_per_axis)).all(axis=1)
         found[tuple(before[wanted].T)] = True
     return np.argwhere(found)
 

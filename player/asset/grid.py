@@ -1,33 +1,33 @@
-"""The sparse grid as the march wants it: built from the arrays of an asset when it is opened, in numpy.
+"""The sparse grid as the march wants it: built from the pyramids of an asset when it is opened, in numpy.
 
-Letters: R cells per axis, nb bricks per axis, C channels; a slot is the number of a brick that has a live
-cell. Everything is flat, so that one integer addresses it, in numpy as in compiled code:
+Letters: R cells of the finest level per axis, nb its bricks per axis, C channels; a slot is the number of a
+brick from which some place is read. Everything is flat, so that one integer addresses it, in numpy as in
+compiled code:
 
-    table      [nb^3] int32        at (bx * nb + by) * nb + bz: the slot, or minus the Chebyshev distance, in
-                                   bricks, to the nearest brick with a live cell (at most MAX_DISTANCE)
+    table      [nb^3] int32        at (bx * nb + by) * nb + bz, for a place in this brick of the finest level:
+                                   slot << 3 | level of the finest brick there, or minus the Chebyshev
+                                   distance, in bricks of the finest level, to the nearest place that has one
+                                   (at most MAX_DISTANCE)
     live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
     density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
                                    that the eight corners of a cell are in one brick; SPARE bytes follow
-    features   [n_vertices, C] int8, the vertices of a grid of its own over the same box, whose rows `rows`
-                                   finds
+    features   [n_vertices, C] int8, the vertices of a pyramid of its own over the same box, the rows of the
+                                   finest level first, which `rows` finds
+
+A slot's cells and vertices are those of its level: the cell of level l is that of the finest level >> l.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.bricks import (
-    BRICK,
-    bricks_per_axis,
-    dense_index,
-    live_cells,
-    stored_bits,
-    with_apron,
-    with_corners,
-)
+from player.asset.bricks import BRICK, bricks_per_axis, dense_index, stored_bits, with_apron, with_corners
 from player.asset.density import decode_constants
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 
 SPARE = 2
 """Bytes behind the densities: compiled code reads whole words."""
@@ -36,29 +36,41 @@ MAX_DISTANCE = 31
 """Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
 
 
+CELLS_OF_LEVELS = np.float32(0.5) ** np.arange(8, dtype=np.float32)
+"""Cells of each level in one of the finest level, along an axis."""
+
+
 @dataclass(frozen=True, eq=False)
 class VertexRows:
-    """Which row of an array holds which stored vertex of a grid. Rows are in the order of bricks, then of
-    bits (`player.asset.bricks`)."""
+    """Which row of an array holds which stored vertex of a pyramid. Rows are in the order of levels, the
+    finest first, then of bricks, then of bits (`player.asset.bricks`)."""
 
     resolution: int
-    """Cells per axis."""
+    """Cells of the finest level per axis."""
     n_per_axis: int
-    """Bricks per axis, nb."""
+    """Bricks of the finest level per axis, nb."""
     bricks: np.ndarray
-    """[nb^3] int32 at (bx * nb + by) * nb + bz: the brick that holds a cell, -1 where no corner of any cell
-    is stored."""
+    """[nb^3] int32 at (bx * nb + by) * nb + bz, for a place in this brick of the finest level: number << 3 |
+    level of the brick that its corners are in, -1 where no corner of any cell is stored. Where no level has a
+    brick, it is one of the finest level that has a corner stored there."""
     rows: np.ndarray
-    """[n_bricks * 729] int32 at brick * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: the row of a vertex, -1 if
+    """[n_bricks * 729] int32 at number * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: the row of a vertex, -1 if
     it is not stored. Bricks have an apron, so that the eight corners of a cell are in one."""
 
-    def find(self, index: np.ndarray) -> np.ndarray:
-        """Rows [n] int64 of vertices [n, 3] that may lie outside; -1 where none is stored."""
-        inside = np.all((index >= 0) & (index < BRICK * self.n_per_axis), axis=-1)
-        cells = np.where(inside[:, None], index, 0).T
-        brick = self.bricks[brick_number(cells, self.n_per_axis)]
-        row = self.rows[corner_number(brick, cells)]
-        return np.where(inside & (brick >= 0), row, -1).astype(np.int64)
+
+class Found(NamedTuple):
+    """Where places are in a `SparseGrid`: the finest brick at each, and the cell of that brick's level."""
+
+    slots: np.ndarray
+    """[...] int32; 0 where there is no brick."""
+    levels: np.ndarray
+    """[...] int32 of the brick; 0 where there is none."""
+    cells: np.ndarray
+    """[3, ...] int32, cells of the brick's level."""
+    fractions: np.ndarray
+    """[3, ...] float32, places in these cells, 0..1."""
+    live: np.ndarray
+    """[...] bool: whether the cell is live."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +84,16 @@ class SparseGrid:
     cells_per_unit: np.ndarray
     """[3] float32: grid coordinate = (x - aabb_min) * cells_per_unit, 0..R."""
     step: np.float32
-    """Distance between lattice samples in model units; dphi of `player.march.contracted` if contracted."""
+    """Distance between base samples in model units; dphi of `player.march.contracted` if contracted."""
+    level_steps: np.ndarray
+    """[n_levels] int32, powers of two that do not fall: for how many base steps one sample in a brick of each
+    level stands."""
     density_low: np.float32
     density_slope: np.float32
     slot_coords: np.ndarray
-    """[n_slots, 3] int32: brick coordinate of each slot."""
+    """[n_slots, 3] int32: brick coordinate of each slot, in bricks of its level."""
+    slot_levels: np.ndarray
+    """[n_slots] int32."""
     table: np.ndarray
     live: np.ndarray
     density: np.ndarray
@@ -92,19 +109,30 @@ class SparseGrid:
         return self.features.shape[1]
 
     def cells(self, g: np.ndarray) -> np.ndarray:
-        """The cells [3, ...] int32 that hold the points `g` [3, ...], grid coordinates. What is on the border
-        belongs to the last cells, and so does what is beyond it."""
+        """The cells [3, ...] int32 of the finest level that hold the points `g` [3, ...], grid coordinates.
+        What is on the border belongs to the last cells, and so does what is beyond it."""
         return np.clip(g.astype(np.int32), 0, self.resolution - 1)
 
-    def slots(self, cells: np.ndarray) -> np.ndarray:
-        """The entries [...] of `table` for the bricks of cells [3, ...]."""
+    def entries(self, cells: np.ndarray) -> np.ndarray:
+        """The entries [...] of `table` for cells [3, ...] of the finest level."""
         return self.table.take(brick_number(cells, self.n_per_axis))
 
-    def are_live(self, slots: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Whether cells [3, ...] are live, [...] bool, from the entries `slots` [...] of their bricks."""
-        x, y, z = cells & 7
-        bits = self.live.take(np.maximum(slots, 0) * 64 + (x * 8 + y)) >> z.astype(np.uint8)
-        return ((bits & 1) != 0) & (slots >= 0)
+    def find(self, g: np.ndarray) -> Found:
+        """What is at points `g` [3, ...], grid coordinates."""
+        cells = self.cells(g)
+        entries = self.entries(cells)
+        there = np.maximum(entries, 0)
+        slots, levels = there >> 3, there & 7
+        cells = cells >> levels
+        fractions = g * CELLS_OF_LEVELS.take(levels) - cells.astype(g.dtype)
+        if len(self.live):
+            x, y, z = cells & 7
+            live = (entries >= 0) & (
+                (self.live.take(slots * 64 + (x * 8 + y)) >> z.astype(np.uint8)) & 1 != 0
+            )
+        else:
+            live = np.zeros(slots.shape, bool)
+        return Found(slots, levels, cells, fractions, live)
 
     @property
     def codes(self) -> np.ndarray:
@@ -118,7 +146,8 @@ class SparseGrid:
 
     @property
     def most_samples(self) -> int:
-        """The number of samples on the box's diagonal, and three for rounding: no ray is marched further."""
+        """The number of base samples on the box's diagonal, and three for rounding: no ray is marched
+        further."""
         diagonal = float(np.linalg.norm(self.resolution / self.cells_per_unit.astype(np.float64)))
         return most_samples(diagonal, float(self.step))
 
@@ -154,111 +183,160 @@ def corner_number(bricks: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def build_grid(
-    densities: tuple[np.ndarray, np.ndarray, np.ndarray],
-    features: tuple[np.ndarray, np.ndarray, np.ndarray],
-    resolutions: tuple[int, int],
+    densities: PyramidValues,
+    features: PyramidValues,
     aabb: np.ndarray,
     step: float,
+    level_steps: Sequence[int],
     density_range: tuple[float, float],
     contracted: bool = False,
     near: float = 0.0,
 ) -> SparseGrid:
-    """Arrange the arrays of an asset for marching.
+    """Arrange the pyramids of an asset for marching.
 
     Args:
-        densities: coordinates and masks of the bricks, and codes, as on disk, already checked.
-        features: the same of the features.
-        resolutions: cells per axis of the two.
+        densities: codes uint8 of one channel, already checked.
+        features: codes int8, or float32 values in units of the codes.
         aabb: [2, 3] the box, model frame.
-        step: distance between lattice samples, model units; dphi if contracted.
+        step: distance between base samples, model units; dphi if contracted.
+        level_steps: for each level of the densities, for how many base steps a sample stands.
         density_range: log sigma at codes 0 and 255.
         contracted: whether the box is all of space, contracted.
         near: where rays begin, model units, if contracted.
 
     >>> from player.asset.bricks import pack_vertices
+    >>> from player.asset.single_level import VertexBricks, from_vertices
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((5, 5, 5))))
-    >>> codes, features = np.zeros(125, np.uint8), np.zeros((125, 2), np.int8)
-    >>> box, range_ = np.array([[-1] * 3, [1] * 3]), (0.0, 1.0)
-    >>> grid = build_grid((coords, masks, codes), (coords, masks, features), (4, 4), box, 0.1, range_)
+    >>> codes = from_vertices(VertexBricks(coords, masks, np.zeros(125, np.uint8)), 4)
+    >>> features = from_vertices(VertexBricks(coords, masks, np.zeros((125, 2), np.int8)), 4)
+    >>> box = np.array([[-1] * 3, [1] * 3])
+    >>> grid = build_grid(codes, features, box, 0.1, (1,), (0.0, 1.0))
     >>> grid.table.tolist(), int(np.bitwise_count(grid.live).sum())
     ([0], 64)
     """
-    coords, masks, density = densities
-    resolution, feature_resolution = resolutions
-    n_per_axis = bricks_per_axis(resolution)
-    index = dense_index(coords, n_per_axis)
-    cells = live_cells(coords, masks, index)
-    has_cells = np.flatnonzero(cells.any(axis=1))
-    slots = np.full(len(coords), -1, np.int32)
-    slots[has_cells] = np.arange(len(has_cells), dtype=np.int32)
-    slot_coords = np.asarray(coords, np.int32)[has_cells]
+    pyramid = densities.pyramid
+    shown = [_shown(pyramid, level) for level in range(len(pyramid.levels))]
+    coords = [bricks.coords for bricks in shown]
+    table = _table(pyramid, coords)
     low, slope = decode_constants(density_range)
     box = np.asarray(aabb, np.float64)
+    values = features.values[0] if len(features.values) == 1 else np.concatenate(features.values)
     return SparseGrid(
-        resolution=resolution,
-        n_per_axis=n_per_axis,
+        resolution=pyramid.resolution,
+        n_per_axis=len(table),
         aabb_min=box[0].astype(np.float32),
-        cells_per_unit=(resolution / (box[1] - box[0])).astype(np.float32),
+        cells_per_unit=(pyramid.resolution / (box[1] - box[0])).astype(np.float32),
         step=np.float32(step),
+        level_steps=np.array(level_steps, np.int32),
         density_low=low,
         density_slope=slope,
-        slot_coords=slot_coords,
-        table=_table(slot_coords, n_per_axis),
-        live=np.ascontiguousarray(cells[has_cells], "<u8").view(np.uint8).reshape(-1),
-        density=_with_apron(stored_bits(masks), density, coords, index, has_cells),
-        rows=vertex_rows(*features[:2], feature_resolution),
-        features=np.ascontiguousarray(features[2], np.int8),
+        slot_coords=np.concatenate(coords).astype(np.int32),
+        slot_levels=np.repeat(np.arange(len(coords), dtype=np.int32), [len(some) for some in coords]),
+        table=table.reshape(-1),
+        live=np.concatenate([bricks.masks for bricks in shown]).astype("<u8").view(np.uint8).reshape(-1),
+        density=_with_apron(densities, coords),
+        rows=vertex_rows(features.pyramid),
+        features=np.ascontiguousarray(values) if len(values) else np.zeros((1, values.shape[1]), np.int8),
         contracted=contracted,
         near=near,
     )
 
 
-def vertex_rows(coords: np.ndarray, masks: np.ndarray, resolution: int) -> VertexRows:
-    """The rows of the vertices of bricks, which are as they are on disk; at least one vertex is stored.
+def vertex_rows(pyramid: Pyramid) -> VertexRows:
+    """The rows of the vertices of a pyramid.
 
-    >>> from player.asset.bricks import pack_vertices
-    >>> coords, masks, _ = pack_vertices(np.array([[0, 0, 0], [9, 0, 0], [9, 0, 1]]))
-    >>> vertex_rows(coords, masks, 16).find(np.array([[9, 0, 1], [0, 0, 0], [1, 0, 0], [-1, 0, 0]])).tolist()
-    [2, 0, -1, -1]
+    >>> from player.asset.pyramid import Bricks
+    >>> one = Bricks(np.array([[0, 0, 0]], np.uint16), np.array([[1, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
+    >>> found = vertex_rows(Pyramid(8, (one,)))
+    >>> found.bricks.tolist(), found.rows[[0, 1, 2, 9, 81, 91]].tolist()
+    ([0], [0, 1, -1, 2, 4, 7])
     """
-    n_per_axis = bricks_per_axis(resolution)
-    stored = stored_bits(masks)
-    rows = np.full((len(stored) + 1, stored.shape[1]), -1, np.int32)
-    rows[:-1][stored] = np.arange(np.count_nonzero(stored), dtype=np.int32)
-    held = with_corners(coords, masks, n_per_axis)
-    apron = np.empty((len(held), 9, 9, 9), np.int32)
-    with_apron(rows, held, dense_index(coords, n_per_axis), apron)
-    bricks = dense_index(held, n_per_axis).reshape(-1)
-    return VertexRows(resolution, n_per_axis, bricks, apron.reshape(-1))
+    owners = np.full((1, 1, 1), -1, np.int32)  # -2 - number << 3 | level: a corner is stored, but no brick
+    held: list[np.ndarray] = []
+    n_held = 0
+    for level in reversed(range(len(pyramid.levels))):
+        owners = _refined(owners, pyramid, level)
+        own = _shown(pyramid, level).coords.astype(np.int64)
+        owners[tuple(own.T)] = np.arange(n_held, n_held + len(own), dtype=np.int32) << 3 | level
+        corners = pyramid.vertices[level].bricks
+        near = with_corners(corners.coords, corners.masks, len(owners))
+        near = near[owners[tuple(near.T)] < 0]
+        held.append(np.concatenate([own, near]))
+        number = np.arange(n_held + len(own), n_held + len(held[-1]), dtype=np.int32)
+        owners[tuple(near.T)] = -2 - (number << 3 | level)
+        n_held += len(held[-1])
+    np.copyto(owners, -2 - owners, where=owners < -1)
+    apron = np.full((max(n_held, 1), 9, 9, 9), -1, np.int32)
+    first_row = 0
+    for level, vertices in enumerate(pyramid.vertices):
+        wanted = held[-1 - level]
+        stored = stored_bits(vertices.bricks.masks)
+        rows = np.full((len(stored) + 1, stored.shape[1]), -1, np.int32)
+        rows[:-1][stored] = np.arange(first_row, first_row + vertices.n, dtype=np.int32)
+        first_row += vertices.n
+        index = dense_index(vertices.bricks.coords, bricks_per_axis(pyramid.cells_per_axis(level)))
+        with_apron(rows, wanted, index, apron[n_held - len(wanted) : n_held])
+        n_held -= len(wanted)
+    return VertexRows(pyramid.resolution, len(owners), owners.reshape(-1), apron.reshape(-1))
 
 
-def _with_apron(
-    stored: np.ndarray, density: np.ndarray, coords: np.ndarray, index: np.ndarray, chosen: np.ndarray
-) -> np.ndarray:
-    dense = np.zeros((len(stored) + 1, stored.shape[1]), np.uint8)
-    dense[:-1][stored] = density
-    n_codes = (BRICK + 1) ** 3 * len(chosen)
+def _shown(pyramid: Pyramid, level: int) -> Bricks:
+    """The bricks of a level that finer ones do not hide wholly."""
+    bricks = pyramid.levels[level]
+    if level == 0:
+        return bricks
+    finer = pyramid.levels[level - 1].coords
+    hidden = np.bincount(bricks.find(finer >> 1) + 1, minlength=len(bricks) + 1)[1:]
+    halves = 2 * bricks.coords.astype(np.int64) + 1 < bricks_per_axis(pyramid.cells_per_axis(level - 1) - 1)
+    shown = hidden < np.where(halves, 2, 1).prod(axis=1)
+    return Bricks(bricks.coords[shown], bricks.masks[shown])
+
+
+def _refined(owners: np.ndarray, pyramid: Pyramid, level: int) -> np.ndarray:
+    """What `owners` [n, n, n] has for the bricks of the next coarser level, for those of `level`."""
+    n = bricks_per_axis(pyramid.cells_per_axis(level) - 1)
+    if level + 1 == len(pyramid.levels):
+        return np.full((n, n, n), owners[0, 0, 0])
+    for axis in range(3):
+        owners = owners.repeat(2, axis=axis)
+    return owners[:n, :n, :n].copy()
+
+
+def _with_apron(densities: PyramidValues, coords: Sequence[np.ndarray]) -> np.ndarray:
+    """The codes of the bricks at `coords` [n, 3] of each level, level after level."""
+    pyramid, n_slots = densities.pyramid, sum(len(some) for some in coords)
+    n_codes = (BRICK + 1) ** 3 * n_slots
     flat = np.zeros(n_codes + SPARE, np.uint8)
     apron = flat[:n_codes].reshape(-1, BRICK + 1, BRICK + 1, BRICK + 1)
-    with_apron(dense, coords[chosen], index, apron)
+    first = 0
+    for level, (some, values) in enumerate(zip(coords, densities.values, strict=True)):
+        vertices = pyramid.vertices[level].bricks
+        stored = stored_bits(vertices.masks)
+        dense = np.zeros((len(stored) + 1, stored.shape[1]), np.uint8)
+        dense[:-1][stored] = values[:, 0]
+        index = dense_index(vertices.coords, bricks_per_axis(pyramid.cells_per_axis(level)))
+        with_apron(dense, some, index, apron[first : first + len(some)])
+        first += len(some)
     return flat
 
 
-def _table(slot_coords: np.ndarray, n_per_axis: int) -> np.ndarray:
-    """Slots, and elsewhere minus the Chebyshev distance: each round grows the reached set by one brick on
-    every side."""
-    reached = np.zeros((n_per_axis,) * 3, bool)
-    where = tuple(slot_coords.T)
-    reached[where] = True
-    table = np.zeros(reached.shape, np.int32)
+def _table(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
+    """[nb, nb, nb] int32: the table of slots at `coords` [n, 3] of each level, which are numbered level by
+    level. Each round of distances grows the reached set by one brick on every side."""
+    table = np.full((1, 1, 1), -1, np.int32)
+    starts = np.cumsum([0, *(len(some) for some in coords)])
+    for level in reversed(range(len(coords))):
+        table = _refined(table, pyramid, level)
+        slots = np.arange(starts[level], starts[level + 1], dtype=np.int32)
+        table[tuple(coords[level].astype(np.int64).T)] = slots << 3 | level
+    reached = table >= 0
     for distance in range(1, MAX_DISTANCE + 1):
         table[~reached] = -distance
         for axis in range(3):
             reached = _dilate(reached, axis)
         if reached.all():
             break
-    table[where] = np.arange(len(slot_coords), dtype=np.int32)
-    return table.reshape(-1)
+    return table
 
 
 def _dilate(mask: np.ndarray, axis: int) -> np.ndarray:

@@ -154,6 +154,8 @@ class Pyramid:
     def _vertices(self, level: int) -> Vertices:
         bricks = self.levels[level]
         corners = corners_of(bricks)
+        if level + 1 == len(self.levels):
+            return Vertices(corners, _no_masks(len(corners)))
         beside = _neighbourhood(bricks.coords, -1, 1)
         last = bricks_per_axis(self.cells_per_axis(level) - 1)
         inside = ((beside >= 0) & (beside < last)).all(axis=1)

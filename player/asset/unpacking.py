@@ -18,6 +18,7 @@ import numpy as np
 from player.asset.bricks import bricks_per_axis, unpack_vertices, with_corners
 from player.asset.manifest import FileEntry, Manifest
 from player.asset.packing import unpack_codes, unpack_masks
+from player.asset.single_level import VertexBricks
 from player.errors import FormatError, IntegrityError
 from player.files.files import file_size, read_bytes
 from player.files.memory import check_memory
@@ -139,8 +140,8 @@ def _most_packed(n_bytes: int) -> int:
     return n_bytes + n_bytes // 100 + 1000
 
 
-def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> list[np.ndarray]:
-    """The six arrays of an asset whose files `check_files` has looked at, in the order of `DTYPES`.
+def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexBricks, VertexBricks]:
+    """The densities and the features of an asset whose files `check_files` has looked at.
 
     Raises FormatError, IntegrityError: they break the format; ConfigError: they take more than is allowed.
     """
@@ -154,8 +155,10 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> list[np.ndarr
         )
         of_features = names is FEATURES
         resolution = manifest.feature_resolution if of_features else manifest.resolution
-        check_bricks(coords, found, names, resolution, f"{folder}/")
-        n_rows = n_vertices(found)
+        check_bricks(coords, found, names, resolution, f"{folder}/", "vertices")
+        if of_features and not found.any():  # every sample that counts is given a feature
+            raise FormatError(f"{folder / PLACES[names[1]]}: expected at least one stored vertex, got none")
+        n_rows = n_set(found)
         n_held = len(with_corners(coords, found, n_per_axis)) if of_features else 0
         n_codes = n_rows * (manifest.n_channels if of_features else 1)
         return found, Counts(n_per_axis, len(coords), n_codes, n_rows, n_held)
@@ -180,7 +183,7 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> list[np.ndarr
         check_memory(needed_bytes(n_packed, dense_counts, coarse_counts), allowed, str(folder))
         features = other.submit(codes, FEATURES, coarse_counts)
         density = codes(DENSITIES, dense_counts)
-        return [coords, found, density, coarse, coarse_found, features.result()]
+        return VertexBricks(coords, found, density), VertexBricks(coarse, coarse_found, features.result())
 
 
 def read_coords(data: bytes, where: str) -> np.ndarray:
@@ -204,32 +207,30 @@ def read_coords(data: bytes, where: str) -> np.ndarray:
     return np.frombuffer(data, "<u2", 3 * n_bricks, match.end()).reshape(-1, 3)
 
 
-def n_vertices(masks: np.ndarray) -> int:
-    """Stored vertices of bricks with these masks [n, 8] uint64."""
+def n_set(masks: np.ndarray) -> int:
+    """Set bits of masks of bricks [n, 8] uint64."""
     return int(np.bitwise_count(masks).sum(dtype=np.int64))
 
 
-def check_bricks(coords: np.ndarray, masks: np.ndarray, names: Names, resolution: int, where: str) -> None:
-    """Raise FormatError unless the bricks are sorted, each once, and hold no vertex beyond the grid."""
+def check_bricks(
+    coords: np.ndarray, masks: np.ndarray, names: Names, last: int, where: str, what: str
+) -> None:
+    """Raise FormatError unless the bricks are sorted, each once, and hold nothing beyond `last` along an
+    axis; `what` they are of, cells or vertices."""
     coords = np.asarray(coords, np.int64)
     keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
     if (np.diff(keys) <= 0).any():
         raise FormatError(f"{where}{PLACES[names[0]]}: expected bricks sorted by x, y, z, each once")
-    n = bricks_per_axis(resolution)
+    n = (last >> 3) + 1
     if (coords >= n).any():
         raise FormatError(f"{where}{PLACES[names[0]]}: expected coordinates below {n}, got {coords.max()}")
-    if names is FEATURES and not masks.any():  # every sample that counts is given a feature
-        raise FormatError(f"{where}{PLACES[names[1]]}: expected at least one stored vertex, got none")
-    last = resolution - 8 * (n - 1)  # the grid's last vertex in a brick at its edge
-    beyond = np.zeros((3, 8), np.uint64)  # bits of vertices behind it, along x, y, z
+    beyond = np.zeros((3, 8), np.uint64)  # bits of what is behind the last, along x, y, z
     bits = np.arange(512)
     for axis, place in enumerate((bits >> 6, (bits >> 3) & 7, bits & 7)):
-        beyond[axis] = np.packbits(place > last, bitorder="little").view("<u8")
+        beyond[axis] = np.packbits(place > (last & 7), bitorder="little").view("<u8")
     for axis in range(3):
         edge = np.flatnonzero(coords[:, axis] == n - 1)
         wrong = edge[(masks[edge] & beyond[axis]).any(axis=1)]
         if len(wrong):
             got = unpack_vertices(coords[wrong[:1]], masks[wrong[:1]])[:, axis].max()
-            raise FormatError(
-                f"{where}{PLACES[names[1]]}: expected vertices up to {resolution}, got one at {got}"
-            )
+            raise FormatError(f"{where}{PLACES[names[1]]}: expected {what} up to {last}, got one at {got}")

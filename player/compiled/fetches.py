@@ -152,7 +152,7 @@ def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, s
             fraction = g - low[axis].to_float()
             share.append((1.0 - fraction, fraction))
         held = gather(grid.bricks, brick_number(low, n_per_axis), 4, resolution > 0)
-        first = corner_number(held, low)
+        first = corner_number(held >> 3, low)
         total = scale.like(0.0)
         parts = []
         for x, y in np.ndindex(2, 2):

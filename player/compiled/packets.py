@@ -241,6 +241,7 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
         with b.if_then(empty.any()):
             bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
             i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))
+        slot = slot >> 3
         with b.if_then(busy.any()):  # a grid without a slot has nothing to read
             within = [c & 7 for c in cell]
             word = gather(grid.live, (slot << 4) + (within[0] << 1) + (within[1] >> 2), 4, busy)

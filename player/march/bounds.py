@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.asset.bricks import BRICK as VERTICES
+from player.asset.bricks import BRICK
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera
 
@@ -34,22 +34,23 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     """
     shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
     near, far = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
-    edge = VERTICES / grid.cells_per_unit.astype(np.float64)
+    edge = BRICK / grid.cells_per_unit.astype(np.float64)
     w2c = np.linalg.inv(camera.c2w)
-    steps = (w2c[:3, :3] * edge).T  # [3, 3]: what one brick along x, y, z is in the camera's frame
-    first = grid.slot_coords @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
-    radius = float(np.linalg.norm(edge)) / 2
-    distance = np.linalg.norm(first + steps.sum(axis=0) / 2, axis=1)
+    steps = (w2c[:3, :3] * edge).T  # [3, 3]: what a brick of level 0 is along x, y, z in the camera's frame
+    size = np.ldexp(1.0, grid.slot_levels)  # bricks are so many times as wide
+    first = (grid.slot_coords * size[:, None]) @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
+    radius = float(np.linalg.norm(edge)) / 2 * size
+    distance = np.linalg.norm(first + size[:, None] * steps.sum(axis=0) / 2, axis=1)
     starts, ends = np.maximum(distance - radius * 1.001, 0), distance + radius * 1.001
     corners = np.array(list(np.ndindex(2, 2, 2))) @ steps
-    depths = -(first[:, 2] + corners[:, 2, None])  # [8, n]
+    depths = -(first[:, 2] + corners[:, 2, None] * size)  # [8, n]
     ahead, behind = (depths > 1e-6 * radius).all(axis=0), (depths < 0).all(axis=0)
     around = np.flatnonzero(~ahead & ~behind)
     if len(around):  # the camera is in or beside such a brick: it may be anywhere in the picture
         near[:], far[:] = starts[around].min(), ends[around].max()
     shown = np.flatnonzero(ahead)
-    x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None]) / depths[:, shown]
-    y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None]) / depths[:, shown]
+    x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None] * size[shown]) / depths[:, shown]
+    y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None] * size[shown]) / depths[:, shown]
     left, right = _range(x, shape[1])
     top, bottom = _range(y, shape[0])
     _spread((left, right, top, bottom), starts[shown], ends[shown], near, far)

@@ -38,7 +38,7 @@ class BoxPath(NamedTuple):
     """Model units between samples."""
 
     def sample(self, i: np.ndarray) -> np.ndarray:
-        return (i + np.float32(0.5)) * self.step
+        return (i.astype(np.float32) + np.float32(0.5)) * self.step
 
     def place(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
         return self.at(ray, self.sample(i))

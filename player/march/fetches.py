@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import SparseGrid, brick_number, corner_number
+from player.asset.grid import CELLS_OF_LEVELS, SparseGrid, brick_number, corner_number
 from player.march.path import Path
 
 MIN_TOTAL = np.float32(1e-3)
@@ -192,9 +192,11 @@ def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.nda
     vertices = grid.rows
     g = np.clip(g * grid.feature_scale, np.float32(0), np.float32(vertices.resolution))
     low = np.minimum(g.astype(np.int32), vertices.resolution - 1)
-    fraction = g - low.astype(np.float32)
     held = vertices.bricks.take(brick_number(low, vertices.n_per_axis))
-    at = corner_number(held, low)
+    level = np.maximum(held, 0) & 7
+    low >>= level
+    fraction = g * CELLS_OF_LEVELS.take(level) - low.astype(np.float32)
+    at = corner_number(held >> 3, low)
     share = [(np.float32(1) - side, side) for side in fraction]
     values = np.zeros((g.shape[1], grid.n_channels), np.float32)
     total = np.zeros(g.shape[1], np.float32)

@@ -125,10 +125,10 @@ def sample_rays(
         ray, i = ray[alive], i[alive]
         g = path.place(ray, i)
         cells = grid.cells(g)
-        slots = grid.slots(cells)
-        busy, empty = np.flatnonzero(slots >= 0), np.flatnonzero(slots < 0)
+        entries = grid.entries(cells)
+        busy, empty = np.flatnonzero(entries >= 0), np.flatnonzero(entries < 0)
         if len(empty):
-            brick, reach = cells[:, empty] >> 3, -1 - slots[empty]
+            brick, reach = cells[:, empty] >> 3, -1 - entries[empty]
             i[empty] = path.jump(ray[empty], i[empty], g[:, empty], brick, reach)
         if len(busy):
             chunks.append(_take_chunk(grid, path, ray[busy], i[busy], tau))
@@ -153,13 +153,11 @@ def _take_chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray, ta
     MAX_TAU; `tau` [n_rays] is updated."""
     samples = i[:, None] + CHUNK
     s, g = path.sample(samples), path.place(ray[:, None], samples)
-    cells = grid.cells(g)
-    slots = grid.slots(cells)
-    at = np.flatnonzero(grid.are_live(slots, cells) & (s < path.length[ray, None]))
+    found = grid.find(g)
+    at = np.flatnonzero(found.live & (s < path.length[ray, None]))
     row, column = np.divmod(at, len(CHUNK))
-    cells, g = (array.reshape(3, -1)[:, at] for array in (cells, g))
-    corner = corner_number(slots.reshape(-1)[at], cells)
-    code = trilinear(grid.density, corner, (g - cells).astype(np.float32))
+    cells, fractions = (array.reshape(3, -1)[:, at] for array in (found.cells, found.fractions))
+    code = trilinear(grid.density, corner_number(found.slots.reshape(-1)[at], cells), fractions)
     way = path.way(ray[row], samples[row, column])
     optical = np.exp(grid.density_low + grid.density_slope * code) * way
     added = np.zeros((len(ray), len(CHUNK) + 1), np.float32)

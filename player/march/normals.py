@@ -47,14 +47,13 @@ def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
 
     `g` [3, n] float32: grid coordinates (cells), each in a live cell, as samples of the march are.
     """
-    cells = grid.cells(g)
-    fraction = (g - cells).astype(np.float32)
-    at = corner_number(grid.slots(cells), cells)
-    share = [(1 - fraction[axis], fraction[axis]) for axis in range(3)]
+    found = grid.find(g)
+    at = corner_number(found.slots, found.cells)
+    share = [(1 - side, side) for side in found.fractions]
     slopes = np.zeros((3, g.shape[1]), np.float32)
     for x, y, z in np.ndindex(2, 2, 2):
         code = grid.density.take(at + (x * 81 + y * 9 + z)).astype(np.float32)
         slopes[0] += (2 * x - 1) * code * share[1][y] * share[2][z]
         slopes[1] += (2 * y - 1) * code * share[0][x] * share[2][z]
         slopes[2] += (2 * z - 1) * code * share[0][x] * share[1][y]
-    return slopes
+    return slopes * np.float32(0.5) ** found.levels

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from exporters.formats.ply import ply_bytes
-from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
 from tests.exporters.meshes import box
 from tests.exporters.solids import ball, cube, write_solid
 from tests.player import conftest as shells
+from tests.vertex_grids import arrays_of
 
 collect_ignore = ["formats/blender_look.py"]  # runs inside Blender
 
@@ -40,7 +41,8 @@ def shells_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         view_size=(48, 40),
         world_from_model=tuple(map(tuple, shells.WORLD_FROM_MODEL)),
     )
-    arrays = GridArrays(coords, masks, codes, coords, masks, features)
+    both = (shells.RESOLUTION, shells.RESOLUTION)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), both)
     write_asset(folder, manifest, arrays, shells.head_bytes(), ply_bytes(box(*BOX)), shells.cameras_bytes())
     return folder
 

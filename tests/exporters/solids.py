@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from exporters.formats.ply import ply_bytes
-from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.manifest import Manifest
 from tests.exporters.meshes import box
 from tests.player.conftest import head_bytes, look_at
+from tests.vertex_grids import arrays_of
 
 DENSITY_RANGE = (-2.0, 6.0)
 AT_SURFACE = 4.0
@@ -53,14 +54,9 @@ def write_solid(folder: Path, distance: Distance, resolution: int, n_cameras: in
     coords, masks, order = pack_vertices(vertices)
     vertices, voxels = vertices[order], voxels[order]
     features = np.concatenate([vertices * (180 / resolution) - 90, np.full((len(vertices), 1), 50)], axis=-1)
-    arrays = GridArrays(
-        coords,
-        masks,
-        encode_density(AT_SURFACE - SLOPE * voxels, DENSITY_RANGE),
-        coords,
-        masks,
-        np.rint(features).astype(np.int8),
-    )
+    codes = encode_density(AT_SURFACE - SLOPE * voxels, DENSITY_RANGE)
+    features = np.rint(features).astype(np.int8)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), (resolution, resolution))
     manifest = Manifest(
         generator="tests",
         resolution=resolution,

@@ -13,12 +13,13 @@ import pytest
 from exporters import cli, export
 from exporters.formats.glb import parse_glb
 from exporters.formats.ply import ply_bytes, read_ply
-from player.asset.asset import GridArrays, write_asset
+from player.asset.asset import write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from tests.exporters.meshes import tetrahedron
+from tests.vertex_grids import arrays_of
 
 # The asset's mesh is in the world already; an exporter that applies this again is far off.
 WORLD_FROM_MODEL = (
@@ -33,7 +34,8 @@ def write_small_asset(folder: Path, mesh: bytes) -> Path:
     """One stored cell, a head that nobody opens, and `mesh`: all that `vfr-export` looks at."""
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     coords, masks, _ = pack_vertices(corners)
-    arrays = GridArrays(coords, masks, np.full(8, 200, np.uint8), coords, masks, np.zeros((8, 4), np.int8))
+    codes, features = np.full(8, 200, np.uint8), np.zeros((8, 4), np.int8)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), (8, 8))
     manifest = Manifest(
         generator="tests",
         resolution=8,

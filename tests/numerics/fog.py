@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from player.asset.bricks import pack_vertices
-from player.asset.grid import SparseGrid, build_grid
+from player.asset.grid import SparseGrid
+from tests.vertex_grids import grid_of
 
 RESOLUTION = 16
 FEATURE = 100
@@ -20,4 +21,4 @@ def fog(optical: float, resolution: int = RESOLUTION, step: float = 2 / 128) -> 
     features = np.full((len(vertices), 1), FEATURE, np.int8)
     box = np.array([[-1.0] * 3, [1.0] * 3])
     where, both = (coords, masks), (resolution, resolution)
-    return build_grid((*where, codes), (*where, features), both, box, step, (low, low + 1))
+    return grid_of((*where, codes), (*where, features), both, box, step, (low, low + 1))

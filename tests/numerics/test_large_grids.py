@@ -16,6 +16,7 @@ from player.asset.asset import GridArrays
 from player.asset.bricks import bricks_per_axis
 from player.asset.grid import SPARE, SparseGrid, VertexRows
 from player.asset.manifest import MAX_RESOLUTION, Manifest
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 from player.compiled import march as march_compiled
 from player.errors import FormatError
 from player.march import march
@@ -77,13 +78,15 @@ def grid_behind(zeros: Zeros, n_slots: int, n_rows: int, contracted: bool) -> Sp
         aabb_min=np.full(3, -box, F32),
         cells_per_unit=np.full(3, resolution / (2 * box), F32),
         step=F32(4 / 96 / float(MAX_SPEED)) if contracted else F32(1 / 40),
+        level_steps=np.ones(1, np.int32),
         density_low=F32(-2),
         density_slope=F32(4 / 255),
         slot_coords=np.argwhere(np.ones((2, 2, 2))).astype(np.int32),
-        table=slots,
+        slot_levels=np.zeros(8, np.int32),
+        table=slots << 3,
         live=live,
         density=density,
-        rows=VertexRows(resolution, 2, slots.copy(), rows),
+        rows=VertexRows(resolution, 2, slots << 3, rows),
         features=features,
         contracted=contracted,
     )
@@ -234,6 +237,7 @@ def test_more_vertices_than_rows_have_numbers_are_refused() -> None:
     )
     coords = np.broadcast_to(np.uint16(0), (n_bricks, 3))
     masks = np.broadcast_to(np.uint64(2**64 - 1), (n_bricks, 8))
-    arrays = GridArrays(coords, masks, np.zeros(1, np.uint8), coords, masks, np.zeros((1, 1), np.int8))
+    pyramid = Pyramid(MAX_RESOLUTION, (Bricks(coords, masks),))
+    arrays = GridArrays(*(PyramidValues(pyramid, (np.zeros((1, 1), kind),)) for kind in (np.uint8, np.int8)))
     with pytest.raises(FormatError, match="at most 2147483647 vertices, got 2147483648"):
         arrays.check(manifest, "")

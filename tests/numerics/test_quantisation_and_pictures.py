@@ -14,7 +14,7 @@ from exporters.shapes.colour import linear_from_srgb, srgb_from_linear
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import decode_density, encode_density
-from player.asset.grid import SparseGrid, build_grid
+from player.asset.grid import SparseGrid
 from player.asset.packing import pack_codes, unpack_codes
 from player.cameras.transforms import read_cameras
 from player.compiled import march as march_compiled
@@ -22,6 +22,7 @@ from player.march import march
 from player.render import Frame, Renderer, render
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
+from tests.vertex_grids import grid_of
 from vfr_bake.baking.grids import code_step, encode_features
 
 MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
@@ -81,7 +82,7 @@ def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
     values = vertices[order][:, axis] + shift
     codes, features = (values + 100).astype(np.uint8), values.astype(np.int8)[:, None]
     where, both = (coords, masks), (resolution, resolution)
-    return build_grid((*where, codes), (*where, features), both, BOX, 0.01, (-4.0, 5.0))
+    return grid_of((*where, codes), (*where, features), both, BOX, 0.01, (-4.0, 5.0))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -208,7 +209,7 @@ def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleTyp
     for points, which in ((vertices, np.arange(len(vertices))), (turned, order)):
         c, m, _ = pack_vertices(points)
         where = (c, m, codes[which]), (c, m, features[which])
-        grids.append(build_grid(*where, (RESOLUTION, RESOLUTION), BOX, STEP, (-2.0, 6.0)))
+        grids.append(grid_of(*where, (RESOLUTION, RESOLUTION), BOX, STEP, (-2.0, 6.0)))
     random = np.random.default_rng(0)
     rays_o = random.normal(size=(500, 3)).astype(np.float32) * 2
     rays_d = random.uniform(-1, 1, (500, 3)) - rays_o

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from exporters.head.onnx_head import HeadWeights, head_onnx
-from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.manifest import Manifest
 from tests.player.march.oracle_march import Scene
+from tests.vertex_grids import arrays_of
 
 RESOLUTION = 64
 DENSITY_RANGE = (-2.0, 6.0)
@@ -79,7 +81,8 @@ def shells() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     radius = np.linalg.norm(vertices / RESOLUTION * 2 - 1, axis=-1)
     inner, outer = np.abs(radius - 0.5) * RESOLUTION / 2, np.abs(radius - 0.99) * RESOLUTION / 2
     near = np.minimum(inner, outer)
-    stored = near < 2.7
+    dense = (near < 2.7).reshape((RESOLUTION + 1,) * 3)
+    stored = ndimage.binary_opening(dense, np.ones((2, 2, 2))).reshape(-1)  # corners of cells with all eight
     vertices, near = vertices[stored], near[stored]
     _, _, order = pack_vertices(vertices)
     vertices, near = vertices[order], near[order]
@@ -113,7 +116,7 @@ def write_shells(folder: Path, sign: int = 1) -> Path:
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
         provenance={"psnr": 30.5},
     )
-    arrays = GridArrays(coords, masks, codes, coords, masks, features)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), (RESOLUTION, RESOLUTION))
     write_asset(folder, manifest, arrays, head_bytes(), b"ply\n", cameras_bytes())
     return folder
 

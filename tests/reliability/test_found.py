@@ -21,7 +21,7 @@ from exporters.shapes.crop import parse_crop
 from player.asset.asset import Asset
 from player.asset.manifest import NAME, parse_manifest
 from player.asset.packing import pack_codes, pack_masks
-from player.asset.unpacking import read_coords
+from player.asset.unpacking import read_arrays, read_coords
 from player.cameras.transforms import parse_transforms, transforms_cameras
 from player.errors import ConfigError, DataError, FormatError
 from player.files.images import png_bytes, read_key
@@ -79,10 +79,10 @@ def test_tensors_where_a_model_has_plain_values(tmp_path: Path) -> None:
 def test_an_asset_without_a_feature(broken: Path) -> None:
     """Rays that hit something found no row to take."""
     asset = Asset.open(broken)
-    a = asset.arrays
+    _, features = read_arrays(asset.folder, asset.manifest, 1 << 40)
     for name, data in (
-        ("feature_masks.bits", pack_masks(np.zeros_like(a.feature_masks))),
-        ("features.codes", pack_codes(a.features[:0])),
+        ("feature_masks.bits", pack_masks(np.zeros_like(features.masks))),
+        ("features.codes", pack_codes(features.values[:0])),
     ):
         (broken / name).write_bytes(data)
     vouch(broken)

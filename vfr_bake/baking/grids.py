@@ -24,6 +24,8 @@ from player.asset.asset import GridArrays
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, VertexRows, build_grid, vertex_rows
+from player.asset.pyramid import PyramidValues
+from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.field.networks import Head
 from vfr_bake.training.model_file import Model
@@ -59,7 +61,11 @@ class Vertices:
         return len(self.index)
 
     def rows(self) -> VertexRows:
-        return vertex_rows(self.coords, self.masks, self.resolution)
+        return vertex_rows(self.values(np.zeros((len(self), 1), np.uint8)).pyramid)
+
+    def values(self, codes: np.ndarray) -> PyramidValues:
+        """The pyramid of one level with the codes [n] or [n, n_channels] of these vertices."""
+        return from_vertices(VertexBricks(self.coords, self.masks, codes), self.resolution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,18 +92,17 @@ class Layout:
         """The asset's arrays, from codes that need not be whole: one for each vertex of the densities,
         [n, n_channels] for each of the features."""
         whole = np.clip(np.rint(density), 0, 255).astype(np.uint8)
-        d, f = self.densities, self.features
-        return GridArrays(d.coords, d.masks, whole, f.coords, f.masks, encode_features(features))
+        return GridArrays(self.densities.values(whole), self.features.values(encode_features(features)))
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
         """The grid that a player makes of `arrays`."""
         a = self.arrays(density, features)
         return build_grid(
-            (a.brick_coords, a.brick_masks, a.density),
-            (a.feature_coords, a.feature_masks, a.features),
-            (self.densities.resolution, self.features.resolution),
+            a.densities,
+            a.features,
             np.array(self.aabb),
             self.step,
+            (1,),
             self.density_range,
             self.contracted,
             self.near,

@@ -15,6 +15,7 @@ import numpy as np
 from player.asset.asset import Asset, GridArrays
 from player.asset.manifest import FileEntry, Manifest
 from player.asset.packing import pack_codes, pack_masks
+from player.asset.single_level import to_vertices
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.render import Renderer
@@ -42,9 +43,9 @@ Measure = Callable[[int, int], float]
 
 def bytes_beside_features(arrays: GridArrays, mesh: int, cameras: int, head: int) -> int:
     """Bytes of an asset of these arrays without its features; mesh, cameras and head are given in bytes."""
-    masks = (len(pack_masks(words)) for words in (arrays.brick_masks, arrays.feature_masks))
-    coords = arrays.brick_coords.nbytes + arrays.feature_coords.nbytes
-    return coords + sum(masks) + len(pack_codes(arrays.density)) + mesh + cameras + head
+    stored = [to_vertices(grid) for grid in (arrays.densities, arrays.features)]
+    structure = sum(grid.coords.nbytes + len(pack_masks(grid.masks)) for grid in stored)
+    return structure + len(pack_codes(stored[0].values)) + mesh + cameras + head
 
 
 def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:

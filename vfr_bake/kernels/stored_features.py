@@ -192,10 +192,13 @@ def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, 
         gy = min(max(points[i, 1], np.float32(0)), size)
         gz = min(max(points[i, 2], np.float32(0)), size)
         x, y, z = min(int(gx), last), min(int(gy), last), min(int(gz), last)
-        fx, fy, fz = gx - np.float32(x), gy - np.float32(y), gz - np.float32(z)
         total = np.float32(0)
         brick = np.int64(bricks[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)])
-        first = brick * 729 + (x & 7) * 81 + (y & 7) * 9 + (z & 7)
+        level = max(brick, 0) & 7
+        x, y, z = x >> level, y >> level, z >> level
+        width = one / np.float32(1 << level)
+        fx, fy, fz = gx * width - np.float32(x), gy * width - np.float32(y), gz * width - np.float32(z)
+        first = (brick >> 3) * 729 + (x & 7) * 81 + (y & 7) * 9 + (z & 7)
         for corner in range(8):
             ix, iy, iz = corner >> 2, (corner >> 1) & 1, corner & 1
             row = of_bricks[first + ix * 81 + iy * 9 + iz] if brick >= 0 else -1

@@ -13,7 +13,7 @@ import numpy as np
 from exporters.formats.ply import ply_bytes
 from exporters.head.onnx_head import head_onnx
 from exporters.shapes.mesh import TriangleMesh
-from player.asset.asset import GridArrays, write_asset
+from player.asset.asset import write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.manifest import Manifest
@@ -21,6 +21,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from tests.exporters.meshes import box
 from tests.player.conftest import WORLD_FROM_MODEL, linear_head, look_at
+from tests.vertex_grids import arrays_of
 
 RESOLUTION = 64
 LOW, HIGH = np.array([20, 16, 24]), np.array([36, 40, 56])
@@ -57,7 +58,8 @@ def write_block(folder: Path) -> Path:
         view_size=(160, 128),
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
     )
-    arrays = GridArrays(coords, masks, codes, coords, masks, (vertices * 2 - 64).astype(np.int8))
+    features = (vertices * 2 - 64).astype(np.int8)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), (RESOLUTION, RESOLUTION))
     head = head_onnx(linear_head(_WEIGHTS, np.zeros((3, 3)), _BIAS))  # the direction counts for nothing
     write_asset(folder, manifest, arrays, head, ply_bytes(_mesh()), write_cameras(cameras()))
     return folder

@@ -20,10 +20,11 @@ from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.volume import Volume, _slope, asset_volume
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
-from player.asset.grid import build_grid, vertex_rows
+from player.asset.single_level import VertexBricks, from_vertices
 from player.errors import ConfigError, FormatError, ParityError, ShapeError
 from tests.exporters.formats import block
 from tests.player import conftest as shells
+from tests.vertex_grids import grid_of
 
 
 def some_volume(n: int = 900, colour: bool = True) -> Volume:
@@ -71,10 +72,10 @@ def test_colours_are_looked_at_up_the_density(size: float, rise: tuple[int, int,
     codes = (vertices @ np.array(rise) + 100).astype(np.uint8)
     edges = np.array([2.0, 3.0, 5.0]) * size
     where, features = (coords, masks), np.zeros((len(codes), 1), np.int8)
-    grid = build_grid(
+    grid = grid_of(
         (*where, codes), (*where, features), (8, 8), np.stack([0 * edges, edges]), 0.1 * size, (0.0, 1.0)
     )
-    rows = vertex_rows(coords, masks, 8)
+    rows = from_vertices(VertexBricks(*where, codes), 8).pyramid.vertices[0]
     inner = np.argwhere(np.ones((7, 7, 7))) + 1
     wanted = np.array(rise) / edges
     np.testing.assert_allclose(
@@ -134,7 +135,7 @@ def test_colours_look_down_the_slope(opened: Asset) -> None:
 def _sigmoid_head(asset: Asset, rows: np.ndarray, dirs: np.ndarray) -> np.ndarray:
     from player.head.head import Head
 
-    features = asset.arrays.features[rows].astype(np.float32)
+    features = asset.arrays.features.values[0][rows].astype(np.float32)
     return Head(asset.path("head.onnx"), 4)(features, dirs.astype(np.float32))
 
 

@@ -18,6 +18,8 @@ import pytest
 from player.asset.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.asset.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
 from player.asset.packing import pack_codes, pack_masks, unpack_codes
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.asset.unpacking import read_arrays
 from player.errors import FormatError, IntegrityError, OutputError, VersionError
 
 SMALLEST = Manifest(
@@ -43,8 +45,11 @@ def test_round_trip_is_byte_for_byte(asset: Asset, tmp_path: Path) -> None:
     assert again.manifest == asset.manifest
     for name in (*FILES, "manifest.json"):
         assert (tmp_path / "copy" / name).read_bytes() == (asset.folder / name).read_bytes()
-    for name in vars(asset.arrays):
-        assert (getattr(again.arrays, name) == getattr(asset.arrays, name)).all()
+    for ours, theirs in zip(vars(asset.arrays).values(), vars(again.arrays).values(), strict=True):
+        assert np.array_equal(ours.values[0], theirs.values[0])
+        for name in ("coords", "masks"):
+            one, other = (getattr(grid.pyramid.levels[0], name) for grid in (ours, theirs))
+            assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("shape", [(0,), (1,), (70,), (0, 3), (1, 3), (70, 1), (70, 5)])
@@ -155,29 +160,29 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def test_arrays_that_do_not_fit(broken_folder: Path, asset: Asset) -> None:
-    a = asset.arrays
-    packed = pack_codes(a.density)
+    densities, features = read_arrays(asset.folder, asset.manifest, 1 << 40)
+    codes, packed = densities.values, pack_codes(densities.values)
     bad: list[tuple[str, bytes, str]] = [
-        ("density.codes", pack_codes(a.density[:-1]), f"expected {len(a.density)} packed codes, got"),
-        ("density.codes", pack_codes(np.append(a.density, np.uint8(0))), "packed codes, got more"),
+        ("density.codes", pack_codes(codes[:-1]), f"expected {len(codes)} packed codes, got"),
+        ("density.codes", pack_codes(np.append(codes, np.uint8(0))), "packed codes, got more"),
         ("density.codes", pack_codes(np.zeros(1 << 20, np.uint8)), "packed codes, got more"),
         ("density.codes", packed + b"tail", "packed codes, got more"),
         ("density.codes", packed[:-9], "packed codes, got"),
         ("density.codes", b"PK\x03\x04 not a stream", "expected packed codes, got something else"),
-        ("density.codes", b"", f"expected {len(a.density)} packed codes, got 0"),
-        ("features.codes", pack_codes(a.features[:, :3]), "packed codes, got"),
-        ("brick_coords.npy", npy(a.brick_coords[::-1].copy()), "expected bricks sorted"),
-        ("brick_coords.npy", npy(a.brick_coords[:-1]), "packed bytes, got more"),
-        ("brick_coords.npy", npy(a.brick_coords + np.uint16(1)), "expected coordinates below 9"),
-        ("brick_coords.npy", npy(np.asfortranarray(a.brick_coords)), "C order"),
+        ("density.codes", b"", f"expected {len(codes)} packed codes, got 0"),
+        ("features.codes", pack_codes(features.values[:, :3]), "packed codes, got"),
+        ("brick_coords.npy", npy(densities.coords[::-1].copy()), "expected bricks sorted"),
+        ("brick_coords.npy", npy(densities.coords[:-1]), "packed bytes, got more"),
+        ("brick_coords.npy", npy(densities.coords + np.uint16(1)), "expected coordinates below 9"),
+        ("brick_coords.npy", npy(np.asfortranarray(densities.coords)), "C order"),
         ("brick_coords.npy", npy(np.array([{}], object), allow_pickle=True), "expected a numpy array"),
-        ("brick_coords.npy", npy(a.brick_coords) + b"tail", "bytes as its header says"),
+        ("brick_coords.npy", npy(densities.coords) + b"tail", "bytes as its header says"),
         ("brick_coords.npy", b"PK\x03\x04 not an array", "expected a numpy array"),
         ("brick_coords.npy", b"", "expected a numpy array"),
-        ("brick_masks.bits", npy(a.brick_masks), "expected packed bytes, got something else"),
-        ("brick_masks.bits", pack_masks(a.brick_masks)[:-9], "packed bytes, got"),
-        ("feature_coords.npy", npy(a.feature_coords[::-1].copy()), "expected bricks sorted"),
-        ("feature_masks.bits", pack_masks(a.feature_masks[:-1]), "packed bytes, got"),
+        ("brick_masks.bits", npy(densities.masks), "expected packed bytes, got something else"),
+        ("brick_masks.bits", pack_masks(densities.masks)[:-9], "packed bytes, got"),
+        ("feature_coords.npy", npy(features.coords[::-1].copy()), "expected bricks sorted"),
+        ("feature_masks.bits", pack_masks(features.masks[:-1]), "packed bytes, got"),
     ]
     for name, data, message in bad:
         good = (broken_folder / name).read_bytes()
@@ -193,15 +198,11 @@ def test_vertices_beyond_the_grid(broken_folder: Path) -> None:
     edit(broken_folder, lambda m: m.update(resolution=63))
     with pytest.raises(FormatError, match="expected coordinates below 8, got 8"):
         Asset.open(broken_folder)
-    arrays = GridArrays(
-        np.zeros((1, 3), np.uint16),
-        np.full((1, 8), 2**7, np.uint64),
-        np.zeros(8, np.uint8),
-        np.zeros((0, 3), np.uint16),
-        np.zeros((0, 8), np.uint64),
-        np.zeros((0, 1), np.int8),
-    )
-    with pytest.raises(FormatError, match="expected vertices up to 6, got one at 7"):
+    beyond = Bricks(np.zeros((1, 3), np.uint16), np.full((1, 8), 2**7, np.uint64))
+    pyramid = Pyramid(SMALLEST.resolution, (beyond,))
+    codes = np.zeros((pyramid.vertices[0].n, 1))
+    arrays = GridArrays(*(PyramidValues(pyramid, (codes.astype(kind),)) for kind in (np.uint8, np.int8)))
+    with pytest.raises(FormatError, match="expected cells up to 5, got one at 7"):
         arrays.check(SMALLEST, "")
 
 

@@ -11,11 +11,11 @@ from player.asset.bricks import (
     dense_index,
     live_cells,
     pack_vertices,
-    stored_bits,
     unpack_vertices,
 )
 from player.asset.density import decode_density, encode_density
 from player.asset.grid import MAX_DISTANCE, build_grid
+from player.asset.single_level import VertexBricks, from_vertices
 
 RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
 
@@ -81,20 +81,30 @@ def test_grid_against_dense_arrays(share: float) -> None:
     vertices = vertices[order]
     codes = rng.integers(1, 256, len(vertices)).astype(np.uint8)
     features = rng.integers(-128, 128, (len(vertices), 3)).astype(np.int8)
-    where, both = (coords, masks), (resolution, resolution)
-    box = np.array([[-1] * 3, [1] * 3])
-    grid = build_grid((*where, codes), (*where, features), both, box, 0.1, (0, 1))
+    densities, stored = (from_vertices(VertexBricks(coords, masks, n), resolution) for n in (codes, features))
+    grid = build_grid(densities, stored, np.array([[-1] * 3, [1] * 3]), 0.1, (1,), (0, 1))
+    cells = np.ones((resolution,) * 3, bool)
+    for x, y, z in np.ndindex(2, 2, 2):
+        cells &= dense[x : x + resolution, y : y + resolution, z : z + resolution]
+    corners = np.zeros((resolution + 1,) * 3, bool)
+    for x, y, z in np.ndindex(2, 2, 2):
+        corners[x : x + resolution, y : y + resolution, z : z + resolution] |= cells
+    kept = corners[tuple(vertices.T)]
+    assert 0 < kept.sum() < len(kept), "some vertices are corners of no live cell"
+    vertices, codes = vertices[kept], codes[kept]
+    assert (grid.features == features[kept]).all()
     n = grid.n_per_axis
     full = np.zeros((n * 8 + 1,) * 3, np.uint8)
     full[tuple(vertices.T)] = codes
     apron = grid.codes.reshape(-1, 9, 9, 9)
     for slot, (x, y, z) in enumerate(grid.slot_coords.tolist()):
-        assert grid.table[(x * n + y) * n + z] == slot
+        assert grid.table[(x * n + y) * n + z] == slot << 3
         assert (apron[slot] == full[x * 8 : x * 8 + 9, y * 8 : y * 8 + 9, z * 8 : z * 8 + 9]).all()
     rows = np.full((n * 8,) * 3, -1)
     rows[tuple(vertices.T)] = np.arange(len(vertices))
-    for x, y, z in coords.tolist():
-        got = grid.rows.rows.reshape(-1, 9, 9, 9)[grid.rows.bricks[(x * n + y) * n + z]][:8, :8, :8]
+    for x, y, z in np.unique(vertices >> 3, axis=0).tolist():
+        brick = grid.rows.bricks[(x * n + y) * n + z]
+        got = grid.rows.rows.reshape(-1, 9, 9, 9)[brick >> 3][:8, :8, :8]
         assert (got == rows[x * 8 : x * 8 + 8, y * 8 : y * 8 + 8, z * 8 : z * 8 + 8]).all()
     for at in np.ndindex(n, n, n):
         entry = int(grid.table.reshape(n, n, n)[at])
@@ -104,5 +114,6 @@ def test_grid_against_dense_arrays(share: float) -> None:
 
 
 def test_grid_of_the_asset_keeps_every_vertex(asset: Asset) -> None:
-    assert stored_bits(asset.arrays.feature_masks).sum() == len(asset.grid.features)
-    assert (asset.grid.features == asset.arrays.features).all()
+    stored = asset.arrays.features
+    assert stored.pyramid.vertices[0].n == len(asset.grid.features)
+    assert (asset.grid.features == stored.values[0]).all()

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, _write_grid, write_asset
 from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
-from player.asset.unpacking import PLACES, Counts, n_vertices, needed_bytes
+from player.asset.single_level import VertexBricks
+from player.asset.unpacking import DENSITIES, FEATURES, PLACES, Counts, n_set, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes
+from tests.reliability.hostile_files import vouch
+from tests.vertex_grids import arrays_of
 
 Vertices = Callable[[np.random.Generator], np.ndarray]
 
@@ -26,17 +29,25 @@ def lattice(n: int, every: int) -> np.ndarray:
 
 
 def written(folder: Path, resolution: int, densities: np.ndarray, features: np.ndarray, n: int) -> Path:
-    coords, masks, _ = pack_vertices(densities)
-    coarse_coords, coarse_masks, _ = pack_vertices(features)
+    """An asset of these vertices, whether or not they are corners of live cells."""
     random = np.random.default_rng(0)
     manifest = Manifest(
         generator="tests", resolution=resolution, feature_resolution=resolution, step=0.1,
         density_range=(-2, 6), n_channels=n, view_size=(48, 40),
     )  # fmt: skip
+    one = lattice(2, 1)
+    nothing = np.zeros((len(one), n), np.int8)
+    any_arrays = arrays_of(
+        (*pack_vertices(one)[:2], nothing[:, 0].view(np.uint8)),
+        (*pack_vertices(one)[:2], nothing),
+        (resolution,) * 2,
+    )
+    write_asset(folder, manifest, any_arrays, head_bytes(n), b"ply\n", cameras_bytes())
     codes = random.integers(0, 256, len(densities)).astype(np.uint8)
     values = random.integers(-128, 128, (len(features), n)).astype(np.int8)
-    arrays = GridArrays(coords, masks, codes, coarse_coords, coarse_masks, values)
-    write_asset(folder, manifest, arrays, head_bytes(n), b"ply\n", cameras_bytes())
+    _write_grid(folder, DENSITIES, VertexBricks(*pack_vertices(densities)[:2], codes))
+    _write_grid(folder, FEATURES, VertexBricks(*pack_vertices(features)[:2], values))
+    vouch(folder)
     return folder
 
 
@@ -53,15 +64,12 @@ CASES: dict[str, tuple[int, np.ndarray, np.ndarray, int]] = {
 def test_what_is_needed_is_what_is_taken(name: str, tmp_path: Path) -> None:
     folder = written(tmp_path / "asset", *CASES[name])
     m = Asset.open(folder).manifest
-    arrays = Asset.open(folder).arrays
+    arrays = read_arrays(folder, m, 1 << 40)
     counts = []
-    for coords, masks, codes in (
-        (arrays.brick_coords, arrays.brick_masks, arrays.density),
-        (arrays.feature_coords, arrays.feature_masks, arrays.features),
-    ):
+    for coords, masks, codes in arrays:
         n = bricks_per_axis(m.resolution)
         held = len(with_corners(coords, masks, n))
-        counts.append(Counts(n, len(coords), codes.size, n_vertices(masks), held))
+        counts.append(Counts(n, len(coords), codes.size, n_set(masks), held))
     n_packed = sum(m.files[file].bytes for file in PLACES.values())
     needed = needed_bytes(n_packed, *counts)
     del arrays, coords, masks, codes

@@ -9,8 +9,9 @@ import numpy as np
 
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
-from player.asset.grid import SparseGrid, build_grid
+from player.asset.grid import SparseGrid
 from player.march.contracted import MAX_SPEED, enter_space
+from tests.vertex_grids import grid_of
 
 RESOLUTION = 48
 STEP = 4 / RESOLUTION / float(MAX_SPEED)
@@ -44,7 +45,7 @@ def contracted_grid(log_sigma: Function, keep: Function) -> SparseGrid:
     features = np.concatenate([vertices * 4 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
     box = np.array([[-2.0] * 3, [2.0] * 3])
     where, both = (coords, masks), (RESOLUTION, RESOLUTION)
-    return build_grid((*where, codes), (*where, features), both, box, STEP, RANGE, True)
+    return grid_of((*where, codes), (*where, features), both, box, STEP, RANGE, True)
 
 
 def naive(

@@ -40,7 +40,7 @@ def some_rays(n: int = 60) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("module", MODULES)
 def test_march_is_that_of_a_loop_that_skips_nothing(module: ModuleType) -> None:
     grid, codes = contracted_grid(bumps, shells), dense_codes(bumps, shells)
-    assert (grid.table < -1).any(), "there is something to skip"
+    assert (grid.table < 0).any(), "there is something to skip"
     rays_o, rays_d = some_rays()
     result = module.march(grid, rays_o, rays_d, 0)
     features = np.zeros((len(rays_o), 4))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from player.asset.grid import SparseGrid, build_grid
+from player.asset.grid import SparseGrid
 from player.march.contracted import MAX_SPEED, MIN_COS, ContractedPath, enter_space, lattice
 from player.march.contraction import contract, pull_back
+from tests.vertex_grids import grid_of
 
 BOX = np.array([[-2.0] * 3, [2.0] * 3])
 
@@ -67,7 +68,7 @@ def test_gradients_are_pulled_back_by_the_jacobian() -> None:
 def empty_grid(resolution: int, step: float) -> SparseGrid:
     where, both = (np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64)), (resolution, resolution)
     codes, features = np.zeros(0, np.uint8), np.zeros((0, 1), np.int8)
-    return build_grid((*where, codes), (*where, features), both, BOX, step, (0.0, 1.0), True)
+    return grid_of((*where, codes), (*where, features), both, BOX, step, (0.0, 1.0), True)
 
 
 def rays_of_all_kinds() -> tuple[np.ndarray, np.ndarray]:

@@ -10,13 +10,14 @@ import pytest
 
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
-from player.asset.grid import SparseGrid, build_grid, vertex_rows
+from player.asset.grid import SparseGrid
 from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins, heaviest
 from player.march.march import MIN_OPACITY
 from tests.player.conftest import DENSITY_RANGE, RESOLUTION, STEP, shells
 from tests.player.march.oracle_march import Scene, bins, march_ray
+from tests.vertex_grids import grid_of, rows_of
 
 # float32: 2^-24 a rounding, some dozen samples of optical depth up to 7; measured 1e-6.
 OPACITY = 5e-6
@@ -89,7 +90,7 @@ def test_march_through_a_box_of_three_different_edges(module: ModuleType, k: int
     vertices, codes, features = shells()
     box = np.array([[-1.5, -0.7, -1.0], [1.1, 0.6, 2.5]])
     where = pack_vertices(vertices)[:2]
-    grid = build_grid((*where, codes), (*where, features), (RESOLUTION, RESOLUTION), box, STEP, DENSITY_RANGE)
+    grid = grid_of((*where, codes), (*where, features), (RESOLUTION, RESOLUTION), box, STEP, DENSITY_RANGE)
     unit_o, unit_d = random_rays(80, seed=10)
     edges = np.diff(box, axis=0)[0]
     rays_o = ((unit_o + 1) / 2 * edges + box[0]).astype(np.float32)
@@ -197,7 +198,7 @@ def with_linear_features(grid: SparseGrid, resolution: int) -> SparseGrid:
     coords, masks, order = pack_vertices(index)
     place = index[order] * np.float32(120 / resolution) - 60
     features = np.concatenate([place, np.full((len(place), 1), 50)], axis=1).astype(np.float32)
-    return replace(grid, rows=vertex_rows(coords, masks, resolution), features=features)
+    return replace(grid, rows=rows_of(coords, masks, resolution), features=features)
 
 
 @pytest.mark.parametrize("module", MARCHES)

@@ -22,16 +22,17 @@ import numpy as np
 
 from exporters.formats.ply import parse_ply
 from player.app.info import facts, page
-from player.asset.asset import Asset
+from player.asset.asset import Asset, read_manifest
 from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
 from player.asset.packing import pack_codes, pack_masks
-from player.asset.unpacking import PLACES
-from player.compiling import available
+from player.asset.unpacking import PLACES, read_arrays
+from player.compiled.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
 from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value
 from tests.reliability.fuzz.targets import Target, small_view
+from tests.vertex_grids import arrays_of
 
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19
@@ -41,7 +42,7 @@ MARCHES: tuple[March, ...] = ("numpy", "numba") if available() else ("numpy",)
 
 def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
     """A ball and a wall, as small as they can be."""
-    from player.asset.asset import GridArrays, write_asset
+    from player.asset.asset import write_asset
     from player.asset.manifest import Manifest
 
     axis = np.arange(RESOLUTION + 1)
@@ -57,7 +58,8 @@ def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
         generator="fuzz", resolution=RESOLUTION, feature_resolution=RESOLUTION, step=0.1,
         density_range=(-2, 4), n_channels=4, view_size=(8, 8), provenance={"bake": {"preset": "fast"}},
     )  # fmt: skip
-    arrays = GridArrays(coords, masks, density, coarse_coords, coarse_masks, features)
+    stored = (coords, masks, density), (coarse_coords, coarse_masks, features)
+    arrays = arrays_of(*stored, (RESOLUTION, RESOLUTION))
     write_asset(folder, manifest, arrays, head, mesh, cameras)
     return folder
 
@@ -69,7 +71,8 @@ class BrokenAsset:
         self.folder = Path(shutil.copytree(whole, folder))
         self._whole = {path.name: path.read_bytes() for path in whole.iterdir()}
         self.manifest: dict[str, Any] = json.loads(self._whole["manifest.json"])
-        self.arrays: Arrays = {name: getattr(Asset.open(whole).arrays, name) for name in PLACES}
+        stored = read_arrays(whole, read_manifest(whole), 1 << 40)
+        self.arrays: Arrays = dict(zip(PLACES, (*stored[0], *stored[1]), strict=True))
         self._changed: set[str] = set()
 
     def bytes_of(self, name: str) -> bytes:

@@ -162,8 +162,7 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: 
     played = march_compiled.march(grid, rays_o, rays_d, k)
     nothing = np.zeros((len(rays_o), 3), np.float32)
     teacher_rays = TeacherRays(rays_o, rays_d, nothing, nothing, nothing[:, 0])
-    arrays = Asset.open(folder).arrays
-    densities = vertex_rows(arrays.brick_coords, arrays.brick_masks, grid.resolution)
+    densities = vertex_rows(Asset.open(folder).arrays.densities.pyramid)
     training_rays: TrainingRays = collect_training_rays(teacher_rays, grid, k, densities)
     assert len(training_rays) == len(played.hits) > 1000
     composed = training_rays.composed(grid.features.astype(np.float32))
@@ -180,7 +179,7 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: 
 
 
 def _codes(folder: Path) -> np.ndarray:
-    return np.asarray(Asset.open(folder).arrays.density, np.float32)
+    return Asset.open(folder).arrays.densities.values[0][:, 0].astype(np.float32)
 
 
 def test_vertices_outside_contracted_space_take_its_border() -> None:
@@ -204,7 +203,7 @@ def test_exports_hold_the_inner_region_in_world_units(model: Model, folder: Path
     assert again["faces"] > 50
     assert (np.abs(np.array(again["bounds"]) - centre) <= asset.scale * 1.001).all()
     densities = np.load(tmp_path / "a.npz")
-    assert len(densities["density"]) < len(asset.arrays.density), "the surroundings are left out"
+    assert len(densities["density"]) < len(asset.arrays.densities.values[0]), "the surroundings are left out"
 
 
 def _options(**settings: object) -> object:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import CONTRACTED_AABB, Manifest
 from player.cameras.camera import Camera
@@ -20,6 +20,7 @@ from player.cameras.transforms import read_cameras, write_cameras
 from player.render import render
 from tests.player.conftest import head_bytes
 from tests.player.march.contracted_scene import RANGE, RESOLUTION, STEP, vertices_and_codes
+from tests.vertex_grids import arrays_of
 from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
@@ -305,7 +306,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Asset:
         world_from_model=((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1)),
     )  # fmt: skip
     folder = tmp_path_factory.mktemp("assets") / "walls"
-    arrays = GridArrays(coords, masks, codes, coords, masks, features)
+    arrays = arrays_of((coords, masks, codes), (coords, masks, features), (RESOLUTION, RESOLUTION))
     write_asset(folder, manifest, arrays, head_bytes(), b"ply\n", write_cameras([]))
     return Asset.open(folder)
 

@@ -1,0 +1,65 @@
+"""Pyramids of one level, made of vertices: how versions 3.x of the format store a grid.
+
+There a brick is 8 x 8 x 8 vertices, and a cell is live where all eight of its corners are stored. In a
+pyramid a brick is of cells, and its vertices follow from them, so that a vertex which is a corner of no live
+cell is left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from player.asset.bricks import bricks_per_axis, dense_index, live_cells, stored_bits
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+
+
+class VertexBricks(NamedTuple):
+    """Vertices in bricks and what is stored at them, as versions 3.x write a grid."""
+
+    coords: np.ndarray
+    """[n_bricks, 3] uint16, sorted."""
+    masks: np.ndarray
+    """[n_bricks, 8] uint64: which vertices are stored."""
+    values: np.ndarray
+    """[n_vertices] or [n_vertices, n_channels] uint8 or int8 codes, by brick and then by bit."""
+
+
+def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
+    """The pyramid of one level whose live cells are those with all eight corners stored.
+
+    Args:
+        stored: vertices and their values; values of one channel may be [n_vertices].
+        resolution: cells along each axis.
+
+    >>> from player.asset.bricks import pack_vertices
+    >>> corners = np.argwhere(np.ones((2, 2, 2)))
+    >>> coords, masks, _ = pack_vertices(np.concatenate([corners, [[1, 1, 2]]]))
+    >>> codes = np.arange(9, dtype=np.uint8)
+    >>> found = from_vertices(VertexBricks(coords, masks, codes), 4)
+    >>> stored_bits(found.pyramid.levels[0].masks).sum(), found.values[0][:, 0].tolist()
+    (1, [0, 1, 2, 3, 4, 5, 6, 7])
+    """
+    coords, masks = np.asarray(stored.coords), np.asarray(stored.masks, np.uint64)
+    values = stored.values[:, None] if stored.values.ndim == 1 else stored.values
+    index = dense_index(coords, bricks_per_axis(resolution))
+    cells = Bricks(coords, live_cells(coords, masks, index)).without_empty()
+    pyramid = Pyramid(resolution, (cells,))
+    kept = pyramid.vertices[0].bricks
+    where = index[tuple(kept.coords.astype(np.int64).T)]
+    left = np.zeros_like(masks)
+    left[where] = kept.masks
+    if not np.array_equal(left, masks):
+        values = values[stored_bits(left)[stored_bits(masks)]]
+    return PyramidValues(pyramid, (values,))
+
+
+def to_vertices(grid: PyramidValues) -> VertexBricks:
+    """Undo `from_vertices`, for a grid of one level; values are [n_vertices, n_channels].
+
+    Every cell with eight corners stored is live in what `from_vertices` makes: a pyramid with a cell that is
+    not live among eight vertices of others is another one when it is read again.
+    """
+    (vertices,), (values,) = grid.pyramid.vertices, grid.values
+    return VertexBricks(vertices.bricks.coords, vertices.bricks.masks, values)
