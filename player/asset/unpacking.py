@@ -82,7 +82,7 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     kept = sum(70 * grid.n_bricks + grid.n_codes for grid in (d, f))
     unpacking = n_packed + sum(256 * grid.n_bricks + 2 * grid.n_codes for grid in (d, f))
     tables = sum(17 * (grid.n_per_axis + 1) ** 3 for grid in (d, f))
-    densities_built = 2400 * d.n_bricks
+    densities_built = 2500 * d.n_bricks
     features_built = 800 * d.n_bricks + 2560 * f.n_bricks + 8 * f.n_rows + 5200 * f.n_held
     return kept + max(unpacking, tables + max(densities_built, features_built))
 

@@ -9,52 +9,42 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.asset.asset import Asset, _write_grid, write_asset
+from player.asset.asset import Asset, write_asset
 from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
-from player.asset.single_level import VertexBricks
-from player.asset.unpacking import DENSITIES, FEATURES, PLACES, Counts, n_set, needed_bytes, read_arrays
+from player.asset.unpacking import PLACES, Counts, n_set, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes
-from tests.reliability.hostile_files import vouch
 from tests.vertex_grids import arrays_of
 
 Vertices = Callable[[np.random.Generator], np.ndarray]
 
 
 def lattice(n: int, every: int) -> np.ndarray:
-    axis = np.arange(0, n, every)
+    """The corners of every so many cells of a grid of `n` vertices an axis."""
+    axis = np.flatnonzero(np.arange(n) % every < 2)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def written(folder: Path, resolution: int, densities: np.ndarray, features: np.ndarray, n: int) -> Path:
-    """An asset of these vertices, whether or not they are corners of live cells."""
     random = np.random.default_rng(0)
     manifest = Manifest(
         generator="tests", resolution=resolution, feature_resolution=resolution, step=0.1,
         density_range=(-2, 6), n_channels=n, view_size=(48, 40),
     )  # fmt: skip
-    one = lattice(2, 1)
-    nothing = np.zeros((len(one), n), np.int8)
-    any_arrays = arrays_of(
-        (*pack_vertices(one)[:2], nothing[:, 0].view(np.uint8)),
-        (*pack_vertices(one)[:2], nothing),
-        (resolution,) * 2,
-    )
-    write_asset(folder, manifest, any_arrays, head_bytes(n), b"ply\n", cameras_bytes())
     codes = random.integers(0, 256, len(densities)).astype(np.uint8)
     values = random.integers(-128, 128, (len(features), n)).astype(np.int8)
-    _write_grid(folder, DENSITIES, VertexBricks(*pack_vertices(densities)[:2], codes))
-    _write_grid(folder, FEATURES, VertexBricks(*pack_vertices(features)[:2], values))
-    vouch(folder)
+    stored = (*pack_vertices(densities)[:2], codes), (*pack_vertices(features)[:2], values)
+    arrays = arrays_of(*stored, (resolution, resolution))
+    write_asset(folder, manifest, arrays, head_bytes(n), b"ply\n", cameras_bytes())
     return folder
 
 
 CASES: dict[str, tuple[int, np.ndarray, np.ndarray, int]] = {
     "full": (96, lattice(97, 1), lattice(97, 1), 4),
-    "one vertex a brick of densities": (255, lattice(256, 8), lattice(9, 1), 4),
-    "one vertex a brick of features": (255, lattice(9, 1), lattice(256, 8), 4),
+    "one cell a brick of densities": (255, lattice(256, 8), lattice(9, 1), 4),
+    "one cell a brick of features": (255, lattice(9, 1), lattice(256, 8), 4),
     "many channels": (64, lattice(65, 8), lattice(65, 1), 64),
     "nearly empty, fine": (1000, lattice(9, 1), lattice(9, 1), 4),
 }
