@@ -158,7 +158,7 @@ class Renderer:
         Raises:
             ConfigError: a picture over MAX_PIXELS, or n_fetches out of range.
         """
-        k = self.asset.manifest.n_samples if n_fetches is None else n_fetches
+        k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
         if k < 0:
             raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
         k = min(k, self._grid.most_samples)

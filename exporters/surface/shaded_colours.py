@@ -100,7 +100,7 @@ class _Shader:
         reach = np.float32(STAND_OFF * voxel_size(self._asset.grid))
         rays_o = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32) - reach * rays_d
         bounds = np.zeros(len(points), np.float32), np.full(len(points), 3 * reach, np.float32)
-        result = self._march(self._grid, rays_o, rays_d, self._asset.manifest.n_samples, bounds)
+        result = self._march(self._grid, rays_o, rays_d, self._asset.manifest.n_fetches, bounds)
         rgb = np.zeros((len(points), 3), np.float32)
         opacity = result.opacity[result.hits]
         rgb[result.hits] = self._head(result.features / opacity[:, None], rays_d[result.hits])

@@ -118,7 +118,7 @@ class Target:
 
 def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     """A digest of everything that the picture depends on."""
-    k = asset.manifest.n_samples if settings.samples is None else settings.samples
+    k = asset.manifest.n_fetches if settings.samples is None else settings.samples
     behind = asset.manifest.background if settings.background is None else settings.background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     facts = json.dumps([camera.c2w.tolist(), lens, k, behind])

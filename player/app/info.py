@@ -18,7 +18,7 @@ from player.terminal import printable
 
 MANIFEST_KEYS = (
     "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
-    "near", "step", "n_samples", "density_range", "n_channels", "background", "colour_space", "view_size",
+    "near", "step", "n_fetches", "density_range", "n_channels", "background", "colour_space", "view_size",
     "provenance",
 )  # fmt: skip
 
@@ -84,7 +84,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
              f"({share:.2%}) in {known['n_bricks']:,} bricks of 8 x 8 x 8"),
             ("features", f"{m.feature_resolution} cells per axis, {known['n_feature_vertices']:,} vertices "
              f"of {m.n_channels} channels of 8 bits, fetched "
-             f"{f'at {m.n_samples} places a ray' if m.n_samples else 'at every sample'}"),
+             f"{f'at {m.n_fetches} places a ray' if m.n_fetches else 'at every sample'}"),
             ("step", _step(m, scale)),
             ("head", f"{known['head_parameters']:,} parameters, once a pixel"),
         ]),

@@ -145,7 +145,7 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
         "threads": done[0].threads if done else None,
         "march": done[0].march if done else None,
         "peak_rss_mb": peak_rss_mb(),
-        "samples": asset.manifest.n_samples if settings.samples is None else settings.samples,
+        "n_fetches": asset.manifest.n_fetches if settings.samples is None else settings.samples,
     }
 
 

@@ -1,70 +1,44 @@
-"""The format `vfr-asset`, version 3.1: this docstring is its specification, the module parses and writes
-the manifest.
+"""The manifest of the format `vfr-asset`, version 4.0; this module parses and writes it. docs/format.md
+specifies the format.
 
-An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved. What is
-packed is so as `player.asset.packing` describes; .npy files have version 1.0 and the header that numpy
-writes.
+An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved.
 
 | file | content |
 |---|---|
 | `manifest.json` | what is described below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
-| `brick_coords.npy` | uint16 [n_bricks, 3], the density's bricks, sorted by (x, y, z), each at most once |
-| `brick_masks.bits` | uint64 [n_bricks, 8], which vertices of a brick are stored, packed |
-| `density.codes` | uint8 [n_vertices], codes, packed |
-| `feature_coords.npy` | uint16 [n_feature_bricks, 3], the features' bricks, sorted in the same way |
-| `feature_masks.bits` | uint64 [n_feature_bricks, 8], which of their vertices are stored, packed |
-| `features.codes` | int8 [n_feature_vertices, n_channels], codes, packed |
+| `part_0.bin`, `part_1.bin`, ... | two pyramids, densities and features, in sections; the first is a whole, coarse picture |
 | `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
 | `report.json`, `report.html` | what the bake measured; for people, no player reads them; may be absent |
 
-GRID. The box `aabb`, in the model frame, has `resolution` R cells and R + 1 vertices along each axis;
-vertex i is at `lo + i (hi - lo) / R`. Vertices are stored in bricks of 8 x 8 x 8 as `player.asset.bricks`
-describes. A cell is live when its eight corners are stored; outside live cells the density is 0. Features
-have a grid of their own over the same box, of `feature_resolution` cells: where a surface is has to be known
-more finely than what colour it has.
-
-CONTRACTED. Where `contracted` is true the box is [-2, 2]^3 of contracted coordinates
-(`player.march.contraction`), which are those of the model frame inside its unit ball and hold the rest of
-space around it. Rays begin `near` model units from the camera: the model has been taught nothing that is
-nearer to one.
-
-DENSITY. `log sigma = lo + (hi - lo) code / 255` with `density_range`; the code is interpolated, sigma is
-per model unit.
-
-FEATURES. The features of a ray are the sum of weight times trilinear code; scales are folded into the head.
-`dirs` are unit directions in the model frame.
-
-MARCH. `player.march.march`, with the step `step`, on the path that `contracted` says (`player.march.path`).
-`n_samples` fetches as `player.march.fetches` chooses them.
-
-COLOUR. `rgb A + (1 - A) background`, in the colour space `colour_space`.
-
 | key | type | meaning |
 |---|---|---|
 | `format` | "vfr-asset" | |
-| `version` | [major, minor] | [3, 1]; unknown keys of a newer minor are ignored |
+| `version` | [major, minor] | [4, 0]; unknown keys of a newer minor are ignored |
 | `generator` | text | the program that wrote the asset |
-| `resolution` | integer, 1..2048 | cells per axis of the density |
-| `feature_resolution` | integer, 1..2048 | cells per axis of the features |
+| `resolution` | integer, 1..2048 | cells per axis of the densities' finest level |
+| `feature_resolution` | integer, 1..2048 | cells per axis of the features' finest level |
 | `aabb` | 2 x 3 numbers | box, model frame |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
-| `contracted` | true or false | |
-| `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted; 0 in 3.0, which lacks it |
+| `contracted` | true or false | whether the box is all of space, contracted (`player.march.contraction`) |
+| `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted |
 | `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
-| `n_samples` | integer, 0..1024 | feature fetches a ray; 0 means at every sample |
+| `level_steps` | 1 to 8 integers, 1..128 | base steps of a sample on each density level: powers of two that do not fall |
+| `n_fetches` | integer, 0..1024 | places where a ray fetches features; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
-| `n_channels` | integer, 1..1024 | |
+| `density_steps` | 1 to 8 integers, 1..255 | by how much a density code changes with a symbol, on each level |
+| `n_channels` | integer, 1..1024 | of the features |
+| `feature_steps` | 1 to 8 integers, 1..255 | the same for features |
 | `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
 | `colour_space` | "srgb" | |
 | `view_size` | 2 integers | width and height of the training pictures |
+| `parts` | list | {`file`, `sections`} of each part: `player.asset.sections` |
 | `files` | object | name: {`bytes`: integer, `sha256`: 64 hexadecimal digits}, every file but the manifest |
 | `provenance` | object | settings and measured figures, free form |
 
 Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
-History: 1.0, the first; 2.0, codes are packed (they were density.npy and features.npy), reports; 2.1,
-contracted; 3.0, features have a grid of their own; 3.1, near.
+A manifest of version 3.x has `n_samples` for `n_fetches`, and has no levels and no parts.
 """
 
 from __future__ import annotations
@@ -76,12 +50,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from player.asset.pyramid import MAX_LEVELS
+from player.asset.sections import MAX_CHANNELS, Grid, Part, check_parts, part_name, parse_parts, parts_as_json
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
-VERSION = (3, 1)
+VERSION = (4, 0)
 NAME = "manifest.json"
-FILES = (
+FILES = ("head.onnx", "mesh.ply", "cameras.json", part_name(0))
+"""The files that every asset of version 4 has."""
+FILES_OF_3 = (
     "brick_coords.npy",
     "brick_masks.bits",
     "density.codes",
@@ -92,10 +70,12 @@ FILES = (
     "mesh.ply",
     "cameras.json",
 )
+"""The files that every asset of version 3 has."""
 MAX_BYTES = 16 << 20
 MAX_VALUES = 1 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
+MAX_LEVEL_STEP = 128
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
@@ -131,9 +111,13 @@ class Manifest:
     world_from_model: tuple[Vector, ...] = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
     contracted: bool = False
     near: float = 0.0
-    n_samples: int = 5
+    level_steps: tuple[int, ...] = (1,)
+    n_fetches: int = 5
+    density_steps: tuple[int, ...] = (1,)
+    feature_steps: tuple[int, ...] = (1,)
     background: Vector = (1.0, 1.0, 1.0)
     colour_space: str = "srgb"
+    parts: tuple[Part, ...] = ()
     files: dict[str, FileEntry] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     version: tuple[int, ...] = VERSION
@@ -142,6 +126,16 @@ class Manifest:
         for key, parse in _PARSERS.items():
             object.__setattr__(self, key, parse(f"manifest: {key}", getattr(self, key)))
         _check_together(self)
+
+    @property
+    def n_levels(self) -> dict[Grid, int]:
+        """Levels of the two pyramids."""
+        return {"densities": len(self.density_steps), "features": len(self.feature_steps)}
+
+    @property
+    def resolutions(self) -> dict[Grid, int]:
+        """Cells along each axis of the finest levels of the two pyramids."""
+        return {"densities": self.resolution, "features": self.feature_resolution}
 
 
 def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
@@ -170,30 +164,62 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
-    if version < (3, 1):
-        document.setdefault("near", 0.0)
+    if version < (4, 0):
+        document = _of_version_4(document, version)
     known = {f.name for f in fields(Manifest)}
     missing = sorted(known - set(document))
     if missing:
         raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
     unknown = sorted(set(document) - known - {"format"})
-    if unknown and version <= VERSION:
+    if unknown and version <= (VERSION if version >= (4, 0) else (3, 1)):
         raise FormatError(
             f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
     values = {}
     for key in known:
         values[key] = _PARSERS[key](f"{where}: {key}", document[key])
-    absent = [name for name in FILES if name not in values["files"]]
-    if complete and absent:
-        raise FormatError(f"{where}: files: expected {absent[0]}, got {sorted(values['files'])}")
+    if complete:
+        _check_files(f"{where}: files", version, values["files"], values["parts"])
     return Manifest(**values)
+
+
+def _of_version_4(document: dict[str, Any], version: tuple[int, ...]) -> dict[str, Any]:
+    """A manifest of version 3.x with the keys of version 4: one level, and no parts.
+
+    What is not a key of version 3 stays and is found to be one too many.
+    """
+    levels = {"level_steps": [1], "density_steps": [1], "feature_steps": [1], "parts": []}
+    found = {f"{key} in version 3" if key in {*levels, "n_fetches"} else key: value
+             for key, value in document.items()}  # fmt: skip
+    if "n_samples" in found:
+        found["n_fetches"] = found.pop("n_samples")
+    if version < (3, 1):
+        found.setdefault("near", 0.0)
+    return found | levels
+
+
+def _check_files(
+    where: str, version: tuple[int, ...], files: dict[str, FileEntry], parts: tuple[Part, ...]
+) -> None:
+    """Raise FormatError unless every file that the version has is listed, and the parts as large as their
+    sections."""
+    needed = FILES if version >= (4, 0) else FILES_OF_3
+    for name in (*needed, *(part.file for part in parts)):
+        if name not in files:
+            raise FormatError(f"{where}: expected {name}, got {sorted(files)}")
+    for part in parts:
+        if files[part.file].bytes != part.bytes:
+            raise FormatError(
+                f"{where}: {part.file}: bytes: expected {part.bytes}, the sum of its sections, got "
+                f"{files[part.file].bytes}"
+            )
 
 
 def manifest_bytes(manifest: Manifest) -> bytes:
     """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
     document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
     document["format"] = FORMAT
+    document["parts"] = parts_as_json(manifest.parts)
     document["files"] = {
         name: {"bytes": entry.bytes, "sha256": entry.sha256} for name, entry in manifest.files.items()
     }
@@ -226,9 +252,9 @@ def _show(value: object) -> str:
 
 def _parse_version(where: str, value: object) -> tuple[int, ...]:
     version = _integers(2, 0, 1 << 20)(where, value)
-    if version[0] != VERSION[0]:
+    if version[0] not in (3, VERSION[0]):
         raise VersionError(
-            f"{where}: expected {VERSION[0]}.x, got {version[0]}.{version[1]}: "
+            f"{where}: expected 3.x or {VERSION[0]}.x, got {version[0]}.{version[1]}: "
             f"{'install a newer vfr-bake' if version > VERSION else 'bake the asset again'}"
         )
     return version
@@ -269,6 +295,15 @@ def _integers(count: int, low: int, high: int) -> Callable[[str, object], tuple[
         if not isinstance(value, list | tuple) or len(value) != count:
             raise FormatError(f"{where}: expected {count} integers, got {_show(value)}")
         return tuple(_integer(low, high)(where, item) for item in value)
+
+    return parse
+
+
+def _steps_of_levels(most: int) -> Callable[[str, object], tuple[int, ...]]:
+    def parse(where: str, value: object) -> tuple[int, ...]:
+        if not isinstance(value, list | tuple) or not 1 <= len(value) <= MAX_LEVELS:
+            raise FormatError(f"{where}: expected 1 to {MAX_LEVELS} integers, got {_show(value)}")
+        return tuple(_integer(1, most)(where, item) for item in value)
 
     return parse
 
@@ -362,6 +397,17 @@ def _check_together(manifest: Manifest) -> None:
         raise FormatError(
             f"manifest: step: expected at most {MAX_STEPS} steps along the diagonal, got {manifest.step}"
         )
+    steps = manifest.level_steps
+    if len(steps) != len(manifest.density_steps):
+        raise FormatError(
+            f"manifest: level_steps: expected {len(manifest.density_steps)}, as many as density_steps, got "
+            f"{len(steps)}"
+        )
+    if any(n & (n - 1) for n in steps) or sorted(steps) != list(steps):
+        raise FormatError(
+            f"manifest: level_steps: expected powers of two that do not fall, got {list(steps)}"
+        )
+    check_parts(manifest.parts, manifest.resolutions, manifest.n_levels, manifest.n_channels)
 
 
 _PARSERS: dict[str, Callable[[str, Any], Any]] = {
@@ -374,12 +420,16 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "step": _number(1e-9, 1e9),
     "contracted": _boolean,
     "near": _number(0, 1e6),
-    "n_samples": _integer(0, 1024),
+    "level_steps": _steps_of_levels(MAX_LEVEL_STEP),
+    "n_fetches": _integer(0, 1024),
     "density_range": _numbers(2, -80, 80),
-    "n_channels": _integer(1, 1024),
+    "density_steps": _steps_of_levels(255),
+    "n_channels": _integer(1, MAX_CHANNELS),
+    "feature_steps": _steps_of_levels(255),
     "background": _numbers(3, 0, 1),
     "colour_space": _one_of("srgb"),
     "view_size": _integers(2, 1, 1 << 20),
+    "parts": parse_parts,
     "files": _files,
     "provenance": _object,
 }

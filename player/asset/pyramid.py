@@ -146,6 +146,16 @@ class Pyramid:
             masks[missing] = expanded(self.shown(level + 1, around >> 1), around & 1)
         return masks
 
+    def with_level(self, level: int, bricks: Bricks) -> Pyramid:
+        """This pyramid with bricks on a level that has none so far, nor have finer ones. The vertices of the
+        other levels stay what they are, and are not looked for again."""
+        levels, vertices = list(self.levels), list(self.vertices)
+        levels[level] = bricks
+        grown = Pyramid(self.resolution, tuple(levels))
+        vertices[level] = grown._vertices(level)
+        vars(grown)["vertices"] = tuple(vertices)
+        return grown
+
     @cached_property
     def vertices(self) -> tuple[Vertices, ...]:
         """The vertices of each level."""

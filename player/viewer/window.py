@@ -72,7 +72,7 @@ class Window:
         self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
         own = self._renderer.asset.manifest
         self._add_controls(
-            own.n_samples if samples is None else min(samples, self._renderer.asset.most_samples),
+            own.n_fetches if samples is None else min(samples, self._renderer.asset.most_samples),
             own.background if background is None else background,
         )
         client.camera.on_update(lambda _: self.touch())
@@ -162,7 +162,7 @@ class Window:
     def _switch(self) -> None:
         """Show another asset, with the number of fetches that it was baked for."""
         self._renderer = self._renderers[self._asset.value]
-        n_fetches = self._renderer.asset.manifest.n_samples
+        n_fetches = self._renderer.asset.manifest.n_fetches
         self._samples.max = max(self._samples.max, n_fetches)
         self._samples.value = n_fetches
         self.touch()

@@ -65,7 +65,7 @@ def measure(
     asset: Asset, cameras: list[Camera], name: Any, n_threads: int | None, k: int | None
 ) -> tuple[Parts, Frame]:
     """Medians over the cameras, and the last frame."""
-    k = asset.manifest.n_samples if k is None else k
+    k = asset.manifest.n_fetches if k is None else k
     rows = []
     with Renderer(asset, n_threads, name) as renderer:
         march, head = Clock(renderer._module.march), Clock(renderer._head)

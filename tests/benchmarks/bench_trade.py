@@ -101,10 +101,10 @@ def section(name: str, trade: dict[str, Any], out: Path) -> list[str]:
 def loss_against_k(trade: dict[str, Any], out: Path) -> list[str]:
     """What fewer lookups lose against all samples, by asset."""
     rows = [row for row in trade["settings"] if row["asset"]]
-    ks = list(dict.fromkeys(row["samples"] for row in rows))
+    ks = list(dict.fromkeys(row["n_fetches"] for row in rows))
     lines = []
     for asset in dict.fromkeys(row["asset"] for row in rows):
-        psnr = {row["samples"]: row["scores"]["psnr"] for row in rows if row["asset"] == asset}
+        psnr = {row["n_fetches"]: row["scores"]["psnr"] for row in rows if row["asset"] == asset}
         lines.append([asset.replace(f"{out}/", ""), *(f"{psnr[0] - psnr[k]:.2f}" for k in ks)])
     return table(["lost against every sample, dB; k =", *(str(k or "all") for k in ks)], lines)
 

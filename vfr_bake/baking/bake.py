@@ -294,7 +294,7 @@ class _Bake:
             n_channels=arrays.features.shape[1],
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
-            n_samples=self.n_fetches,
+            n_fetches=self.n_fetches,
             background=tuple(model.background.tolist()),
             provenance={
                 "bake": asdict(self.config) | asdict(self.choice),

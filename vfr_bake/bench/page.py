@@ -76,11 +76,11 @@ def _marks(trade: Trade, x: str) -> dict[str, list[Mark]]:
     shown = played if x == "k" else trade.settings
     most_ms = max(setting.point.ms for setting in shown)
     most_mb = max(setting.point.megabytes for setting in shown)
-    most_k = max([setting.samples or 0 for setting in played] + [1])
+    most_k = max([setting.n_fetches or 0 for setting in played] + [1])
     series: dict[str, list[Mark]] = {}
     for setting in shown:
         point = setting.point
-        across = {"time": point.ms, "size": point.megabytes, "k": float(setting.samples or 2 * most_k)}[x]
+        across = {"time": point.ms, "size": point.megabytes, "k": float(setting.n_fetches or 2 * most_k)}[x]
         up = float(setting.scores["loss_db"] or 0.0) if x == "k" else point.psnr
         area = point.megabytes / most_mb if x == "time" else point.ms / most_ms
         label = f"{setting.name}: {point.psnr:.2f} dB, {point.ms:.0f} ms, {point.megabytes:.1f} MB"

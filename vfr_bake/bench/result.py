@@ -22,8 +22,8 @@ class Setting:
     """Folder and k of an asset, or the file of the model."""
     asset: str | None
     """The folder; None for the full model."""
-    samples: int | None
-    """Lookups a ray, k; 0 for every sample. None for the full model."""
+    n_fetches: int | None
+    """Feature fetches a ray, k; 0 for every sample. None for the full model."""
     what: dict[str, Any]
     """What the asset is made of: preset, head, resolution, channels and number formats."""
     scores: dict[str, float | None]

@@ -64,7 +64,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
     own = views.cameras[0].width, views.cameras[0].height
     half_and_twice = [((own[0] + 1) // 2, (own[1] + 1) // 2), (2 * own[0], 2 * own[1])]
     sizes = list(dict.fromkeys([own, *(config.frame_sizes() or half_and_twice)]))
-    ks = set(config.samples) | {asset.manifest.n_samples for asset in assets.values()}
+    ks = set(config.samples) | {asset.manifest.n_fetches for asset in assets.values()}
     samples = sorted(ks, key=lambda k: k or 1e9)
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
         run = _Run(Path(folder), views, config, lpips, progress)
@@ -88,7 +88,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
         Setting(
             name=f"{name} k={k or 'all'}",
             asset=name,
-            samples=k,
+            n_fetches=k,
             what=describe(asset),
             scores=qualities[index].scores[k],
             times={size: times[index, k, size] for size in sizes},
@@ -166,7 +166,7 @@ class _Run:
         setting = Setting(
             name=str(path),
             asset=None,
-            samples=None,
+            n_fetches=None,
             what={"preset": "full model"},
             scores=self.scores(pictures, None),
             times={size: frame_times(some, None, [1.0] * len(some)) for size, some in answers.items()},
@@ -207,7 +207,7 @@ class _Run:
                 pictures.append(np.load(self._picture))
                 peak = answer["peak_mb"]
             scores[k] = self.scores(pictures, full)
-            if k == asset.manifest.n_samples:
+            if k == asset.manifest.n_fetches:
                 lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, pictures, strict=True)]))
                 worst_view = Pictures(name, wanted[lowest], pictures[lowest])
                 worst = worst_pixels(asset, self._views.cameras, wanted, pictures)
@@ -235,7 +235,7 @@ def describe(asset: Asset) -> dict[str, Any]:
         "resolution": manifest.resolution,
         "n_channels": manifest.n_channels,
         "code_levels": baked.get("code_levels"),
-        "n_samples": manifest.n_samples,
+        "n_fetches": manifest.n_fetches,
     }
 
 

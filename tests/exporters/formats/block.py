@@ -54,7 +54,7 @@ def write_block(folder: Path) -> Path:
         step=1 / RESOLUTION,
         density_range=density_range,
         n_channels=3,
-        n_samples=0,
+        n_fetches=0,
         view_size=(160, 128),
         world_from_model=tuple(map(tuple, WORLD_FROM_MODEL)),
     )

@@ -38,9 +38,9 @@ def test_one_picture_a_frame_and_figures(
         assert picture.size == (48, 40) and picture.mode == "RGB"
     got = json.loads(figures.read_text())
     assert set(got) == {
-        "ms_median", "ms_p95", "frames", "width", "height", "threads", "march", "peak_rss_mb", "samples",
+        "ms_median", "ms_p95", "frames", "width", "height", "threads", "march", "peak_rss_mb", "n_fetches",
     }  # fmt: skip
-    assert (got["frames"], got["width"], got["height"], got["threads"], got["samples"]) == (5, 48, 40, 2, 5)
+    assert (got["frames"], got["width"], got["height"], got["threads"], got["n_fetches"]) == (5, 48, 40, 2, 5)
     assert got["march"] == ("numba" if compiling.available() else "numpy")
     assert 0 < got["ms_median"] <= got["ms_p95"]
     assert got["peak_rss_mb"] is None or got["peak_rss_mb"] > 10
@@ -72,7 +72,7 @@ def test_json_on_stdout_and_slices(
         assert cli.main([*views(shells_folder), *options]) == 0
         got = json.loads(capsys.readouterr().out)
         assert sorted(p.stem for p in out.iterdir()) == names and got["frames"] == len(names)
-        assert got["march"] == "numpy" and got["samples"] == 0
+        assert got["march"] == "numpy" and got["n_fetches"] == 0
 
 
 @pytest.mark.parametrize(

@@ -308,7 +308,7 @@ def test_not_a_manifest(data: bytes) -> None:
 
 
 def test_golden_manifest() -> None:
-    manifest = replace(SMALLEST, feature_resolution=4, step=0.5, view_size=(4, 3), n_samples=0)
+    manifest = replace(SMALLEST, feature_resolution=4, step=0.5, view_size=(4, 3), n_fetches=0)
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
         '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'

@@ -15,7 +15,7 @@ from tests.player.asset.test_asset import SMALLEST
 LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
     "resolution": (0, 1, 2048, 2049),
     "feature_resolution": (0, 1, 2048, 2049),
-    "n_samples": (-1, 0, 1024, 1025),
+    "n_fetches": (-1, 0, 1024, 1025),
     "n_channels": (0, 1, 1024, 1025),
     "density_range": ((-80.5, 1), (-80, 1), (0, 80), (0, 80.5)),
     "background": ((-0.01, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1.01)),

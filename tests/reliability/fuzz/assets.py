@@ -231,7 +231,7 @@ def _settings(document: dict[str, Any], random: np.random.Generator) -> dict[str
         "feature_resolution": (1, 7, 8, 16, 18, 20, 23, 24, 100, 400),
         "n_channels": (1, 2, 3, 5, 8, 16, 1024),
         "step": (1e-3, 0.01, 0.5, 3.0, 1e9),
-        "n_samples": (0, 1, 2, 64, 1024),
+        "n_fetches": (0, 1, 2, 64, 1024),
         "density_range": ((-80, 80), (79, 80), (-80, -79), (0, 1e-30)),
         "aabb": (((-1e9,) * 3, (1e9,) * 3), ((0, 0, 0), (1e-9, 1, 1)), ((-1, -1, -1), (1, 1, 1e-3))),
         "background": ((0, 0, 0),),

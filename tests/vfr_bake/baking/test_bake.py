@@ -273,7 +273,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
     page = (tmp_path / "asset" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "<svg" in page
     assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
-    k = Asset.open(tmp_path / "asset", verify=True).manifest.n_samples
+    k = Asset.open(tmp_path / "asset", verify=True).manifest.n_fetches
     assert list(said["lookups"])[-1] == str(k) and k <= 4
     assert all(loss > 0.15 for tried, loss in said["lookups"].items() if tried != str(k)), (
         "fewer would lose more"

@@ -77,7 +77,7 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
     bake(model, tmp_path / "a", BakeConfig(**SMALL), quiet)
     bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), quiet)
     a, b = (Asset.open(tmp_path / name).manifest for name in "ab")
-    assert (a.n_samples, a.files["head.onnx"].bytes) == (b.n_samples, b.files["head.onnx"].bytes)
+    assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
 
 
 def test_less_memory_means_fewer_rays(model: Model) -> None:

@@ -51,7 +51,7 @@ def test_each_scene_keeps_to_its_budget(chosen: dict[str, dict]) -> None:
 
 
 def test_fog_takes_more_lookups_than_a_surface(chosen: dict[str, dict]) -> None:
-    lookups = {kind: report["manifest"].n_samples for kind, report in chosen.items()}
+    lookups = {kind: report["manifest"].n_fetches for kind, report in chosen.items()}
     channels = {kind: report["manifest"].n_channels for kind, report in chosen.items()}
     assert lookups["fog"] > lookups["matte"]
     assert len(set(zip(lookups.values(), channels.values(), strict=True))) == 3

@@ -76,7 +76,7 @@ def results(shells_folder: Path, data: Path, tmp_path_factory: pytest.TempPathFa
 
 def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder: Path) -> None:
     rows = results[0]["settings"]
-    assert [row["samples"] for row in rows] == [1, 2, 5, 0], "5 is the asset's own"
+    assert [row["n_fetches"] for row in rows] == [1, 2, 5, 0], "5 is the asset's own"
     asset = Asset.open(shells_folder)
     for row in rows:
         assert row["n_bytes"] == sum(entry.bytes for entry in asset.manifest.files.values())
@@ -130,7 +130,7 @@ def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Pa
 
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
     """The photographs are the asset's own pictures: nothing is lost with every sample, more with fewer."""
-    rows = {row["samples"]: row["scores"] for row in results[0]["settings"]}
+    rows = {row["n_fetches"]: row["scores"] for row in results[0]["settings"]}
     assert rows[0]["psnr"] is None and rows[0]["ssim"] == 1 and rows[0]["loss_db"] == 0
     assert rows[1]["psnr"] < rows[2]["psnr"] < rows[5]["psnr"] < MAX_PSNR
     assert rows[1]["loss_db"] == pytest.approx(MAX_PSNR - rows[1]["psnr"])
