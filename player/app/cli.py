@@ -143,12 +143,12 @@ def _say(text: str) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from player.asset.asset import Asset, checksums, read_manifest
-    from player.asset.unpacking import check_total
+    from player.asset.folder import check_total
     from player.files.memory import allowed_bytes
     from player.head.head import read_head_file
 
     manifest = read_manifest(arguments.asset)
-    check_total(arguments.asset, manifest, allowed_bytes(arguments.max_memory))
+    check_total(arguments.asset, manifest.files, allowed_bytes(arguments.max_memory))
     results = {}
     for name, error in checksums(arguments.asset, manifest):
         results[name] = "ok" if error is None else str(error)

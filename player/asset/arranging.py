@@ -9,6 +9,7 @@ than half.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -60,9 +61,9 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
         if not np.array_equal(wanted, got):
             row, channel = np.argwhere(wanted != got)[0].tolist()
             raise FormatError(
-                f"{grid}, level {level}: expected values that follow from steps of {steps[level]} and, on the "
-                f"border, from the next coarser level: {got[row, channel]} at row {row}, channel {channel}, "
-                f"got {wanted[row, channel]}"
+                f"{grid}, level {level}: expected values that follow from steps of {steps[level]} and, on "
+                f"the border, from the next coarser level: {got[row, channel]} at row {row}, channel "
+                f"{channel}, got {wanted[row, channel]}"
             )
     for level, bricks in enumerate(pyramid.levels):
         coarser = pyramid.levels[level + 1] if level + 1 < len(pyramid.levels) else None
@@ -71,7 +72,7 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
         counts = {"n_bricks": len(bricks), "n_vertices": vertices.n}
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
         bounds = channel_groups(stored.n_channels)
-        for first, end in zip(bounds, bounds[1:], strict=False):
+        for first, end in pairwise(bounds):
             data = encode_symbols(symbols[level][:, first:end], vertices, first)
             channels = {"first_channel": first, "n_channels": end - first}
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)
@@ -97,11 +98,13 @@ def _cut(sections: Sequence[WrittenSection]) -> Iterator[WrittenPart]:
     """Parts of sections that follow each other, none of them empty."""
     ends = np.cumsum([len(written.data) for written in sections])
     firsts = [0]
+    kinds = [(section.grid, section.kind) for section, _ in sections]
+    whole = kinds.index(("features", "symbols")) + 1  # the least that can be shown
     for share in SHARES:
         n = int(np.searchsorted(ends, share * ends[-1], side="right")) if share < 1 else len(sections)
-        if n > firsts[-1]:
+        if n > firsts[-1] and n >= whole:
             firsts.append(n)
-    for number, (first, end) in enumerate(zip(firsts, firsts[1:], strict=False)):
+    for number, (first, end) in enumerate(pairwise(firsts)):
         some = sections[first:end]
         part = Part(part_name(number), tuple(written.section for written in some))
         yield WrittenPart(part, b"".join(written.data for written in some))

@@ -1,9 +1,7 @@
-"""An asset on disk: opened and checked, or written as a whole. The format is specified in
-`player.asset.manifest`."""
+"""An asset on disk: opened and checked, or written as a whole. docs/format.md specifies the format."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -12,30 +10,27 @@ from pathlib import Path
 
 import numpy as np
 
+from player.asset.arranging import write_parts
+from player.asset.check_bricks import check_level
+from player.asset.folder import check_files, check_size, check_sum, file_digest
 from player.asset.grid import SparseGrid, build_grid, most_samples
-from player.asset.manifest import MAX_BYTES, NAME, FileEntry, Manifest, manifest_bytes, parse_manifest
-from player.asset.packing import pack_codes, pack_masks
-from player.asset.pyramid import MAX_LEVELS, PyramidValues
-from player.asset.single_level import VertexBricks, from_vertices, to_vertices
-from player.asset.unpacking import (
-    DENSITIES,
-    DTYPES,
-    FEATURES,
-    PLACES,
-    Names,
-    check_bricks,
-    check_files,
-    check_size,
-    n_set,
-    read_arrays,
+from player.asset.manifest import (
+    MAX_BYTES,
+    NAME,
+    VERSION,
+    FileEntry,
+    Manifest,
+    manifest_bytes,
+    parse_manifest,
 )
-from player.errors import FormatError, IntegrityError
-from player.files.files import new_folder, open_file, read_bytes
+from player.asset.parts import DTYPES, PartsReader
+from player.asset.pyramid import PyramidValues
+from player.asset.sections import MAX_ROWS, Grid
+from player.asset.unpacking import read_version_3
+from player.errors import ConfigError, FormatError
+from player.files.files import new_folder, read_bytes
 from player.files.memory import allowed_bytes
 from player.files.replace import clear_up
-
-MAX_VERTICES = 2**31 - 1
-"""Stored vertices of a grid, whose rows are numbered in 32 bits (`player.asset.grid.VertexRows`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,39 +42,39 @@ class GridArrays:
     features: PyramidValues
     """Codes int8 [n_vertices, n_channels] of each level."""
 
-    def check(self, manifest: Manifest, where: str) -> None:
+    def check(self, manifest: Manifest) -> None:
         """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
-        _check_grid(self.densities, DENSITIES, manifest.resolution, 1, where)
-        _check_grid(self.features, FEATURES, manifest.feature_resolution, manifest.n_channels, where)
+        for grid, stored in (("densities", self.densities), ("features", self.features)):
+            _check_grid(grid, stored, manifest)
 
 
-def _check_grid(grid: PyramidValues, names: Names, resolution: int, n_channels: int, where: str) -> None:
-    pyramid = grid.pyramid
-    coords_name, masks_name, codes_name = (where + PLACES[name] for name in names)
+def _check_grid(grid: Grid, stored: PyramidValues, manifest: Manifest) -> None:
+    pyramid, levels = stored.pyramid, stored.pyramid.levels
+    resolution, n_levels = manifest.resolutions[grid], manifest.n_levels[grid]
     if pyramid.resolution != resolution:
-        raise FormatError(f"{coords_name}: expected {resolution} cells an axis, got {pyramid.resolution}")
-    if not len(pyramid.levels) == len(grid.values) <= MAX_LEVELS:
+        raise FormatError(f"{grid}: expected {resolution} cells an axis, got {pyramid.resolution}")
+    if not len(levels) == len(stored.values) == n_levels:
         raise FormatError(
-            f"{codes_name}: expected codes for each of at most {MAX_LEVELS} levels, got {len(grid.values)} "
-            f"for {len(pyramid.levels)} levels"
+            f"{grid}: expected bricks and values of {n_levels} levels, got {len(levels)} and "
+            f"{len(stored.values)}"
         )
-    n_cells = sum(n_set(bricks.masks) for bricks in pyramid.levels)
-    if n_cells > MAX_VERTICES:  # there are more vertices than cells
-        raise FormatError(f"{masks_name}: expected at most {MAX_VERTICES} vertices, got {n_cells}")
-    if names is FEATURES and not n_cells:  # every sample that counts is given a feature
-        raise FormatError(f"{masks_name}: expected at least one live cell, got none")
-    for level, bricks in enumerate(pyramid.levels):
-        _check_array(coords_name, bricks.coords, "<u2", (len(bricks), 3))
-        _check_array(masks_name, bricks.masks, "<u8", (len(bricks), 8))
-        check_bricks(bricks.coords, bricks.masks, names, pyramid.cells_per_axis(level) - 1, where, "cells")
+    if grid == "features" and not len(levels[-1]):  # every sample that counts is given a feature
+        raise FormatError(f"{grid}: expected at least one live cell, got none")
+    for level, bricks in reversed(list(enumerate(levels))):
+        where = f"{grid}, level {level}"
+        _check_array(f"{where}: coords", bricks.coords, np.uint16, (len(bricks), 3))
+        _check_array(f"{where}: masks", bricks.masks, np.uint64, (len(bricks), 8))
+        above = levels[level + 1] if level + 1 < n_levels else None
+        check_level(bricks, above, pyramid.cells_per_axis(level), where)
     n_rows = sum(vertices.n for vertices in pyramid.vertices)
-    if n_rows > MAX_VERTICES:
-        raise FormatError(f"{masks_name}: expected at most {MAX_VERTICES} vertices, got {n_rows}")
-    for vertices, values in zip(pyramid.vertices, grid.values, strict=True):
-        _check_array(codes_name, values, DTYPES[names[2]], (vertices.n, n_channels))
+    if n_rows > MAX_ROWS:
+        raise FormatError(f"{grid}: expected at most {MAX_ROWS} vertices, got {n_rows}")
+    n_channels = manifest.n_channels if grid == "features" else 1
+    for level, (vertices, values) in enumerate(zip(pyramid.vertices, stored.values, strict=True)):
+        _check_array(f"{grid}, level {level}: values", values, DTYPES[grid], (vertices.n, n_channels))
 
 
-def _check_array(where: str, array: np.ndarray, kind: str, shape: tuple[int, ...]) -> None:
+def _check_array(where: str, array: np.ndarray, kind: type[np.generic], shape: tuple[int, ...]) -> None:
     dtype = np.dtype(kind)
     if array.dtype != dtype or array.shape != shape:
         raise FormatError(
@@ -89,39 +84,69 @@ def _check_array(where: str, array: np.ndarray, kind: str, shape: tuple[int, ...
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """An opened asset, its arrays unpacked. `asset.grid` arranges them for the march."""
+    """An opened asset, its values decoded. `asset.grid` arranges them for the march."""
 
     folder: Path
     manifest: Manifest
     arrays: GridArrays
+    n_parts: int = 0
+    """Parts that have been read; version 3 has none."""
+    missing: str | None = None
+    """Why there is less than was asked for, in one line: a later part is not there, cut short, or another
+    one. What there is plays."""
 
     @classmethod
-    def open(cls, folder: str | Path, verify: bool = False, max_memory: float | None = None) -> Asset:
+    def open(
+        cls,
+        folder: str | Path,
+        verify: bool = False,
+        max_memory: float | None = None,
+        parts: int | None = None,
+    ) -> Asset:
         """Open the asset in `folder`.
 
         Args:
             folder: the asset's folder; its files are regular ones inside it.
-            verify: compare every checksum first, which reads every byte.
+            verify: compare every checksum first, which reads every byte. Otherwise only those of the parts
+                are compared, and a part behind the first that is not there, cut short or another one is no
+                error: `asset.missing` tells.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching; half of what
                 the machine has if None.
+            parts: how many of the parts to read, 1 or more: the fewer, the coarser and the sooner. All if
+                None.
 
         Raises:
             FormatError: not an asset, or one that breaks the format; VersionError if it is a newer one.
             IntegrityError: a file is cut short or changed.
-            ConfigError: it takes more memory than it may.
+            ConfigError: it takes more memory than it may, or `parts` is less than 1.
+
+        >>> asset = Asset.open("out/", parts=1)
+        >>> asset.n_parts, asset.missing
+        (1, None)
         """
-        folder, allowed = Path(folder), allowed_bytes(max_memory)
-        manifest = read_manifest(folder)
-        check_files(folder, manifest, allowed)
-        if verify:
-            for name, entry in manifest.files.items():
-                _check_sum(folder, name, entry)
-        densities, features = read_arrays(folder, manifest, allowed)
-        arrays = GridArrays(
-            from_vertices(densities, manifest.resolution),
-            from_vertices(features, manifest.feature_resolution),
-        )
-        return cls(folder, manifest, arrays)
+        if parts is not None and parts < 1:
+            raise ConfigError(f"parts: expected at least 1, got {parts}")
+        opening = _Opening(Path(folder), verify, max_memory)
+        return opening.asset(len(opening.manifest.parts) if parts is None else parts)
+
+    @classmethod
+    def growing(
+        cls, folder: str | Path, verify: bool = False, max_memory: float | None = None
+    ) -> Iterator[Asset]:
+        """Open the asset in `folder` part by part: first a whole, coarser picture, then sharper ones. Each
+        part is read and decoded once.
+
+        Arguments and errors as `open`; the assets yielded share what has not changed.
+
+        >>> [asset.n_parts for asset in Asset.growing("out/")]
+        [1, 2, 3, 4]
+        """
+        opening = _Opening(Path(folder), verify, max_memory)
+        for n_parts in range(1, max(len(opening.manifest.parts), 1) + 1):
+            asset = opening.asset(n_parts)
+            yield asset
+            if asset.missing is not None:
+                return
 
     def path(self, name: str) -> Path:
         """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
@@ -149,7 +174,7 @@ class Asset:
             a.features,
             np.array(m.aabb),
             m.step,
-            (1,) * len(a.densities.pyramid.levels),
+            m.level_steps,
             (low, high),
             m.contracted,
             m.near,
@@ -172,12 +197,43 @@ class Asset:
         return math.sqrt(sum(row[0] ** 2 for row in self.manifest.world_from_model[:3]))
 
 
+class _Opening:
+    """An asset that is being opened, part by part."""
+
+    def __init__(self, folder: Path, verify: bool, max_memory: float | None) -> None:
+        self._folder, self._allowed = folder, allowed_bytes(max_memory)
+        self.manifest = read_manifest(folder)
+        may_lack = set() if verify else {part.file for part in self.manifest.parts[1:]}
+        needed = {name: entry for name, entry in self.manifest.files.items() if name not in may_lack}
+        check_files(folder, needed, self._allowed)
+        if verify:
+            for name, entry in needed.items():
+                check_sum(folder, name, entry)
+        self._parts = PartsReader(folder, self.manifest, self._allowed)
+
+    def asset(self, n_parts: int) -> Asset:
+        """The asset as its first `n_parts` parts have it, as far as they are there."""
+        folder, manifest, parts = self._folder, self.manifest, self._parts
+        if manifest.version < (4, 0):
+            return Asset(folder, manifest, GridArrays(*read_version_3(folder, manifest, self._allowed)))
+        missing = None
+        while missing is None and parts.n_read < min(n_parts, len(manifest.parts)):
+            try:
+                parts.read()
+            except FormatError as error:
+                if not parts.n_read:
+                    raise
+                missing = f"{error}: shown as the first {parts.n_read} of {len(manifest.parts)} parts have it"
+        arrays = GridArrays(parts.values("densities"), parts.values("features"))
+        return Asset(folder, manifest, arrays, parts.n_read, missing)
+
+
 def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatError | None]]:
     """Every file's name with what is wrong with it, or None; reads each byte once."""
     for name, entry in sorted(manifest.files.items()):
         try:
             check_size(folder, name, entry)
-            _check_sum(folder, name, entry)
+            check_sum(folder, name, entry)
         except FormatError as error:
             yield name, error
         else:
@@ -216,7 +272,7 @@ def write_asset(
 
     Args:
         folder: the new folder.
-        manifest: everything but `files`, which is filled in here.
+        manifest: everything but `parts` and `files`, which are filled in here.
         arrays: checked before anything is written.
         head: bytes of `head.onnx`.
         mesh: bytes of `mesh.ply`, world frame.
@@ -226,13 +282,15 @@ def write_asset(
             files that it returns, content by name, are added. What it raises leaves nothing.
 
     Raises:
-        FormatError: the arrays contradict the manifest.
+        FormatError: the arrays contradict the manifest, or hold values that its steps do not reach.
         OutputError: the folder exists, or the disk is full.
     """
-    arrays.check(manifest, "")
+    arrays.check(manifest)
+    parts = write_parts(arrays.densities, arrays.features, manifest)
+    manifest = replace(manifest, version=VERSION, parts=tuple(part.part for part in parts), files={})
     with new_folder(folder, force) as new:
-        for names, grid in ((DENSITIES, arrays.densities), (FEATURES, arrays.features)):
-            _write_grid(new, names, to_vertices(grid))
+        for part in parts:
+            (new / part.part.file).write_bytes(part.data)
         for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
             (new / name).write_bytes(data)
         _write_manifest(new, manifest)
@@ -240,16 +298,6 @@ def write_asset(
             for name, data in finish(new).items():
                 (new / name).write_bytes(data)
             _write_manifest(new, manifest)
-
-
-def _write_grid(folder: Path, names: Names, stored: VertexBricks) -> None:
-    """The three files of a grid in version 3.1."""
-    coords_name, masks_name, codes_name = (folder / PLACES[name] for name in names)
-    with coords_name.open("wb") as file:
-        coords = np.ascontiguousarray(stored.coords, "<u2")
-        np.lib.format.write_array(file, coords, version=(1, 0), allow_pickle=False)
-    masks_name.write_bytes(pack_masks(stored.masks))
-    codes_name.write_bytes(pack_codes(stored.values))
 
 
 def _write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -263,19 +311,4 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
 
 def _entry(path: Path) -> FileEntry:
     size = path.stat().st_size
-    return FileEntry(size, _digest(path, size, path.parent))
-
-
-def _check_sum(folder: Path, name: str, entry: FileEntry) -> None:
-    path = folder / name
-    digest = _digest(path, entry.bytes, folder)
-    if digest != entry.sha256:
-        raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")
-
-
-def _digest(path: Path, most: int, inside: Path) -> str:
-    digest = hashlib.sha256()
-    with open_file(path, "a file of an asset", most, inside) as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    return FileEntry(size, file_digest(path, size, path.parent))

@@ -33,8 +33,8 @@ def check_level(bricks: Bricks, above: Bricks | None, n_cells: int, where: str) 
     wrong = np.flatnonzero((below.masks != above.masks_at(below.coords) & _cells_of(octants)).any(axis=1))
     if len(wrong):
         raise FormatError(
-            f"{where}: expected a live cell in each live cell of the coarser level that it refines, and in no "
-            f"other: differs in brick {below.coords[wrong[0]].tolist()}"
+            f"{where}: expected a live cell in each live cell of the coarser level that it refines, and in "
+            f"no other: differs in brick {below.coords[wrong[0]].tolist()}"
         )
 
 

@@ -6,7 +6,7 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | file | content |
 |---|---|
 | `manifest.json` | what is described below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
-| `part_0.bin`, `part_1.bin`, ... | two pyramids, densities and features, in sections; the first is a whole, coarse picture |
+| `part_0.bin`, `part_1.bin`, ... | densities and features; the first is a whole, coarse picture |
 | `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
@@ -24,10 +24,10 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `contracted` | true or false | whether the box is all of space, contracted (`player.march.contraction`) |
 | `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted |
 | `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
-| `level_steps` | 1 to 8 integers, 1..128 | base steps of a sample on each density level: powers of two that do not fall |
+| `level_steps` | 1 to 8 integers, 1..128 | base steps of a sample on each density level, powers of two |
 | `n_fetches` | integer, 0..1024 | places where a ray fetches features; 0 means at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
-| `density_steps` | 1 to 8 integers, 1..255 | by how much a density code changes with a symbol, on each level |
+| `density_steps` | 1 to 8 integers, 1..255 | by how much a symbol changes a density code, on each level |
 | `n_channels` | integer, 1..1024 | of the features |
 | `feature_steps` | 1 to 8 integers, 1..255 | the same for features |
 | `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
@@ -51,7 +51,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from player.asset.pyramid import MAX_LEVELS
-from player.asset.sections import MAX_CHANNELS, Grid, Part, check_parts, part_name, parse_parts, parts_as_json
+from player.asset.sections import MAX_CHANNELS, Grid, Part, check_parts, parse_parts, part_name, parts_as_json
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
@@ -204,6 +204,8 @@ def _check_files(
     """Raise FormatError unless every file that the version has is listed, and the parts as large as their
     sections."""
     needed = FILES if version >= (4, 0) else FILES_OF_3
+    if version >= (4, 0) and not parts:
+        raise FormatError(f"{where.removesuffix(': files')}: parts: expected at least one, got none")
     for name in (*needed, *(part.file for part in parts)):
         if name not in files:
             raise FormatError(f"{where}: expected {name}, got {sorted(files)}")

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.check_bricks import check_level
+from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
 from player.asset.standin import decode_structure, decode_symbols
-from player.errors import FormatError, IntegrityError
+from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
 
@@ -125,6 +126,10 @@ class PartsReader:
             later = other.submit(features.read_symbols, sections["features"])
             densities.read_symbols(sections["densities"])
             later.result()
+        if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given a feature
+            raise FormatError(
+                f"{self._folder / part.file}: expected at least one live cell of the features, got none"
+            )
         self.n_read += 1
 
     def _check_memory(self) -> None:
@@ -133,12 +138,9 @@ class PartsReader:
     def _bytes(self, part: Part) -> bytes:
         """The content of the part's file, compared with its checksum."""
         path, entry = self._folder / part.file, self._manifest.files[part.file]
+        check_size(self._folder, part.file, entry)
         data = read_bytes(path, "a part of an asset", entry.bytes, self._folder)
-        if len(data) != entry.bytes:
-            raise IntegrityError(f"{path}: size: expected {entry.bytes} bytes, got {len(data)}")
-        digest = hashlib.sha256(data).hexdigest()
-        if digest != entry.sha256:
-            raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")
+        compare_sums(path, entry, hashlib.sha256(data).hexdigest())
         return data
 
     def values(self, grid: Grid) -> PyramidValues:

@@ -120,9 +120,7 @@ def _parse_part(where: str, number: int, value: object) -> Part:
         raise FormatError(f"{where}: file: expected {part_name(number)}, got {_show(value['file'])}")
     sections = value["sections"]
     if not isinstance(sections, list) or not 1 <= len(sections) <= MAX_SECTIONS:
-        raise FormatError(
-            f"{where}: sections: expected a list of 1 to {MAX_SECTIONS}, got {_show(sections)}"
-        )
+        raise FormatError(f"{where}: sections: expected a list of 1 to {MAX_SECTIONS}, got {_show(sections)}")
     found = (_parse_section(f"{where}: section {i}", section) for i, section in enumerate(sections))
     return Part(value["file"], tuple(found))
 

@@ -1,4 +1,4 @@
-"""The arrays of an asset out of its files, within a budget of memory.
+"""The arrays of an asset of version 3 out of its files, within a budget of memory.
 
 Every step is as large as what came before it says, and is compared with the budget before it is taken: the
 manifest has the sizes of the files; so many bytes of coordinates are so many bricks; each has a mask of 64
@@ -15,12 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.bricks import bricks_per_axis, unpack_vertices, with_corners
-from player.asset.manifest import FileEntry, Manifest
+from player.asset.bricks import bricks_per_axis, with_corners
+from player.asset.check_bricks import check_inside, check_sorted
+from player.asset.manifest import Manifest
 from player.asset.packing import unpack_codes, unpack_masks
-from player.asset.single_level import VertexBricks
-from player.errors import FormatError, IntegrityError
-from player.files.files import file_size, read_bytes
+from player.asset.pyramid import Bricks, PyramidValues
+from player.asset.single_level import VertexBricks, from_vertices
+from player.errors import FormatError
+from player.files.files import read_bytes
 from player.files.memory import check_memory
 
 DTYPES = {
@@ -44,10 +46,6 @@ PLACES = {
 Names = tuple[str, str, str]
 DENSITIES: Names = ("brick_coords", "brick_masks", "density")
 FEATURES: Names = ("feature_coords", "feature_masks", "features")
-
-MAX_HEAD_BYTES = 64 << 20
-"""Ten times the largest head that can be baked: 1,024 channels into layers that are 256 wide take 6 MB."""
-MAX_CAMERA_BYTES = 64 << 20
 
 _HEADER = re.compile(
     rb"\x93NUMPY\x01\x00(..)"
@@ -87,39 +85,17 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     return kept + max(unpacking, tables + max(densities_built, features_built))
 
 
-def check_files(folder: Path, manifest: Manifest, allowed: int) -> None:
-    """Look at every file of an asset before any is opened: sizes against the manifest, against what they can
-    hold, and against the memory that is allowed.
-
-    Raises FormatError: not a file, outside the folder, larger than any of its kind; IntegrityError: of
-    another size; ConfigError: more than is allowed.
-    """
-    for name, entry in manifest.files.items():
-        check_size(folder, name, entry)
-    check_total(folder, manifest, allowed)
-    most = {"head.onnx": MAX_HEAD_BYTES, "cameras.json": MAX_CAMERA_BYTES}
+def _check_coords_files(folder: Path, manifest: Manifest, allowed: int) -> None:
+    """Look at the sizes of the files of coordinates: against the number of bricks that there can be, and with
+    what they come to, against the memory that is allowed. Raises FormatError, ConfigError."""
     for names, n_per_axis in _per_axis(manifest):
-        most[PLACES[names[0]]] = 6 * n_per_axis**3 + _LONGEST_HEADER
-    for name, n_bytes in most.items():
-        if manifest.files[name].bytes > n_bytes:
+        name, most = PLACES[names[0]], 6 * n_per_axis**3 + _LONGEST_HEADER
+        if manifest.files[name].bytes > most:
             raise FormatError(
-                f"{folder / name}: size: expected at most {n_bytes} bytes, got {manifest.files[name].bytes}"
+                f"{folder / name}: size: expected at most {most} bytes, got {manifest.files[name].bytes}"
             )
     least = [Counts(n, _n_bricks(manifest, names)) for names, n in _per_axis(manifest)]
     check_memory(needed_bytes(0, *least), allowed, str(folder))
-
-
-def check_total(folder: Path, manifest: Manifest, allowed: int) -> None:
-    """Raise ConfigError if the files of an asset are larger than what is allowed, all together."""
-    check_memory(sum(entry.bytes for entry in manifest.files.values()), allowed, str(folder))
-
-
-def check_size(folder: Path, name: str, entry: FileEntry) -> None:
-    """Raise FormatError unless the file is a regular one inside the folder; IntegrityError for another size
-    than the manifest has."""
-    size = file_size(folder / name, f"a file of {entry.bytes} bytes", folder)
-    if size != entry.bytes:
-        raise IntegrityError(f"{folder / name}: size: expected {entry.bytes} bytes, got {size}")
 
 
 def _per_axis(manifest: Manifest) -> list[tuple[Names, int]]:
@@ -140,11 +116,25 @@ def _most_packed(n_bytes: int) -> int:
     return n_bytes + n_bytes // 100 + 1000
 
 
+def read_version_3(folder: Path, manifest: Manifest, allowed: int) -> tuple[PyramidValues, PyramidValues]:
+    """The densities and the features of an asset of version 3, whose files are there; arguments and errors as
+    `read_arrays`."""
+    densities, features = read_arrays(folder, manifest, allowed)
+    return (
+        from_vertices(densities, manifest.resolution),
+        from_vertices(features, manifest.feature_resolution),
+    )
+
+
 def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexBricks, VertexBricks]:
-    """The densities and the features of an asset whose files `check_files` has looked at.
+    """The densities and the features of an asset of version 3, as its files have them.
+
+    `allowed`: bytes of memory that the asset may take.
 
     Raises FormatError, IntegrityError: they break the format; ConfigError: they take more than is allowed.
     """
+
+    _check_coords_files(folder, manifest, allowed)
 
     def read(name: str, most: int) -> bytes:
         return read_bytes(folder / PLACES[name], "an array", most, folder)
@@ -155,7 +145,8 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
         )
         of_features = names is FEATURES
         resolution = manifest.feature_resolution if of_features else manifest.resolution
-        check_bricks(coords, found, names, resolution, f"{folder}/", "vertices")
+        check_sorted(coords, str(folder / PLACES[names[0]]))
+        check_inside(Bricks(coords, found), resolution + 1, "vertices", str(folder / PLACES[names[0]]))
         if of_features and not found.any():  # every sample that counts is given a feature
             raise FormatError(f"{folder / PLACES[names[1]]}: expected at least one stored vertex, got none")
         n_rows = n_set(found)
@@ -210,27 +201,3 @@ def read_coords(data: bytes, where: str) -> np.ndarray:
 def n_set(masks: np.ndarray) -> int:
     """Set bits of masks of bricks [n, 8] uint64."""
     return int(np.bitwise_count(masks).sum(dtype=np.int64))
-
-
-def check_bricks(
-    coords: np.ndarray, masks: np.ndarray, names: Names, last: int, where: str, what: str
-) -> None:
-    """Raise FormatError unless the bricks are sorted, each once, and hold nothing beyond `last` along an
-    axis; `what` they are of, cells or vertices."""
-    coords = np.asarray(coords, np.int64)
-    keys = (coords[:, 0] << 32) | (coords[:, 1] << 16) | coords[:, 2]
-    if (np.diff(keys) <= 0).any():
-        raise FormatError(f"{where}{PLACES[names[0]]}: expected bricks sorted by x, y, z, each once")
-    n = (last >> 3) + 1
-    if (coords >= n).any():
-        raise FormatError(f"{where}{PLACES[names[0]]}: expected coordinates below {n}, got {coords.max()}")
-    beyond = np.zeros((3, 8), np.uint64)  # bits of what is behind the last, along x, y, z
-    bits = np.arange(512)
-    for axis, place in enumerate((bits >> 6, (bits >> 3) & 7, bits & 7)):
-        beyond[axis] = np.packbits(place > (last & 7), bitorder="little").view("<u8")
-    for axis in range(3):
-        edge = np.flatnonzero(coords[:, axis] == n - 1)
-        wrong = edge[(masks[edge] & beyond[axis]).any(axis=1)]
-        if len(wrong):
-            got = unpack_vertices(coords[wrong[:1]], masks[wrong[:1]])[:, axis].max()
-            raise FormatError(f"{where}{PLACES[names[1]]}: expected {what} up to {last}, got one at {got}")

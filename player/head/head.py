@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from player.asset.unpacking import MAX_HEAD_BYTES
+from player.asset.folder import MAX_HEAD_BYTES
 from player.errors import FormatError
 from player.files.files import read_bytes
 from player.head.graph import HeadArrays, read_head

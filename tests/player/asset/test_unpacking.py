@@ -1,4 +1,5 @@
-"""What an asset takes in memory: the sum that is compared with the budget, against what numpy asks for."""
+"""What an asset of version 3 takes in memory: the sum that is compared with the budget, against what numpy
+asks for."""
 
 from __future__ import annotations
 
@@ -9,14 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.asset.asset import Asset, write_asset
+from player.asset.asset import Asset
 from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
+from player.asset.single_level import VertexBricks
 from player.asset.unpacking import PLACES, Counts, n_set, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes
-from tests.vertex_grids import arrays_of
+from tests.version_3 import write_version_3
 
 Vertices = Callable[[np.random.Generator], np.ndarray]
 
@@ -27,6 +29,11 @@ def lattice(n: int, every: int) -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+def cells_of(lowest: np.ndarray) -> np.ndarray:
+    """The eight corners of each of the cells [n, 3]."""
+    return (lowest[:, None] + np.argwhere(np.ones((2, 2, 2)))).reshape(-1, 3)
+
+
 def written(folder: Path, resolution: int, densities: np.ndarray, features: np.ndarray, n: int) -> Path:
     random = np.random.default_rng(0)
     manifest = Manifest(
@@ -35,17 +42,19 @@ def written(folder: Path, resolution: int, densities: np.ndarray, features: np.n
     )  # fmt: skip
     codes = random.integers(0, 256, len(densities)).astype(np.uint8)
     values = random.integers(-128, 128, (len(features), n)).astype(np.int8)
-    stored = (*pack_vertices(densities)[:2], codes), (*pack_vertices(features)[:2], values)
-    arrays = arrays_of(*stored, (resolution, resolution))
-    write_asset(folder, manifest, arrays, head_bytes(n), b"ply\n", cameras_bytes())
-    return folder
+    stored = (
+        VertexBricks(*pack_vertices(densities)[:2], codes),
+        VertexBricks(*pack_vertices(features)[:2], values),
+    )
+    files = {"head.onnx": head_bytes(n), "mesh.ply": b"ply\n", "cameras.json": cameras_bytes()}
+    return write_version_3(folder, manifest, *stored, files)
 
 
 CASES: dict[str, tuple[int, np.ndarray, np.ndarray, int]] = {
     "full": (96, lattice(97, 1), lattice(97, 1), 4),
-    "one cell a brick of densities": (255, lattice(256, 8), lattice(9, 1), 4),
-    "one cell a brick of features": (255, lattice(9, 1), lattice(256, 8), 4),
-    "many channels": (64, lattice(65, 8), lattice(65, 1), 64),
+    "one cell a brick of densities": (255, cells_of(lattice(249, 8)), lattice(9, 1), 4),
+    "one cell a brick of features": (255, lattice(9, 1), cells_of(lattice(249, 8)), 4),
+    "many channels": (64, lattice(9, 1), lattice(65, 1), 64),
     "nearly empty, fine": (1000, lattice(9, 1), lattice(9, 1), 4),
 }
 

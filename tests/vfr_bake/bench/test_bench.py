@@ -91,7 +91,7 @@ def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder:
                 "two frames: mean of all = of quartiles"
             )
         assert row["peak_mb"] > 20 and row["first_picture_ms"] > 10
-        assert row["commands"][1].startswith(f"vfr-play {shells_folder} --samples {row['samples']} ")
+        assert row["commands"][1].startswith(f"vfr-play {shells_folder} --samples {row['n_fetches']} ")
 
 
 @pytest.mark.parametrize("contracted", [False, True], ids=["object", "unbounded"])

@@ -1,0 +1,44 @@
+"""Assets of version 3.1 of the format, which is read and no longer written: as its writer wrote them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from player.asset.manifest import FileEntry, Manifest, manifest_bytes
+from player.asset.packing import pack_codes, pack_masks
+from player.asset.single_level import VertexBricks
+from player.asset.unpacking import DENSITIES, FEATURES, PLACES
+
+KEYS_OF_4 = ("level_steps", "density_steps", "feature_steps", "parts")
+
+
+def write_version_3(
+    folder: Path, manifest: Manifest, densities: VertexBricks, features: VertexBricks, files: dict[str, bytes]
+) -> Path:
+    """Write an asset; `files` are head, mesh, cameras and reports by their names. Returns its folder."""
+    folder.mkdir(parents=True)
+    for names, stored in ((DENSITIES, densities), (FEATURES, features)):
+        coords = io.BytesIO()
+        np.save(coords, np.ascontiguousarray(stored.coords, "<u2"))
+        packed = coords.getvalue(), pack_masks(stored.masks), pack_codes(stored.values)
+        files = files | {PLACES[name]: data for name, data in zip(names, packed, strict=True)}
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    (folder / "manifest.json").write_bytes(manifest_3(manifest, files))
+    return folder
+
+
+def manifest_3(manifest: Manifest, files: dict[str, bytes]) -> bytes:
+    """The manifest as version 3.1 has it."""
+    document = json.loads(manifest_bytes(manifest))
+    for key in KEYS_OF_4:
+        del document[key]
+    document["n_samples"] = document.pop("n_fetches")
+    entries = {name: FileEntry(len(data), hashlib.sha256(data).hexdigest()) for name, data in files.items()}
+    document["files"] = {name: vars(entry) for name, entry in entries.items()}
+    return json.dumps(document | {"version": [3, 1]}, sort_keys=True, indent=1).encode()
