@@ -24,6 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from player.asset.bricks import BRICK, bricks_per_axis, stored_bits
+from player.asset.prediction import Places, values_from
 
 MAX_LEVELS = 8
 
@@ -299,6 +300,21 @@ def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
     return Pyramid(resolution, tuple(levels))
 
 
+def _places(fine: Vertices, coarse: Vertices) -> Places:
+    """Where the vertices of the next coarser level around those of a level are."""
+    rows = np.append(coarse.row_of_bit, np.full(BRICK**3, -1, np.int32)).reshape(-1, BRICK, BRICK, BRICK)
+    apron = np.empty((len(coarse.bricks), BRICK + 1, BRICK + 1, BRICK + 1), np.int32)
+    for offset in np.ndindex(2, 2, 2):
+        beside = coarse.bricks.find(coarse.bricks.coords.astype(np.int64) + offset)  # -1: the last, of -1
+        into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
+        take = tuple(slice(1) if o else slice(None) for o in offset)
+        apron[(slice(None), *into)] = rows[(slice(None), *take)][beside]
+    bricks = np.empty((len(fine.bricks), 4), np.int32)
+    bricks[:, 0] = coarse.bricks.find(fine.bricks.coords >> 1)
+    bricks[:, 1:] = (fine.bricks.coords & 1) * (BRICK // 2)
+    return Places(bricks, apron.reshape(-1))
+
+
 def predicted(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
     """What the next coarser level says at the vertices of a level.
 
@@ -310,23 +326,16 @@ def predicted(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarra
     Returns:
         [n, n_channels] int16: (the sum of the values at floor(v / 2) and ceil(v / 2) of each axis + 4) >> 3.
     """
-    out = np.empty((fine.n, values.shape[1]), np.int16)
-    index = fine.index
-    parity = (index & 1) @ np.array([4, 2, 1])
-    for odd in np.ndindex(2, 2, 2):
-        rows = np.flatnonzero(parity == odd[0] * 4 + odd[1] * 2 + odd[2])
-        if not len(rows):
-            continue
-        low = index[rows] >> 1
-        total = np.zeros((len(rows), values.shape[1]), np.int16)
-        for up in np.ndindex(*(1 + o for o in odd)):
-            total += values[coarse.rows(low + np.array(up, np.int32))]
-        out[rows] = (total * np.int16(8 >> sum(odd)) + np.int16(4)) >> np.int16(3)
-    return out
+    masks, none = fine.bricks.masks, np.zeros((0, values.shape[1]), np.int16)
+    return values_from(masks, fine.border, _places(fine, coarse), values, none, 1, (0, 0), np.int16)
 
 
 def values_of(
-    vertices: Sequence[Vertices], symbols: Sequence[np.ndarray], steps: Sequence[int], limits: tuple[int, int]
+    vertices: Sequence[Vertices],
+    symbols: Sequence[np.ndarray],
+    steps: Sequence[int],
+    limits: tuple[int, int],
+    dtype: type[np.generic] = np.int16,
 ) -> list[np.ndarray]:
     """The values of all levels from what each stores.
 
@@ -334,22 +343,25 @@ def values_of(
         vertices: those of each level, the finest first.
         symbols: for each level [n_stored, n_channels] integers, one row for each vertex that is not on the
             border: by how many steps it differs from what the coarser level says; on the coarsest level, from
-            0.
+            0. [0, n_channels] where all are 0.
         steps: for each level the width of a step, 1 or more.
         limits: the lowest and the highest value.
+        dtype: of the values.
 
     Returns:
-        for each level [n, n_channels] int16, a row for each vertex.
+        for each level [n, n_channels], a row for each vertex.
     """
     found: list[np.ndarray] = []
     for level in reversed(range(len(vertices))):
-        here, stored = vertices[level], ~vertices[level].on_border
+        here, change, step = vertices[level], symbols[level], steps[level]
         if found:
-            values = predicted(here, vertices[level + 1], found[-1])
+            places = _places(here, vertices[level + 1])
+            values = values_from(
+                here.bricks.masks, here.border, places, found[-1], change, step, limits, dtype
+            )
         else:
-            values = np.zeros((here.n, symbols[level].shape[1]), np.int16)
-        moved = values[stored] + steps[level] * symbols[level].astype(np.int32)
-        values[stored] = np.clip(moved, *limits)
+            values = np.zeros((here.n, change.shape[1]), dtype)
+            values[: len(change)] = np.clip(step * change.astype(np.int32), *limits)
         found.append(values)
     return found[::-1]
 

@@ -1,0 +1,101 @@
+"""What a level of a pyramid says at the vertices of the next finer one, and the finer one's values with it:
+compiled where numba is installed, otherwise in numpy. Both give the same integers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from player.asset.bricks import BRICK, stored_bits
+from player.compiled.compiling import available
+from player.compiled.prediction import add_to_prediction
+
+_AT_ONCE = 256
+"""Bricks whose values are predicted at a time in numpy: some megabytes."""
+
+
+class Places(NamedTuple):
+    """Where the coarser level's vertices around those of a level's bricks are."""
+
+    bricks: np.ndarray
+    """[n_bricks, 4] int32: which brick of `rows`, and where in it along each axis, 0 or 4, a brick begins."""
+    rows: np.ndarray
+    """[n_coarse_bricks * 729] int32: the rows of the coarser level's vertices, brick by brick with an apron;
+    -1 where there is none."""
+
+
+def values_from(
+    masks: np.ndarray,
+    border: np.ndarray,
+    places: Places,
+    coarse: np.ndarray,
+    symbols: np.ndarray,
+    step: int,
+    limits: tuple[int, int],
+    dtype: type[np.generic],
+) -> np.ndarray:
+    """The values [n, n_channels] of a level: clip(predicted + step * symbol), and what is predicted on the
+    border.
+
+    Args:
+        masks: [n_bricks, 8] uint64, which vertices there are.
+        border: [n_bricks, 8] uint64, which of them have no symbol.
+        places: the coarser level's vertices around them.
+        coarse: [n_coarse, n_channels] the coarser level's values.
+        symbols: [n_stored, n_channels] int16; [0, n_channels] if all are 0.
+        step: width of a step.
+        limits: lowest and highest value.
+        dtype: of the values.
+    """
+    n = int(np.bitwise_count(masks).sum(dtype=np.int64))
+    out = np.empty((n, coarse.shape[1]), dtype)
+    if available():
+        sums = np.empty(coarse.shape[1], np.int32)
+        add_to_prediction(
+            masks, border, places.bricks, places.rows, np.ascontiguousarray(coarse),
+            np.ascontiguousarray(symbols, np.int16), (step, *limits), sums, out,
+        )  # fmt: skip
+        return out
+    row = first_symbol = 0
+    for first in range(0, len(masks), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        stored = stored_bits(masks[some])
+        values = _predicted(places.bricks[some], places.rows, coarse, stored)
+        if len(symbols):
+            moved = ~stored_bits(border[some])[stored]
+            n_moved = int(np.count_nonzero(moved))
+            change = step * symbols[first_symbol : first_symbol + n_moved].astype(np.int32)
+            values[moved] = np.clip(values[moved] + change, *limits)
+            first_symbol += n_moved
+        out[row : row + len(values)] = values
+        row += len(values)
+    return out
+
+
+def _predicted(bricks: np.ndarray, rows: np.ndarray, coarse: np.ndarray, stored: np.ndarray) -> np.ndarray:
+    """[n, n_channels] int16: (sum over the 8 vertices at floor and ceil of half the position + 4) >> 3."""
+    n_channels = coarse.shape[1]
+    x, y, z = (bricks[:, 1:, None] + np.arange(BRICK // 2 + 1, dtype=np.int32)).transpose(1, 0, 2)
+    index = bricks[:, 0, None, None, None].astype(np.int64) * 729 + (
+        x[:, :, None, None] * 81 + y[:, None, :, None] * 9 + z[:, None, None, :]
+    )
+    total = coarse[rows[index]].astype(np.int16)
+    for axis in (1, 2, 3):
+        total = _doubled(total, axis)
+    whole = total.reshape(-1, n_channels)[stored.reshape(-1)]
+    whole += 4
+    whole >>= 3
+    return whole
+
+
+def _doubled(values: np.ndarray, axis: int) -> np.ndarray:
+    """Twice the values at 8 places, from those at 5 that are twice as far apart along an axis."""
+    shape = list(values.shape)
+    shape[axis] = BRICK
+    out = np.empty(shape, values.dtype)
+    into, taken = np.moveaxis(out, axis, 0), np.moveaxis(values, axis, 0)
+    np.multiply(taken[:-1], 2, out=into[0::2])
+    np.add(taken[:-1], taken[1:], out=into[1::2])
+    return out
