@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from player.app.commands import run, write_result
-from player.errors import DataError, MissingExtraError
+from player.errors import ConfigError, DataError, MissingExtraError
 from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
+from vfr_bake.config import BakeConfig
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
@@ -209,6 +210,8 @@ def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
 
 def _bake(options: Any) -> int:
     check_target(options.asset, options.force)
+    if options.convert:
+        return _convert(options)
     from player.proof import prove
     from vfr_bake.baking.bake import bake, check_bakeable
     from vfr_bake.baking.plan import expected_seconds, make_plan
@@ -246,6 +249,32 @@ def _bake(options: Any) -> int:
         )
     for missed in result.missed:
         print(f"vfr-bake: warning: {missed}: see report.html for where it goes", file=sys.stderr)
+    return 0
+
+
+def _convert(options: Any) -> int:
+    from vfr_bake.baking.convert import convert
+
+    given = [name for name, value in asdict(options.config).items()
+             if name != "max_memory" and value != getattr(BakeConfig(), name)]  # fmt: skip
+    if given:
+        raise ConfigError(f"--convert: expected no other setting than --max-memory, got {sorted(given)}")
+    with Bar("converting") as bar:
+        done = convert(options.model, options.asset, options.config.max_memory, options.force, bar.count)
+    before = sum(entry.bytes for entry in done.asset.manifest.files.values())
+    version = done.asset.manifest.version
+    write_result(
+        options.json,
+        {
+            "asset": str(options.asset),
+            "megabytes": done.n_bytes / 1e6,
+            "megabytes_before": before / 1e6,
+            "version_before": list(version),
+            "seconds": done.seconds,
+        },
+        f"{options.asset}: {done.n_bytes / 1e6:.1f} MB, rewritten from {options.model} (version "
+        f"{version[0]}.{version[1]}, {before / 1e6:.1f} MB) in {done.seconds:.0f} s",
+    )
     return 0
 
 

@@ -39,13 +39,18 @@ class Bake:
     """Bake a trained model into an asset: sparse 8-bit grid, ONNX head and mesh, played by vfr-play on any
     CPU.
 
-    The data set is not needed; the model file holds the training cameras.
+    The data set is not needed; the model file holds the training cameras. `vfr-bake --convert old/ new/`
+    rewrites an asset of an earlier version of the format without its model.
     """
 
     model: Positional[Path]
-    """A model file written by vfr-train."""
+    """A model file written by vfr-train; with --convert, the folder of an asset."""
     asset: Positional[Path]
     """The folder to write."""
+    convert: bool = False
+    """Bake nothing: rewrite an asset in the current version of the format, which takes fewer bytes and shows
+    a first picture early. Its pictures, head, mesh, cameras and reports stay what they are; of the settings
+    --max-memory alone has a meaning."""
     config: BakeConfig = field(default_factory=BakeConfig)
     force: bool = False
     """Replace the folder if it exists."""

@@ -42,14 +42,13 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from player.asset.asset import Asset
     from player.render import import_ahead
     from player.viewer.server import ServeSettings, serve
 
     settings = settings_of(ServeSettings, arguments)
     import_ahead()
     folders = (arguments.asset, *arguments.others)
-    assets = [Asset.open(folder, max_memory=arguments.max_memory) for folder in folders]
+    assets = [_open(folder, arguments) for folder in folders]
     with serve(assets, settings, _say) as address:
         print(f"{arguments.asset}: look at it at {address}", flush=True)
         _advise(arguments.asset, address)
@@ -57,6 +56,16 @@ def _view(arguments: argparse.Namespace) -> int:
         while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
             pass
     return 0
+
+
+def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
+    """The asset, of which as much as there is plays: a line says what is missing."""
+    from player.asset.asset import Asset
+
+    asset = Asset.open(folder, max_memory=arguments.max_memory)
+    if asset.missing is not None:
+        _say(f"warning: {printable(asset.missing)}")
+    return asset
 
 
 def _advise(asset: Path, address: str) -> None:
@@ -86,14 +95,13 @@ def _play(arguments: argparse.Namespace) -> int:
 
 def _play_on_a_bar(arguments: argparse.Namespace, target: Target) -> Played:
     from player.app.play import play
-    from player.asset.asset import Asset
     from player.cameras.views import frame_rate
     from player.render import import_ahead
 
     settings = settings_of(PlaySettings, arguments)
     target.check(settings)  # so that nobody waits for a refusal until an asset is open
     import_ahead(scipy=False)
-    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
+    asset = _open(arguments.asset, arguments)
     cameras = _views(asset, arguments)
     if target.is_video and arguments.fps is None and arguments.cameras is not None:
         settings = replace(settings, fps=frame_rate(arguments.cameras) or settings.fps)
@@ -167,9 +175,8 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _info(arguments: argparse.Namespace) -> int:
     from player.app.info import facts, page
-    from player.asset.asset import Asset
 
-    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
+    asset = _open(arguments.asset, arguments)
     known = facts(asset)
     lines = [] if arguments.json == "-" else picture_lines(asset, sys.stdout)
     text = "\n".join([*lines, *page(arguments.asset, asset.manifest, known)])

@@ -59,7 +59,9 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
     """
-    assets = {str(folder): Asset.open(folder, max_memory=config.max_memory) for folder in config.assets}
+    assets = {  # whole ones: the figures of a part would be told as those of the asset
+        str(folder): Asset.open(folder, verify=True, max_memory=config.max_memory) for folder in config.assets
+    }
     views = _read_views(config, list(assets.values()), progress)
     own = views.cameras[0].width, views.cameras[0].height
     half_and_twice = [((own[0] + 1) // 2, (own[1] + 1) // 2), (2 * own[0], 2 * own[1])]

@@ -1,0 +1,120 @@
+"""An asset rewritten in the current version of the format, without the model: the same values, in fewer
+bytes, with coarser levels beneath so that its first part is a picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.parts import LIMITS
+from player.asset.pyramid import MAX_LEVELS, Bricks, PyramidValues, Vertices, whole_pyramid
+from player.asset.sections import Grid
+from player.files.files import check_target
+
+COARSEST = 16
+"""Cells along each axis that the coarsest level has at most, if there are levels enough."""
+STEPS = 6
+"""Steps that `progress` is told of."""
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What came of it."""
+
+    asset: Asset
+    """The asset that was read."""
+    n_bytes: int
+    """Bytes of all files of the new one."""
+    seconds: float
+
+
+def convert(
+    old: Path, new: Path, max_memory: float | None, force: bool = False, progress: Progress | None = None
+) -> Converted:
+    """Write the asset in `old`, of version 3 or 4, to the folder `new` as version 4.
+
+    Head, mesh, cameras, reports and settings stay what they are, and so does every value of the finest level.
+
+    Args:
+        old: the folder of an asset; every file of it has to be whole.
+        new: the folder to write.
+        max_memory: gigabytes that the asset may take; half of the machine's if None.
+        force: replace `new` if it exists.
+        progress: called with the steps that are done and their number.
+
+    Raises:
+        FormatError, IntegrityError: not an asset, or a file that is broken.
+        ConfigError: more memory than is allowed.
+        OutputError: `new` exists, or cannot be written.
+    """
+    begin = time.perf_counter()
+    tell = progress or (lambda done, total: None)
+    check_target(new, force)
+    asset = Asset.open(old, verify=True, max_memory=max_memory)
+    tell(1, STEPS)
+    densities = with_coarser_levels(asset.arrays.densities, "densities")
+    tell(2, STEPS)
+    features = with_coarser_levels(asset.arrays.features, "features")
+    tell(3, STEPS)
+    manifest = asset.manifest
+    n_levels = len(densities.values)
+    if len(manifest.level_steps) < n_levels:
+        steps = (1,) * n_levels
+        manifest = replace(manifest, level_steps=steps, density_steps=steps)
+    if len(manifest.feature_steps) < len(features.values):
+        manifest = replace(manifest, feature_steps=(1,) * len(features.values))
+    head, mesh, cameras = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
+    reports = {name: asset.read(name) for name in manifest.files if name.startswith("report.")}
+    write_asset(
+        new, replace(manifest, parts=(), files={}), GridArrays(densities, features), head, mesh, cameras,
+        force, lambda _: reports,
+    )  # fmt: skip
+    tell(STEPS, STEPS)
+    n_bytes = sum(path.stat().st_size for path in new.iterdir())
+    return Converted(asset, n_bytes, time.perf_counter() - begin)
+
+
+def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
+    """What is stored at one level, with coarser levels beneath that nothing is read from while it is there;
+    what has several levels stays as it is.
+
+    A coarser vertex has the value of the finer one at its place; where none is stored there, the mean of
+    those around it.
+    """
+    if len(stored.values) > 1:
+        return stored
+    resolution = stored.pyramid.resolution
+    none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
+    n_levels = 1
+    while n_levels < MAX_LEVELS and resolution > COARSEST << (n_levels - 1):
+        n_levels += 1
+    pyramid = whole_pyramid(resolution, [stored.pyramid.levels[0], *[none] * (n_levels - 1)])
+    low, high = LIMITS[grid]  # version 3 has features of -128, which bakes did not write
+    values = [np.clip(stored.values[0], low, high)]
+    for fine, coarse in pairwise(pyramid.vertices):
+        values.append(_coarser(fine, coarse, values[-1]))
+    return PyramidValues(pyramid, tuple(values))
+
+
+def _coarser(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
+    """The values [n_coarse, n_channels] of the next coarser level."""
+    places = coarse.index * 2
+    rows = fine.rows(places)
+    out = values[rows]
+    alone = np.flatnonzero(rows < 0)
+    total, n = np.zeros((len(alone), values.shape[1])), np.zeros((len(alone), 1))
+    for offset in np.ndindex(3, 3, 3):
+        beside = fine.rows(places[alone] + np.array(offset, np.int32) - 1)
+        there = beside >= 0
+        total[there] += values[beside[there]]
+        n[there] += 1
+    out[alone] = np.rint(total / n)  # a cell with this corner is live, and a finer one in it
+    return out
