@@ -24,7 +24,7 @@ import numpy as np
 from exporters.extras import needs
 from exporters.progress import silent
 from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
-from player.asset.grid import SparseGrid, corner_number
+from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError
 
 BLOCK = 64
@@ -140,7 +140,7 @@ def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndar
     and whether the point is in a live cell [n] bool: elsewhere both are 0."""
     found = grid.find(g.T)
     known = np.all((g >= 0) & (g <= grid.resolution), axis=-1) & found.live
-    at = corner_number(found.slots, found.cells)
+    at = found.corners
     share = [(1 - side, side) for side in found.fractions]
     codes, slopes = np.zeros(len(g)), np.zeros((len(g), 3))
     for x, y, z in np.ndindex(2, 2, 2):

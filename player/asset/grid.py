@@ -61,16 +61,19 @@ class VertexRows:
 class Found(NamedTuple):
     """Where places are in a `SparseGrid`: the finest brick at each, and the cell of that brick's level."""
 
-    slots: np.ndarray
-    """[...] int32; 0 where there is no brick."""
-    levels: np.ndarray
-    """[...] int32 of the brick; 0 where there is none."""
+    entries: np.ndarray
+    """[...] int32, of the table."""
     cells: np.ndarray
-    """[3, ...] int32, cells of the brick's level."""
+    """[3, ...] int32, cells of the brick's level; of the finest where there is no brick."""
     fractions: np.ndarray
-    """[3, ...] float32, places in these cells, 0..1."""
+    """[3, ...] places in these cells, 0..1, of the type of the places."""
     live: np.ndarray
     """[...] bool: whether the cell is live."""
+
+    @property
+    def corners(self) -> np.ndarray:
+        """[...] int64: where in `density` the lowest corners of the cells are, where there is a brick."""
+        return corner_number(self.entries >> 3, self.cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,11 @@ class SparseGrid:
     """Where rays begin, model units, if contracted."""
 
     @property
+    def n_levels(self) -> int:
+        """Levels of the densities."""
+        return len(self.level_steps)
+
+    @property
     def n_channels(self) -> int:
         return self.features.shape[1]
 
@@ -121,10 +129,12 @@ class SparseGrid:
         """What is at points `g` [3, ...], grid coordinates."""
         cells = self.cells(g)
         entries = self.entries(cells)
-        there = np.maximum(entries, 0)
-        slots, levels = there >> 3, there & 7
-        cells = cells >> levels
-        fractions = g * CELLS_OF_LEVELS.take(levels) - cells.astype(g.dtype)
+        slots = np.maximum(entries >> 3, 0)
+        if self.n_levels > 1:
+            levels = np.where(entries < 0, 0, entries & 7)
+            cells >>= levels
+            g = g * CELLS_OF_LEVELS.take(levels)
+        fractions = g - cells.astype(g.dtype)
         if len(self.live):
             x, y, z = cells & 7
             live = (entries >= 0) & (
@@ -132,7 +142,7 @@ class SparseGrid:
             )
         else:
             live = np.zeros(slots.shape, bool)
-        return Found(slots, levels, cells, fractions, live)
+        return Found(entries, cells, fractions, live)
 
     @property
     def codes(self) -> np.ndarray:

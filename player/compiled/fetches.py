@@ -145,13 +145,19 @@ def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, s
         )
         resolution, n_per_axis = (splat(b, b.trunc(n, INT)) for n in (grid.resolution, grid.n_per_axis))
         scale = splat(b, grid.scale)
-        low, share = [], []
-        for axis in range(3):
-            g = (load(b, at, LONG(axis * LANES)) * scale).most(0.0).least(resolution.to_float())
-            low.append(g.to_int().least(resolution - 1))
-            fraction = g - low[axis].to_float()
-            share.append((1.0 - fraction, fraction))
+        g = [
+            (load(b, at, LONG(axis * LANES)) * scale).most(0.0).least(resolution.to_float())
+            for axis in range(3)
+        ]
+        low = [x.to_int().least(resolution - 1) for x in g]
         held = gather(grid.bricks, brick_number(low, n_per_axis), 4, resolution > 0)
+        level = choose(held > -1, held & 7, 0)
+        width = ((127 - level) << 23).as_float()
+        low = [cell >> level for cell in low]
+        share = []
+        for x, cell in zip(g, low, strict=True):
+            fraction = x * width - cell.to_float()
+            share.append((1.0 - fraction, fraction))
         first = corner_number(held >> 3, low)
         total = scale.like(0.0)
         parts = []

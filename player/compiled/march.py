@@ -88,7 +88,7 @@ def march(
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
     if grid.contracted:
         steps, packets = _enter_space(grid, rays_o, rays_d)
-        capacity = steps.n_samples
+        capacity = steps.n_steps
     else:
         steps, packets = _enter_box(grid, rays_o, rays_d, bounds)
         capacity = grid.most_samples
@@ -115,8 +115,8 @@ def march(
     vertices = grid.rows
     n_hits = _march_rays(
         Lookup(
-            grid.table, grid.live, grid.density, grid.resolution, grid.n_per_axis,
-            grid.density_low, grid.density_slope,
+            grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
+            int(grid.level_steps[0] == 1), grid.density_low, grid.density_slope,
         ),
         Stored(
             vertices.bricks, vertices.rows, grid.features, vertices.resolution, vertices.n_per_axis,
@@ -157,9 +157,12 @@ def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tu
     )  # fmt: skip
     packets = scratch((n_packets, SPACE_ROWS, LANES), F32)
     packets[:] = rows.reshape(SPACE_ROWS, n_packets, LANES).swapaxes(0, 1)
-    half, fastest = grid.step * F32(0.5), MAX_SPEED * grid.step * path.cells
-    angles = np.cos(half), np.sin(half), np.sin(grid.step)
-    return SpaceSteps(path.table, path.table.shape[1], *angles, fastest, path.cells), packets
+    angle = np.arange(grid.level_steps[-1] + 1).astype(F32) * grid.step
+    angles = np.stack([np.cos(angle * F32(0.5)), np.sin(angle * F32(0.5)), np.sin(angle)])
+    middles, ends = (np.ascontiguousarray(path.table[:, first::2]) for first in (0, 1))
+    fastest = MAX_SPEED * grid.step * path.cells
+    sizes = middles.shape[1], angles.shape[1]
+    return SpaceSteps(middles, ends, angles, *sizes, fastest, path.cells), packets
 
 
 @compiled

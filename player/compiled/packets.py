@@ -46,8 +46,11 @@ class Lookup(NamedTuple):
     table: np.ndarray
     live: np.ndarray
     density: np.ndarray
+    level_steps: np.ndarray
     resolution: int
     n_per_axis: int
+    least_coarse: int
+    """Places of levels below this one are read like those of a grid of one level: 0 or 1."""
     density_low: np.float32
     density_slope: np.float32
 
@@ -56,20 +59,20 @@ class BoxSteps(NamedTuple):
     """What all rays through a box have in common."""
 
     step: np.float32
-    """Model units between samples."""
+    """Length of a base step, model units."""
 
 
 class SpaceSteps(NamedTuple):
     """What all rays through contracted space have in common."""
 
-    lattice: np.ndarray
-    """[3, n_samples] float32: that of `player.march.contracted`."""
-    n_samples: int
-    cos_half: np.float32
-    sin_half: np.float32
-    """cos and sin of half a step of phi."""
-    sin_step: np.float32
-    """sin of a step of phi."""
+    middles: np.ndarray
+    """[3, n_steps] float32: the lattice of `player.march.contracted` at the middles of base steps."""
+    ends: np.ndarray
+    """[3, n_steps] float32: the same at their ends."""
+    angles: np.ndarray
+    """[3, n_sizes] float32: cos and sin of half the angle of so many base steps, and sin of the angle."""
+    n_steps: int
+    n_sizes: int
     fastest: np.float32
     """Cells that a step makes at most."""
     cells: np.float32
@@ -78,7 +81,7 @@ class SpaceSteps(NamedTuple):
 
 BOX_ROWS = 9
 """Rows of a packet in a box: entry point x, y, z and direction x, y, z in grid coordinates, length, t of the
-entry, first sample. A length of 0 stands for no ray."""
+entry, first base step. A length of 0 stands for no ray."""
 LENGTH, ENTRY, FIRST = 6, 7, 8
 """Those of the rows that are one number each."""
 SPACE_ROWS = 11
@@ -103,20 +106,29 @@ class _Box:
         self._length, self._entry, self._first = rows[LENGTH], rows[ENTRY], rows[FIRST]
         self._step = splat(b, steps.step)
         self._per_step = 1.0 / self._step
+        self._way = Variable(self._step)
         self._still = [d.call("fabs") <= 0 for d in self._d]
         self._inverse = [1.0 / d for d in self._d]
 
     def first(self) -> Lanes:
-        """The first samples to look at."""
+        """The first base steps to look at."""
         return self._first.to_int()
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
-        """s of the samples `i`, whether the rays reach so far, and their grid coordinates."""
+        """s of the middles of base steps `i`, whether the rays reach so far, and their grid coordinates."""
         s = (i.to_float() + 0.5) * self._step
+        self._way.set(self._step)
         return s, active & (s < self._length), self.at(s)
 
+    def place_group(self, i: Lanes, size: Lanes, where: Lanes) -> tuple[Lanes, Lanes, Three]:
+        """As `place`, of the middles of `size` base steps from `i` on, of the lanes that are true in `where`;
+        the others stay where they were placed."""
+        s = (i.to_float() + size.to_float() * 0.5) * self._step
+        self._way.set(choose(where, size.to_float() * self._step, self._way.get()))
+        return s, where & (s < self._length), self.at(s)
+
     def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
-        """The sample to look at next, from one in a brick around which all are empty within `reach`."""
+        """The base step to look at next, from one in a brick around which all are empty within `reach`."""
         leave = self._length
         for e, inverse, still, brick in zip(self._e, self._inverse, self._still, bricks, strict=True):
             ahead = ((brick + reach + 1) << 3).to_float() - float(SKIP_MARGIN)
@@ -127,7 +139,7 @@ class _Box:
 
     def way(self) -> Lanes:
         """Model units that the samples placed last stand for."""
-        return self._step
+        return self._way.get()
 
     def at(self, s: Lanes) -> Three:
         """Grid coordinates of the places `s`."""
@@ -147,21 +159,38 @@ class _Space:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
         self._p, self._wd = rows[:3], rows[3:6]
         self._cos0, self._sin0, self._width, self._length, self._t_nearest = rows[6:]
-        self._lattice = [b.gep(steps.lattice, [b.mul(steps.n_samples, LONG(row))]) for row in range(3)]
-        self._end = splat(b, b.trunc(steps.n_samples, INT))
-        self._cos_half, self._sin_half, self._sin_step, self._fastest, self._cells = (
-            splat(b, number) for number in steps[2:]
+        self._middles, self._ends = (
+            [b.gep(table, [b.mul(steps.n_steps, LONG(row))]) for row in range(3)]
+            for table in (steps.middles, steps.ends)
         )
-        self._placed: tuple[Lanes, Lanes]  # cos and sin of phi of the samples placed last
+        self._angles = [b.gep(steps.angles, [b.mul(steps.n_sizes, LONG(row))]) for row in range(3)]
+        self._one = [splat(b, b.load(b.gep(row, [LONG(1)]))) for row in self._angles]
+        self._end = splat(b, b.trunc(steps.n_steps, INT))
+        self._fastest, self._cells = splat(b, steps.fastest), splat(b, steps.cells)
+        zero = self._cos0.like(0.0)
+        self._placed = [Variable(zero) for _ in range(2)]  # cos and sin of phi of the samples placed last
+        self._of_size = [Variable(row) for row in self._one]  # their `angles`
 
     def first(self) -> Lanes:
         return self._end.like(0)
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
         active = active & (i < self._end)
-        s, cos_s, sin_s = (gather(row, i, 4, active).as_float() for row in self._lattice)
-        self._placed = self._turned(cos_s, sin_s)
-        return s, active & (s < self._length), self._on_grid(*self._placed)
+        s, cos_s, sin_s = (gather(row, i, 4, active).as_float() for row in self._middles)
+        placed = self._turned(cos_s, sin_s)
+        for variable, value in zip((*self._placed, *self._of_size), (*placed, *self._one), strict=True):
+            variable.set(value)
+        return s, active & (s < self._length), self._on_grid(*placed)
+
+    def place_group(self, i: Lanes, size: Lanes, where: Lanes) -> tuple[Lanes, Lanes, Three]:
+        number = i + (size >> 1) - 1
+        known = where & (number < self._end)
+        s, cos_s, sin_s = (gather(row, number, 4, known).as_float() for row in self._ends)
+        placed = self._turned(cos_s, sin_s)
+        angles = (gather(row, size, 4, where).as_float() for row in self._angles)
+        for variable, value in zip((*self._placed, *self._of_size), (*placed, *angles), strict=True):
+            variable.set(choose(where, value, variable.get()))
+        return s, known & (s < self._length), self._on_grid(*placed)
 
     def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
         free = None
@@ -174,10 +203,11 @@ class _Space:
         return i + 1 + ((free - float(SKIP_MARGIN)) / self._fastest).to_int().most(0)
 
     def way(self) -> Lanes:
-        cos, sin = self._placed
-        a, b = cos * self._cos_half, sin * self._sin_half
+        cos, sin = (variable.get() for variable in self._placed)
+        cos_half, sin_half, sin_angle = (variable.get() for variable in self._of_size)
+        a, b = cos * cos_half, sin * sin_half
         below = (a + b).most(float(MIN_COS)) * (a - b).most(float(MIN_COS))
-        return self._width * self._sin_step / below
+        return self._width * sin_angle / below
 
     def at(self, s: Lanes) -> Three:
         return self._on_grid(*self._turned(s.call("cos"), s.call("sin")))
@@ -228,22 +258,40 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
     i, taken, active = Variable(first), Variable(first.like(0)), Variable(first >= 0)
     tau, trans, n_weights = Variable(zero), Variable(zero.like(1.0)), Variable(zero)
     total, moment = _Sum(zero), _Sum(zero)
+    least_coarse = splat(b, b.trunc(grid.least_coarse, INT))
+
+    def look_up(g: Three, where: Lanes) -> tuple[list[Lanes], Lanes]:
+        """Cells of the finest level, and the table's entries."""
+        cell = [x.most(0.0).least(last).to_int() for x in g]
+        return cell, gather(grid.table, brick_number(cell, n_per_axis), 4, where)
+
     n_rows = cgutils.alloca_once_value(b, LONG(0))
     with while_any(b, active):
         now = i.get()
         s, inside, g = path.place(now, active.get())
-        cell = [x.most(0.0).least(last).to_int() for x in g]
-        slot = gather(grid.table, brick_number(cell, n_per_axis), 4, inside)
-        empty = inside & (slot < 0)
-        busy = inside & (slot > -1)
+        cell, entry = look_up(g, inside)
+        empty = inside & (entry < 0)
+        busy = inside & (entry > -1)
         i.set(now + 1)
         active.set(inside)
         with b.if_then(empty.any()):
             bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
-            i.set(choose(empty, path.jump(now, g, bricks, -slot - 1), now + 1))
-        slot = slot >> 3
+            i.set(choose(empty, path.jump(now, g, bricks, -entry - 1), now + 1))
+        at = _At(s, entry, busy, g, cell)
+        coarse = busy & ((entry & 7) >= least_coarse)
+        with b.if_then(coarse.any()):
+            size = gather(grid.level_steps, entry & 7, 4, coarse)
+            size = choose(now > 0, size.least(now & (0 - now)), size)  # the least power of two divides all
+            i.set(choose(coarse, now + size, i.get()))
+            grouped = coarse & (size > 1)
+            with b.if_then(grouped.any()):
+                s, reached, g = path.place_group(now, size, grouped)
+                cell, entry = look_up(g, reached)
+                at.move(grouped, s, entry, reached & (entry > -1), g, cell)
+            at.to_own_cells()
+        s, entry, busy, g, cell = at.get()
         with b.if_then(busy.any()):  # a grid without a slot has nothing to read
-            within = [c & 7 for c in cell]
+            slot, within = entry >> 3, [c & 7 for c in cell]
             word = gather(grid.live, (slot << 4) + (within[0] << 1) + (within[1] >> 2), 4, busy)
             bit = ((within[1] & 3) << 3) + within[2]
             lit = Lanes(b, b.lshr(word.value, bit.value)) & 1
@@ -281,6 +329,32 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
     ):
         store(out, LONG(row * LANES), values)
     return b.load(n_rows)
+
+
+class _At:
+    """Where the samples of a packet are: s, the table's entry, whether there is a brick, grid coordinates and
+    cell; those that are not on the finest level move to cells of their own."""
+
+    def __init__(self, s: Lanes, entry: Lanes, busy: Lanes, g: Three, cell: list[Lanes]) -> None:
+        self._all = [Variable(value) for value in (s, entry, busy, *g, *cell)]
+
+    def move(self, where: Lanes, s: Lanes, entry: Lanes, busy: Lanes, g: Three, cell: list[Lanes]) -> None:
+        """Put those that are true in `where` elsewhere."""
+        for variable, value in zip(self._all, (s, entry, busy, *g, *cell), strict=True):
+            variable.set(choose(where, value, variable.get()))
+
+    def to_own_cells(self) -> None:
+        """Coordinates and cells of the brick's level."""
+        _, entry, busy, *_ = (variable.get() for variable in self._all)
+        level = choose(busy, entry & 7, 0)
+        width = ((127 - level) << 23).as_float()
+        for x, cell in zip(self._all[3:6], self._all[6:], strict=True):
+            x.set(x.get() * width)
+            cell.set(cell.get() >> level)
+
+    def get(self) -> tuple[Lanes, Lanes, Lanes, list[Lanes], list[Lanes]]:
+        s, entry, busy, *rest = (variable.get() for variable in self._all)
+        return s, entry, busy, rest[:3], rest[3:]
 
 
 class _Sum:

@@ -1,7 +1,7 @@
 """Rays through a box: where they enter it, and the lattice of samples on them.
 
-A place on a ray is s, the distance behind the entry in model units. The samples of a ray are at `s_i = (i +
-1/2) step`, wherever it enters.
+A place on a ray is s, the distance behind the entry in model units. The middles of a ray's base steps are at
+`s_i = (i + 1/2) step`, wherever it enters.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ SKIP_MARGIN = np.float32(0.01)
 coordinate."""
 
 
+ONE = np.array(1, np.int32)
+"""A sample that stands for one base step."""
+
 Bounds = tuple[np.ndarray, np.ndarray]
 """`near` and `far`, [n] float32: t of n rays outside which the caller knows that there is no live cell."""
 
@@ -27,7 +30,7 @@ class BoxPath(NamedTuple):
     t: np.ndarray
     """[n] float32, t of the entry, model units."""
     first: np.ndarray
-    """[n] int32, the first sample that may lie in a live cell."""
+    """[n] int32, the first base step whose middle may lie in a live cell."""
     length: np.ndarray
     """[n] float32, s where the ray ends; <= 0 for a ray that misses the box."""
     point: np.ndarray
@@ -35,13 +38,13 @@ class BoxPath(NamedTuple):
     direction: np.ndarray
     """[3, n] float32, cells per model unit."""
     step: np.float32
-    """Model units between samples."""
+    """Length of a base step, model units."""
 
-    def sample(self, i: np.ndarray) -> np.ndarray:
-        return (i.astype(np.float32) + np.float32(0.5)) * self.step
+    def sample(self, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        return (i.astype(np.float32) + size.astype(np.float32) * np.float32(0.5)) * self.step
 
-    def place(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
-        return self.at(ray, self.sample(i))
+    def place(self, ray: np.ndarray, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        return self.at(ray, self.sample(i, size))
 
     def jump(
         self, ray: np.ndarray, i: np.ndarray, g: np.ndarray, brick: np.ndarray, reach: np.ndarray
@@ -55,17 +58,14 @@ class BoxPath(NamedTuple):
         left = np.minimum(s.min(axis=0), np.float32(1e6)) / self.step - np.float32(0.5)
         return np.maximum(i, np.floor(np.minimum(left, np.float32(1e9))).astype(np.int32)) + 1
 
-    def way(self, ray: np.ndarray, i: np.ndarray) -> np.float32:
-        return self.step
+    def way(self, ray: np.ndarray, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        return size.astype(np.float32) * self.step
 
     def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         return self.point[:, ray] + s * self.direction[:, ray]
 
     def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         return self.t[ray] + s
-
-    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        return np.full(len(ray), self.step)
 
     def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         return gradients  # the box's axes are the model frame's

@@ -3,16 +3,16 @@
 Letters: (o, d) a ray in the model frame, d of unit length; p its point nearest to the origin, at t = t_p; b =
 |p|; w = max(1, b). A place on the ray is an angle: t = t_p + w tan(phi), from phi_0 at t = near to almost
 pi/2. The point is (p cos(phi) + w d sin(phi)) / cos(phi), which `player.march.contraction` takes as it is:
-nothing is divided by a cosine that is nearly 0. s = phi - phi_0, so that the samples are at s_n = (n + 1/2)
-dphi.
+nothing is divided by a cosine that is nearly 0. s = phi - phi_0, so that the middles of base steps are at s_n
+= (n + 1/2) dphi.
 
 In contracted space a ray is never faster than MAX_SPEED for a step of phi: inside the unit ball dt/dphi = w +
-(t - t_p)^2 / w <= 2; far out it approaches sqrt(4 b^2 + w^2) / w <= sqrt(5). So pi / dphi samples reach from
-anywhere to infinity, and m cells around a sample that are empty are m / (cells for MAX_SPEED dphi) samples
-long.
+(t - t_p)^2 / w <= 2; far out it approaches sqrt(4 b^2 + w^2) / w <= sqrt(5). So pi / dphi steps reach from
+anywhere to infinity, and m cells around a place that are empty are m / (cells for MAX_SPEED dphi) steps long.
 
-The sample at phi has the way from phi - dphi/2 to phi + dphi/2, in model units w sin(dphi) / (cos(phi -
-dphi/2) cos(phi + dphi/2)); both cosines are at least MIN_COS, which is where the lattice ends.
+A sample at phi that stands for m base steps has the way from phi - m dphi/2 to phi + m dphi/2, in model units
+w sin(m dphi) / (cos(phi - m dphi/2) cos(phi + m dphi/2)); both cosines are at least MIN_COS, which is where
+the lattice ends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.grid import SparseGrid
-from player.march.box import SKIP_MARGIN
+from player.march.box import ONE, SKIP_MARGIN
 from player.march.contraction import contraction_scale, pull_back
 
 MAX_SPEED = np.float32(5**0.5)
@@ -54,17 +54,17 @@ class ContractedPath(NamedTuple):
     step: np.float32
     """dphi."""
     table: np.ndarray
-    """[3, n_samples] float32: the `lattice` of `step`."""
+    """[3, 2 n_steps] float32: the `lattice` of `step`."""
 
     @property
     def first(self) -> np.ndarray:
         return np.zeros(len(self.length), np.int32)
 
-    def sample(self, i: np.ndarray) -> np.ndarray:
-        return self.table[0].take(i, mode="clip")  # the last is behind the end of every ray
+    def sample(self, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        return self._at_sample(i, size)[0]
 
-    def place(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
-        return self._on_grid(ray, *self._turned_to_sample(ray, i))
+    def place(self, ray: np.ndarray, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        return self._on_grid(ray, *self._turned(ray, *self._at_sample(i, size)[1:]))
 
     def jump(
         self, ray: np.ndarray, i: np.ndarray, g: np.ndarray, brick: np.ndarray, reach: np.ndarray
@@ -74,8 +74,12 @@ class ContractedPath(NamedTuple):
         fastest = MAX_SPEED * self.step * self.cells
         return i + np.maximum(np.floor(free / fastest), 0).astype(np.int32) + 1
 
-    def way(self, ray: np.ndarray, i: np.ndarray) -> np.ndarray:
-        return self._way(ray, *self._turned_to_sample(ray, i))
+    def way(self, ray: np.ndarray, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:
+        cos, sin = self._turned(ray, *self._at_sample(i, size)[1:])
+        angle = size.astype(np.float32) * self.step
+        half = angle * np.float32(0.5)
+        a, b = cos * np.cos(half), sin * np.sin(half)
+        return self.width[ray] * np.sin(angle) / (np.maximum(a + b, MIN_COS) * np.maximum(a - b, MIN_COS))
 
     def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         return self._on_grid(ray, *self._turned(ray, np.cos(s), np.sin(s)))
@@ -84,17 +88,15 @@ class ContractedPath(NamedTuple):
         cos, sin = self._turned(ray, np.cos(s), np.sin(s))
         return self.t_nearest[ray] + self.width[ray] * sin / np.maximum(cos, MIN_COS)
 
-    def lengths(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        return self._way(ray, *self._turned(ray, np.cos(s), np.sin(s)))
-
     def pulled_back(self, gradients: np.ndarray, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         cos, sin = self._turned(ray, np.cos(s), np.sin(s))
         return pull_back(gradients, self._direction(ray, cos, sin), cos)
 
-    def _turned_to_sample(self, ray: np.ndarray, i: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """cos and sin of phi at samples."""
-        _, cos_s, sin_s = self.table.take(i, axis=1, mode="clip")
-        return self._turned(ray, cos_s, sin_s)
+    def _at_sample(self, i: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """s of samples, its cosine and its sine [3, ...]."""
+        return self.table.take(
+            2 * i + (size - 1), axis=1, mode="clip"
+        )  # the last is behind the end of every ray
 
     def _turned(self, ray: np.ndarray, cos_s: np.ndarray, sin_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """cos and sin of phi, from those of s."""
@@ -110,12 +112,6 @@ class ContractedPath(NamedTuple):
         v = self._direction(ray, cos, sin)
         scale = contraction_scale(np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cos) * self.cells
         return v * scale + self.cells * np.float32(2)
-
-    def _way(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
-        """Model units that samples at places stand for."""
-        half = self.step * np.float32(0.5)
-        a, b = cos * np.cos(half), sin * np.sin(half)
-        return self.width[ray] * np.sin(self.step) / (np.maximum(a + b, MIN_COS) * np.maximum(a - b, MIN_COS))
 
 
 def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> ContractedPath:
@@ -142,13 +138,13 @@ def enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Con
 
 @lru_cache(maxsize=4)
 def lattice(step: float) -> np.ndarray:
-    """s_n and its cos and sin [3, n_samples] float32, for all samples that a ray can have and one more, which
-    is behind the end of every ray.
+    """s and its cos and sin [3, 2 n_steps] float32, at the middle and the end of all base steps that a ray
+    can have and of one more, which is behind the end of every ray.
 
     >>> lattice(1.0)[0].tolist()
-    [0.5, 1.5, 2.5, 3.5, 4.5]
+    [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0]
     """
-    s = (np.arange(int(np.pi / step) + 2) + 0.5).astype(np.float32) * np.float32(step)
+    s = (np.arange(1, 2 * int(np.pi / step) + 5) * 0.5).astype(np.float32) * np.float32(step)
     found = np.stack([s, np.cos(s.astype(np.float64)), np.sin(s.astype(np.float64))]).astype(np.float32)
     found.flags.writeable = False  # it is shared
     return found

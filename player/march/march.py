@@ -2,11 +2,14 @@
 
 Letters: (o, d) a ray in the model frame, d of unit length; tau the optical depth so far; A the opacity.
 
-1. The path of a ray (`player.march.path`) says where its samples lie, and which way l_i in model units sample
-   i stands for. In a box samples are a step dt apart: the ray enters the box at t_in (0 if it starts inside)
-   and leaves at t_out, and its samples are at `t_i = t_in + (i + 1/2) dt`, i = 0, 1, ..., while t_i < t_out.
-   In contracted space (`player.march.contracted`) they are an angle apart, and the last is almost infinitely
-   far away.
+1. The path of a ray (`player.march.path`) is cut into base steps n = 0, 1, ... In a box a step is a distance
+   dt: the ray enters the box at t_in (0 if it starts inside) and leaves at t_out, and the middle of step n is
+   at `t_in + (n + 1/2) dt`; the last step is the last whose middle is before t_out. In contracted space
+   (`player.march.contracted`) a step is an angle, and the last is almost infinitely far away.
+   Where no level has a brick at the middle of step n, the march goes on with step n + 1. Otherwise a sample
+   stands for the steps n to n + m - 1, where m is the largest power of two that divides n and is at most
+   `level_steps` of the finest level that has a brick there; the sample is at the middle of these steps, and
+   the march goes on with step n + m. Which way l_i in model units sample i stands for, the path says.
 2. A sample in a cell that is not live contributes nothing. Otherwise sigma is decoded from the interpolated
    code (`player.asset.density`), and `alpha = -expm1(-sigma l_i)`, `w = exp(-tau) alpha`, `tau += sigma l_i`.
    The march stops after the sample with `exp(-tau) < 1e-3`. `A = 1 - exp(-tau)`. The depth is t at the mean
@@ -27,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import SparseGrid, corner_number
-from player.march.box import Bounds
+from player.asset.grid import Found, SparseGrid
+from player.march.box import ONE, Bounds
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
 
@@ -43,8 +46,8 @@ MIN_OPACITY = np.float32(1 / 512)
 level."""
 
 CHUNK = np.arange(8, dtype=np.int32)
-"""Lattice samples that a ray evaluates at a time near a surface, counted from the first: fewer calls of
-numpy, few samples in vain."""
+"""Base steps that a ray evaluates at a time near a surface, counted from the first: fewer calls of numpy, few
+samples in vain."""
 
 
 class MarchResult(NamedTuple):
@@ -78,7 +81,7 @@ def march(
         n_fetches: k, feature fetches a ray; 0 fetches at every sample.
         bounds: where live cells of a box can be, if that is known.
     """
-    path, samples, tau, counts = sample_rays(grid, rays_o, rays_d, bounds)
+    path, samples, _, tau, counts = sample_rays(grid, rays_o, rays_d, bounds)
     n_rays = len(rays_o)
     opacity = -np.expm1(-tau)
     heavy = samples.weights.astype(np.float64)
@@ -98,6 +101,8 @@ class SampledRays(NamedTuple):
     path: Path
     samples: Samples
     """All samples with weight."""
+    ways: np.ndarray
+    """[n_samples] float32, the model units that each of them stands for."""
     tau: np.ndarray
     """[n] float32, optical depth."""
     n_density_samples: np.ndarray
@@ -112,7 +117,7 @@ def sample_rays(
 ) -> SampledRays:
     """The samples of rays; the arguments are those of `march`.
 
-    All rays are marched in step: one in an empty brick jumps, one in another takes a chunk of its samples.
+    All rays are marched in step: one in no brick jumps, one in a brick takes a chunk of its samples.
     """
     path = path_of(grid, rays_o, rays_d, bounds)
     tau = np.zeros(len(rays_o), np.float32)
@@ -131,8 +136,58 @@ def sample_rays(
             brick, reach = cells[:, empty] >> 3, -1 - entries[empty]
             i[empty] = path.jump(ray[empty], i[empty], g[:, empty], brick, reach)
         if len(busy):
-            chunks.append(_take_chunk(grid, path, ray[busy], i[busy], tau))
-            i[busy] += len(CHUNK)
+            chunk = _chunk(grid, path, ray[busy], i[busy])
+            chunks.append(_take(grid, path, ray[busy], chunk, tau))
+            i[busy] = chunk.after
+
+
+class Chunk(NamedTuple):
+    """Samples of n rays that may be in live cells, one ray's after the other's, in the order of the march."""
+
+    row: np.ndarray
+    """[n_samples] int64: which of the rays."""
+    column: np.ndarray
+    """[n_samples] int64: which sample of a ray, below len(CHUNK)."""
+    i: np.ndarray
+    """[n_samples] int32: the base step with which each begins."""
+    size: np.ndarray
+    """[n_samples] int32: for how many base steps each stands; one number if all are alike."""
+    s: np.ndarray
+    """[n_samples] float32: places on the rays."""
+    found: Found
+    """What is there."""
+    after: np.ndarray
+    """[n] int32: the base step to go on with."""
+
+
+def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chunk:
+    """The samples that begin in the base steps from `i` [n] on, of which there is a brick in the first."""
+    steps = i[:, None] + CHUNK
+    s, g = path.sample(steps), path.place(ray[:, None], steps)
+    found, after = grid.find(g), i + len(CHUNK)
+    if grid.level_steps[-1] == 1:
+        row, column = np.divmod(np.arange(steps.size), len(CHUNK))
+        flat = Found(*(array.reshape(*array.shape[:-2], -1) for array in found))
+        return Chunk(row, column, steps.reshape(-1), ONE, s.reshape(-1), flat, after)
+    sizes = group_size(grid, steps, found.entries)
+    begins = np.zeros(steps.shape, bool)
+    then = i
+    for column, here in enumerate(steps.T):
+        at = then == here
+        begins[:, column] = at & (found.entries[:, column] >= 0)
+        then = np.where(at, here + sizes[:, column], then)
+    row, column = np.nonzero(begins)
+    i, size = steps[row, column], sizes[row, column]
+    found = grid.find(path.place(ray[row], i, size))
+    return Chunk(row, column, i, size, path.sample(i, size), found, np.maximum(then, after))
+
+
+def group_size(grid: SparseGrid, i: np.ndarray, entries: np.ndarray) -> np.ndarray:
+    """For how many base steps the samples stand that begin with steps `i`, in whose middles the table has
+    `entries`: the largest power of two that is at most the level's and divides i; 1 where there is no
+    brick."""
+    most = np.where(entries < 0, 1, grid.level_steps.take(entries & 7, mode="clip"))
+    return np.where(i == 0, most, np.minimum(most, i & -i)).astype(np.int32)
 
 
 class Taken(NamedTuple):
@@ -142,23 +197,23 @@ class Taken(NamedTuple):
     """[n_samples] int64."""
     s: np.ndarray
     """[n_samples] places on the rays."""
+    way: np.ndarray
+    """[n_samples] float32, model units that the sample stands for."""
     optical: np.ndarray
     """[n_samples] float32, the sample's optical depth."""
     before: np.ndarray
     """[n_samples] float32, tau before the sample."""
 
 
-def _take_chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray, tau: np.ndarray) -> Taken:
-    """The samples from `i` [n] on of the rays `ray` [n]: those in live cells, up to the one that passes
-    MAX_TAU; `tau` [n_rays] is updated."""
-    samples = i[:, None] + CHUNK
-    s, g = path.sample(samples), path.place(ray[:, None], samples)
-    found = grid.find(g)
-    at = np.flatnonzero(found.live & (s < path.length[ray, None]))
-    row, column = np.divmod(at, len(CHUNK))
-    cells, fractions = (array.reshape(3, -1)[:, at] for array in (found.cells, found.fractions))
-    code = trilinear(grid.density, corner_number(found.slots.reshape(-1)[at], cells), fractions)
-    way = path.way(ray[row], samples[row, column])
+def _take(grid: SparseGrid, path: Path, ray: np.ndarray, chunk: Chunk, tau: np.ndarray) -> Taken:
+    """Of a chunk's samples of the rays `ray` [n] those in live cells, up to the one that passes MAX_TAU;
+    `tau` [n_rays] is updated."""
+    at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
+    row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
+    size = chunk.size[at] if chunk.size.ndim else chunk.size
+    found = Found(*(array[..., at] for array in chunk.found))
+    code = trilinear(grid.density, found.corners, found.fractions)
+    way = np.broadcast_to(path.way(ray[row], i, size), s.shape)
     optical = np.exp(grid.density_low + grid.density_slope * code) * way
     added = np.zeros((len(ray), len(CHUNK) + 1), np.float32)
     added[:, 0] = tau[ray]
@@ -168,7 +223,7 @@ def _take_chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray, ta
     kept = before <= MAX_TAU
     row, column = row[kept], column[kept]
     tau[ray[row]] = running[row, column + 1]  # in order, so that the last sample of each ray stays
-    return Taken(ray[row], s[row, column], optical[kept], before[kept])
+    return Taken(ray[row], s[kept], way[kept], optical[kept], before[kept])
 
 
 def trilinear(density: np.ndarray, corner: np.ndarray, fraction: np.ndarray) -> np.ndarray:
@@ -191,20 +246,20 @@ def trilinear(density: np.ndarray, corner: np.ndarray, fraction: np.ndarray) -> 
     return lerp(lerp(edge(0), edge(9), fraction[1]), lerp(edge(81), edge(90), fraction[1]), fraction[0])
 
 
-def _weigh(chunks: list[Taken], tau: np.ndarray) -> tuple[Samples, np.ndarray, np.ndarray]:
+def _weigh(chunks: list[Taken], tau: np.ndarray) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:
     """The samples of all chunks, sorted by ray, with their weights; those without weight are dropped. Returns
-    with them tau, and for each ray the number of samples taken."""
+    with them their ways, tau, and for each ray the number of samples taken."""
     n_rays = len(tau)
     if not chunks:
         none = np.zeros(0, np.float32)
-        return Samples(none.astype(np.int64), none, none), tau, np.zeros(n_rays, np.int32)
-    ray, s, optical, before = (np.concatenate(column) for column in zip(*chunks, strict=True))
+        return Samples(none.astype(np.int64), none, none), none, tau, np.zeros(n_rays, np.int32)
+    ray, s, ways, optical, before = (np.concatenate(column) for column in zip(*chunks, strict=True))
     counts = np.bincount(ray, minlength=n_rays).astype(np.int32)
     small = ray.astype(np.uint16) if n_rays <= 1 << 16 else ray  # 16 bits are sorted by radix
     order = np.argsort(small, kind="stable")
     weights = (np.exp(-before) * -np.expm1(-optical))[order]
     samples = Samples(ray[order], s[order], weights)
     if (weights > 0).all():
-        return samples, tau, counts
+        return samples, ways[order], tau, counts
     kept = np.flatnonzero(weights > 0)
-    return Samples(*(column[kept] for column in samples)), tau, counts
+    return Samples(*(column[kept] for column in samples)), ways[order[kept]], tau, counts

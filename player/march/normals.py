@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.asset.grid import SparseGrid, corner_number
+from player.asset.grid import CELLS_OF_LEVELS, SparseGrid
 from player.march.box import Bounds
 from player.march.march import sample_rays
 
@@ -33,7 +33,7 @@ def composited_normals(
     Returns:
         normals: [n, 3] float32, of unit length; 0 where no sample has weight or the gradients cancel.
     """
-    path, samples, _, _ = sample_rays(grid, rays_o, rays_d, bounds)
+    path, samples, *_ = sample_rays(grid, rays_o, rays_d, bounds)
     slopes = code_gradient(grid, path.at(samples.ray, samples.s)) * grid.cells_per_unit[:, None]
     slopes = path.pulled_back(slopes, samples.ray, samples.s)
     weights = samples.weights.astype(np.float64)
@@ -48,7 +48,7 @@ def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
     `g` [3, n] float32: grid coordinates (cells), each in a live cell, as samples of the march are.
     """
     found = grid.find(g)
-    at = corner_number(found.slots, found.cells)
+    at = found.corners
     share = [(1 - side, side) for side in found.fractions]
     slopes = np.zeros((3, g.shape[1]), np.float32)
     for x, y, z in np.ndindex(2, 2, 2):
@@ -56,4 +56,4 @@ def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
         slopes[0] += (2 * x - 1) * code * share[1][y] * share[2][z]
         slopes[1] += (2 * y - 1) * code * share[0][x] * share[2][z]
         slopes[2] += (2 * z - 1) * code * share[0][x] * share[1][y]
-    return slopes * np.float32(0.5) ** found.levels
+    return slopes * CELLS_OF_LEVELS.take(found.entries & 7)

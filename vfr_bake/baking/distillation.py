@@ -56,7 +56,8 @@ class Fetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units."""
+    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
+    were merged into."""
 
     def compose(self, codes: np.ndarray) -> np.ndarray:
         """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded."""
@@ -77,7 +78,8 @@ class TrainingRays:
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units."""
+    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
+    were merged into."""
     dirs: np.ndarray
     """[n, 3] float32 unit view directions."""
     opacity: np.ndarray
@@ -202,20 +204,21 @@ class PlayerFetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units."""
+    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
+    were merged into."""
 
 
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
     `player.march.march` composes them with k = `n_fetches`."""
-    entries, samples, tau, _ = sample_rays(grid, rays_o, rays_d)
+    entries, samples, ways, tau, _ = sample_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)
     is_hit[hits] = True
     counts = np.bincount(samples.ray, minlength=len(opacity))
     merged = is_hit[samples.ray] & (counts[samples.ray] > n_fetches) & (n_fetches > 0)
-    ray, s, weights = (column[is_hit[samples.ray] & ~merged] for column in samples)
+    ray, s, weights, lengths = (column[is_hit[samples.ray] & ~merged] for column in (*samples, ways))
     if merged.any():
         many = Samples(*(column[merged] for column in samples))
         bins = equal_mass_bins(many, n_fetches)
@@ -227,11 +230,11 @@ def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_f
         ray = np.concatenate([ray, bins.ray])
         s = np.concatenate([s, places])
         weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_fetches)])
+        lengths = np.concatenate([lengths, np.zeros(len(bins.ray), np.float32)])
         order = np.argsort(ray, kind="stable")
-        ray, s, weights = ray[order], s[order], weights[order]
+        ray, s, weights, lengths = ray[order], s[order], weights[order], lengths[order]
     counts = np.bincount(ray, minlength=len(opacity))[hits]
     points = np.ascontiguousarray(entries.at(ray, s).T)
-    lengths = entries.lengths(ray, s)
     return PlayerFetches(hits, opacity[hits], counts, points, weights.astype(np.float32), lengths)
 
 

@@ -57,7 +57,7 @@ def naive(
     Every lattice sample is looked at. Which cell it is in is float32, as the format says, the rest float64.
     """
     path = enter_space(grid, ray_o[None], ray_d[None])
-    n = np.flatnonzero(path.table[0] < path.length[0])
+    n = np.flatnonzero(path.table[0, ::2] < path.length[0])
     ray = np.zeros(len(n), np.int64)
     tau, taken, samples = 0.0, 0, []
     for place, way, s in zip(path.place(ray, n).T, path.way(ray, n), path.sample(n), strict=True):
