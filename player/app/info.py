@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from player.app.parts_info import what_it_adds
 from player.asset.asset import Asset
 from player.asset.manifest import Manifest
+from player.asset.pyramid import PyramidValues
 from player.cameras.views import asset_cameras
 from player.head.head import read_head_file
 from player.march.contracted import MAX_SPEED
@@ -18,8 +20,8 @@ from player.terminal import printable
 
 MANIFEST_KEYS = (
     "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
-    "near", "step", "n_fetches", "density_range", "n_channels", "background", "colour_space", "view_size",
-    "provenance",
+    "near", "step", "level_steps", "n_fetches", "density_range", "density_steps", "n_channels",
+    "feature_steps", "background", "colour_space", "view_size", "provenance",
 )  # fmt: skip
 
 CONTENT = {
@@ -45,6 +47,11 @@ def facts(asset: Asset) -> dict[str, Any]:
         "n_bricks": sum(len(bricks) for bricks in asset.arrays.densities.pyramid.levels),
         "n_vertices": int(asset.arrays.densities.first_rows[-1]),
         "n_feature_vertices": int(asset.arrays.features.first_rows[-1]),
+        "n_parts": len(m.parts),
+        "n_parts_read": asset.n_parts,
+        "missing": asset.missing,
+        "parts": [{"file": part.file, "bytes": part.bytes, "adds": what_it_adds(part)} for part in m.parts],
+        "levels": {grid: _levels(getattr(asset.arrays, grid)) for grid in ("densities", "features")},
         "head_parameters": head.n_parameters,
         "n_cameras": len(asset_cameras(asset)),
         "world_box": _world_box(asset),
@@ -71,6 +78,9 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
             (name, f"{_megabytes(n):>9}  {_bar(n / max(total, 1))}  {CONTENT.get(name, '')}")
             for name, n in sorted(known["bytes"].items(), key=lambda item: -item[1])
         ]),
+        *_section("parts, each of which makes the picture sharper", [
+            (part["file"], f"{_megabytes(part['bytes']):>9}  {part['adds']}") for part in known["parts"]
+        ]),
         *_section("scene", [
             ("inner region" if m.contracted else "world box",
              f"{size} units, from {_numbers(low)} to {_numbers(high)}"),
@@ -85,6 +95,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
             ("features", f"{m.feature_resolution} cells per axis, {known['n_feature_vertices']:,} vertices "
              f"of {m.n_channels} channels of 8 bits, fetched "
              f"{f'at {m.n_fetches} places a ray' if m.n_fetches else 'at every sample'}"),
+            *([("levels", _level_sentence(known["levels"]))] if m.parts else []),
             ("step", _step(m, scale)),
             ("head", f"{known['head_parameters']:,} parameters, once a pixel"),
         ]),
@@ -134,6 +145,20 @@ def _step(m: Manifest, scale: float) -> str:
     if m.contracted:
         return f"an angle of {m.step:.5g}, {cells * MAX_SPEED:.2g} of a cell at most"
     return f"{m.step * scale:.5g} world units, {cells:.2g} of a cell"
+
+
+def _levels(stored: PyramidValues) -> list[dict[str, int]]:
+    """What has been read of each level, the finest first."""
+    levels = zip(stored.pyramid.levels, stored.values, strict=True)
+    return [{"n_bricks": len(bricks), "n_vertices": len(values)} for bricks, values in levels]
+
+
+def _level_sentence(levels: dict[str, list[dict[str, int]]]) -> str:
+    words = []
+    for grid, found in levels.items():
+        n = [level["n_vertices"] for level in found]
+        words.append(f"{len(found)} of {grid} ({', '.join(f'{count:,}' for count in n)} vertices)")
+    return "; ".join(words)
 
 
 def _world_box(asset: Asset) -> list[list[float]]:
