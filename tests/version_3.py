@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from player.asset.manifest import FileEntry, Manifest, manifest_bytes
-from player.asset.packing import pack_codes, pack_masks
 from player.asset.single_level import VertexBricks
-from player.asset.unpacking import DENSITIES, FEATURES, PLACES
+from player.asset.version_3.packing import pack_codes, pack_masks
+from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
 
 KEYS_OF_4 = ("level_steps", "density_steps", "feature_steps", "parts")
 

@@ -18,7 +18,8 @@ from player.asset.manifest import Manifest
 from player.asset.parts import LIMITS
 from player.asset.pyramid import PyramidValues, symbols_of, values_of
 from player.asset.sections import Grid, Part, Section, part_name
-from player.asset.standin import encode_structure, encode_symbols
+from player.asset.standin import encode_structure
+from player.asset.symbols import encode_level, level_rows
 from player.errors import FormatError
 
 SHARES = (0.1, 0.25, 0.5, 1.0)
@@ -71,9 +72,10 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
         data = encode_structure(bricks, coarser)
         counts = {"n_bricks": len(bricks), "n_vertices": vertices.n}
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
+        rows = level_rows(vertices)
         bounds = channel_groups(stored.n_channels)
         for first, end in pairwise(bounds):
-            data = encode_symbols(symbols[level][:, first:end], vertices, first)
+            data = encode_level(symbols[level][:, first:end], rows)
             channels = {"first_channel": first, "n_channels": end - first}
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)
 

@@ -26,7 +26,7 @@ from player.asset.manifest import (
 from player.asset.parts import DTYPES, PartsReader
 from player.asset.pyramid import PyramidValues
 from player.asset.sections import MAX_ROWS, Grid
-from player.asset.unpacking import read_version_3
+from player.asset.version_3.unpacking import read_version_3
 from player.errors import ConfigError, FormatError
 from player.files.files import new_folder, read_bytes
 from player.files.memory import allowed_bytes

@@ -20,7 +20,8 @@ from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
-from player.asset.standin import decode_structure, decode_symbols
+from player.asset.standin import decode_structure
+from player.asset.symbols import LevelRows, decode_level, level_rows
 from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
@@ -52,6 +53,7 @@ class PyramidReader:
         self._steps = manifest.feature_steps if grid == "features" else manifest.density_steps
         self._limits, self._dtype = LIMITS[grid], DTYPES[grid]
         self.pyramid = Pyramid(manifest.resolutions[grid], (none,) * n_levels)
+        self._rows: dict[int, LevelRows] = {}
         self._symbols = [np.zeros((0, self._n_channels), np.int16)] * n_levels
 
     def read_structures(self, sections: Iterable[StoredSection]) -> None:
@@ -64,10 +66,8 @@ class PyramidReader:
         """Add symbols of levels that are there. Raises FormatError: a section breaks the format."""
         for section, data, where in sections:
             if section.kind == "symbols":
-                vertices, symbols = self.pyramid.vertices[section.level], self._symbols[section.level]
-                shape = len(symbols), section.n_channels
-                channels = slice(section.first_channel, section.end_channel)
-                symbols[:, channels] = decode_symbols(data, shape, vertices, section.first_channel, where)
+                self._read_symbols(section, data, where)
+        self._rows.clear()
 
     def _read_structure(self, section: Section, data: memoryview, where: str) -> None:
         level = section.level
@@ -80,8 +80,16 @@ class PyramidReader:
         vertices = self.pyramid.vertices[level]
         if vertices.n != section.n_vertices:
             raise FormatError(f"{where}: n_vertices: expected {vertices.n}, got {section.n_vertices}")
-        n_stored = vertices.n - int(np.bitwise_count(vertices.border).sum(dtype=np.int64))
-        self._symbols[level] = np.zeros((n_stored, self._n_channels), np.int16)
+
+    def _read_symbols(self, section: Section, data: memoryview, where: str) -> None:
+        level = section.level
+        if level not in self._rows:
+            self._rows[level] = level_rows(self.pyramid.vertices[level])
+        rows = self._rows[level]
+        found = decode_level(data, rows, section.n_channels, where)
+        if not len(self._symbols[level]):
+            self._symbols[level] = np.zeros((rows.neighbours.n, self._n_channels), np.int16)
+        self._symbols[level][:, section.first_channel : section.end_channel] = found
 
     def values(self) -> PyramidValues:
         """What is known so far."""

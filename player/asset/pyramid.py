@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from player.asset.bricks import BRICK, bricks_per_axis, stored_bits
-from player.asset.prediction import Places, values_from
+from player.asset.prediction.prediction import Places, values_from
 
 MAX_LEVELS = 8
 

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from player.asset.pyramid import Bricks, Vertices
+from player.asset.pyramid import Bricks
 from player.errors import FormatError
 
 
@@ -38,14 +38,3 @@ def decode_structure(data: bytes, n_bricks: int, coarser: Bricks | None, n_cells
     coords = np.frombuffer(found, "<u2", 3 * n_bricks).reshape(-1, 3)
     masks = np.frombuffer(found[6 * n_bricks :], "<u8", 8 * n_bricks).reshape(-1, 8)
     return Bricks(coords, masks)
-
-
-def encode_symbols(symbols: np.ndarray, vertices: Vertices, first: int) -> bytes:
-    return _packed(symbols.T.astype("<i2"))
-
-
-def decode_symbols(
-    data: bytes, shape: tuple[int, int], vertices: Vertices, first: int, where: str
-) -> np.ndarray:
-    found = _unpacked(data, 2 * shape[0] * shape[1], where)
-    return np.frombuffer(found, "<i2").reshape(shape[::-1]).T

@@ -15,7 +15,7 @@ from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import decode_density, encode_density
 from player.asset.grid import SparseGrid
-from player.asset.packing import pack_codes, unpack_codes
+from player.asset.version_3.packing import pack_codes, unpack_codes
 from player.cameras.transforms import read_cameras
 from player.compiled import march as march_compiled
 from player.march import march

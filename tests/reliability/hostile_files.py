@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from player.asset.packing import pack_codes, pack_masks
+from player.asset.version_3.packing import pack_codes, pack_masks
 
 BUDGET = 0.3
 """Gigabytes that the commands may take for the asset."""

@@ -20,8 +20,8 @@ import torch
 from exporters.shapes.crop import parse_crop
 from player.asset.asset import Asset
 from player.asset.manifest import NAME, parse_manifest
-from player.asset.packing import pack_codes, pack_masks
-from player.asset.unpacking import read_arrays, read_coords
+from player.asset.version_3.packing import pack_codes, pack_masks
+from player.asset.version_3.unpacking import read_arrays, read_coords
 from player.cameras.transforms import parse_transforms, transforms_cameras
 from player.errors import ConfigError, DataError, FormatError
 from player.files.images import png_bytes, read_key

@@ -22,7 +22,7 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
-from player.asset.packing import pack_codes
+from player.asset.version_3.packing import pack_codes
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, TrainingError
 from player.files.files import check_target

@@ -14,8 +14,8 @@ import numpy as np
 
 from player.asset.asset import Asset, GridArrays
 from player.asset.manifest import FileEntry, Manifest
-from player.asset.packing import pack_codes, pack_masks
 from player.asset.single_level import to_vertices
+from player.asset.version_3.packing import pack_codes, pack_masks
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.render import Renderer

@@ -14,7 +14,7 @@ from player.asset.asset import Asset
 from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
 from player.asset.single_level import VertexBricks
-from player.asset.unpacking import PLACES, Counts, n_set, needed_bytes, read_arrays
+from player.asset.version_3.unpacking import PLACES, Counts, n_set, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes

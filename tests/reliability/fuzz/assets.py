@@ -25,9 +25,9 @@ from player.app.info import facts, page
 from player.asset.asset import Asset, read_manifest
 from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
-from player.asset.packing import pack_codes, pack_masks
-from player.asset.unpacking import PLACES, read_arrays
-from player.compiled.compiling import available
+from player.asset.version_3.packing import pack_codes, pack_masks
+from player.asset.version_3.unpacking import PLACES, read_arrays
+from player.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
 from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value

@@ -18,9 +18,9 @@ import numpy as np
 from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.check_bricks import check_inside, check_sorted
 from player.asset.manifest import Manifest
-from player.asset.packing import unpack_codes, unpack_masks
 from player.asset.pyramid import Bricks, PyramidValues
 from player.asset.single_level import VertexBricks, from_vertices
+from player.asset.version_3.packing import unpack_codes, unpack_masks
 from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory

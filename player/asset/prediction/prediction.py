@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.bricks import BRICK, stored_bits
-from player.compiled.compiling import available
-from player.compiled.prediction import add_to_prediction
+from player.asset.prediction.compiled import add_to_prediction
+from player.compiling import available
 
 _AT_ONCE = 256
 """Bricks whose values are predicted at a time in numpy: some megabytes."""

@@ -1,11 +1,11 @@
 """Values of a level of a pyramid from those of the next coarser level, vertex by vertex
-(`player.asset.prediction`)."""
+(`player.asset.prediction.prediction`)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from player.compiled.compiling import compiled
+from player.compiling import compiled
 
 
 @compiled

@@ -1,0 +1,1 @@
+"""What a level of a pyramid says about the next finer one."""
