@@ -217,13 +217,12 @@ class _Opening:
         if manifest.version < (4, 0):
             return Asset(folder, manifest, GridArrays(*read_version_3(folder, manifest, self._allowed)))
         missing = None
-        while missing is None and parts.n_read < min(n_parts, len(manifest.parts)):
-            try:
-                parts.read()
-            except FormatError as error:
-                if not parts.n_read:
-                    raise
-                missing = f"{error}: shown as the first {parts.n_read} of {len(manifest.parts)} parts have it"
+        try:
+            parts.read(n_parts)
+        except FormatError as error:
+            if not parts.n_read:
+                raise
+            missing = f"{error}: shown as the first {parts.n_read} of {len(manifest.parts)} parts have it"
         arrays = GridArrays(parts.values("densities"), parts.values("features"))
         return Asset(folder, manifest, arrays, parts.n_read, missing)
 

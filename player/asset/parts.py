@@ -8,14 +8,16 @@ corners. No more than that is ever decoded, whatever a file holds.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.check_bricks import check_level
+from player.asset.coder.lanes import Neighbours
 from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues, values_of
@@ -29,6 +31,10 @@ from player.files.memory import check_memory
 LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127, 127)}
 """The lowest and the highest code of a value."""
 DTYPES: dict[Grid, type[np.generic]] = {"densities": np.uint8, "features": np.int8}
+
+
+MAX_THREADS = 8
+"""Sections that are decoded at a time at most: each takes memory of its own."""
 
 
 class StoredSection(NamedTuple):
@@ -49,52 +55,50 @@ class PyramidReader:
     def __init__(self, grid: Grid, manifest: Manifest) -> None:
         n_levels = manifest.n_levels[grid]
         none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
-        self._n_channels = manifest.n_channels if grid == "features" else 1
+        self.n_channels = manifest.n_channels if grid == "features" else 1
         self._steps = manifest.feature_steps if grid == "features" else manifest.density_steps
         self._limits, self._dtype = LIMITS[grid], DTYPES[grid]
         self.pyramid = Pyramid(manifest.resolutions[grid], (none,) * n_levels)
-        self._rows: dict[int, LevelRows] = {}
-        self._symbols = [np.zeros((0, self._n_channels), np.int16)] * n_levels
+        self._symbols = [np.zeros((0, self.n_channels), np.int16)] * n_levels
 
-    def read_structures(self, sections: Iterable[StoredSection]) -> None:
-        """Add levels. Raises FormatError: a section breaks the format."""
-        for section, data, where in sections:
-            if section.kind == "structure":
-                self._read_structure(section, data, where)
-
-    def read_symbols(self, sections: Iterable[StoredSection]) -> None:
-        """Add symbols of levels that are there. Raises FormatError: a section breaks the format."""
-        for section, data, where in sections:
-            if section.kind == "symbols":
-                self._read_symbols(section, data, where)
-        self._rows.clear()
-
-    def _read_structure(self, section: Section, data: memoryview, where: str) -> None:
-        level = section.level
-        levels = self.pyramid.levels
+    def read_structure(self, stored: StoredSection) -> None:
+        """Add a level. Raises FormatError: the section breaks the format."""
+        section, data, where = stored
+        level, levels = section.level, self.pyramid.levels
         coarser = levels[level + 1] if level + 1 < len(levels) else None
         n_cells = self.pyramid.cells_per_axis(level)
         bricks = decode_structure(data, section.n_bricks, coarser, n_cells, where)
         check_level(bricks, coarser, n_cells, where)
-        self.pyramid = self.pyramid.with_level(level, bricks)
-        vertices = self.pyramid.vertices[level]
+        pyramid = self.pyramid.with_level(level, bricks)
+        vertices = pyramid.vertices[level]
         if vertices.n != section.n_vertices:
             raise FormatError(f"{where}: n_vertices: expected {vertices.n}, got {section.n_vertices}")
+        self.pyramid = pyramid
 
-    def _read_symbols(self, section: Section, data: memoryview, where: str) -> None:
-        level = section.level
-        if level not in self._rows:
-            self._rows[level] = level_rows(self.pyramid.vertices[level])
-        rows = self._rows[level]
-        found = decode_level(data, rows, section.n_channels, where)
+    def rows_of(self, level: int) -> LevelRows:
+        """The rows of a level that is there; before its symbols are read, which it makes room for."""
+        rows = level_rows(self.pyramid.vertices[level])
         if not len(self._symbols[level]):
-            self._symbols[level] = np.zeros((rows.neighbours.n, self._n_channels), np.int16)
-        self._symbols[level][:, section.first_channel : section.end_channel] = found
+            self._symbols[level] = np.zeros((rows.neighbours.n, self.n_channels), np.int16)
+        return rows
+
+    def read_symbols(self, stored: StoredSection, rows: LevelRows) -> None:
+        """Add symbols to a level; sections can be read at the same time. Raises FormatError: the section
+        breaks the format."""
+        section, data, where = stored
+        own = LevelRows(Neighbours(rows.neighbours.rows), rows.classes)  # it keeps what belongs to a section
+        found = decode_level(data, own, section.n_channels, where)
+        self._symbols[section.level][:, section.first_channel : section.end_channel] = found
+
+    def forget(self, section: Section) -> None:
+        """Make the symbols of a section 0 again."""
+        self._symbols[section.level][:, section.first_channel : section.end_channel] = 0
 
     def values(self) -> PyramidValues:
         """What is known so far."""
-        values = values_of(self.pyramid.vertices, self._symbols, self._steps, self._limits)
-        return PyramidValues(self.pyramid, tuple(level.astype(self._dtype) for level in values))
+        vertices = self.pyramid.vertices
+        values = values_of(vertices, self._symbols, self._steps, self._limits, self._dtype)
+        return PyramidValues(self.pyramid, tuple(values))
 
 
 class PartsReader:
@@ -110,47 +114,89 @@ class PartsReader:
         self.n_read = 0
         """Parts that have been read."""
 
-    def read(self) -> None:
-        """Read the next part.
+    def read(self, n_parts: int) -> None:
+        """Read on until `n_parts` are read, or one cannot be.
 
-        Raises FormatError, IntegrityError: it is not there, or another one, or breaks the format; what has
-        been read of it stays. ConfigError: it takes more memory than is allowed.
+        Raises FormatError, IntegrityError: a part is not there, or another one, or breaks the format; those
+        before it are read. ConfigError: it takes more memory than is allowed.
         """
-        part = self._manifest.parts[self.n_read]
-        data = memoryview(self._bytes(part))
-        sections: dict[Grid, list[StoredSection]] = {"densities": [], "features": []}
-        first = 0
-        for section in part.sections:
-            where = f"{self._folder / part.file}: {section.name}"
-            stored = StoredSection(section, data[first : first + section.bytes], where)
-            sections[section.grid].append(stored)
-            first += section.bytes
-        with ThreadPoolExecutor(1) as other:  # both at a time: what decodes leaves the interpreter to others
-            densities, features = (self._grids[grid] for grid in ("densities", "features"))
-            later = other.submit(features.read_structures, sections["features"])
-            densities.read_structures(sections["densities"])
-            later.result()
-            self._check_memory()
-            later = other.submit(features.read_symbols, sections["features"])
-            densities.read_symbols(sections["densities"])
-            later.result()
-        if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given a feature
-            raise FormatError(
-                f"{self._folder / part.file}: expected at least one live cell of the features, got none"
-            )
-        self.n_read += 1
+        parts = self._manifest.parts[self.n_read : n_parts]
+        check_memory(self._stated_bytes(parts), self._allowed, str(self._folder))
+        read: list[list[StoredSection]] = []
+        error: FormatError | None = None
+        try:
+            for part in parts:
+                sections = self._sections(part)
+                for stored in sections:
+                    if stored.section.kind == "structure":
+                        self._grids[stored.section.grid].read_structure(stored)
+                if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given one
+                    raise FormatError(
+                        f"{self._folder / part.file}: expected a live cell of the features, got none"
+                    )
+                read.append(sections)
+        except FormatError as found:
+            error = found
+        check_memory(self._exact_bytes(parts), self._allowed, str(self._folder))
+        n_good, broken = self._read_symbols(read)
+        self.n_read += n_good
+        if broken is not None or error is not None:
+            raise broken or error  # type: ignore[misc]
 
-    def _check_memory(self) -> None:
-        check_memory(0, self._allowed, str(self._folder))
+    def _read_symbols(self, read: Sequence[Sequence[StoredSection]]) -> tuple[int, FormatError | None]:
+        """Decode the symbols of parts, several sections at a time. Of the first section that breaks the
+        format, and of all behind it, nothing is kept.
 
-    def _bytes(self, part: Part) -> bytes:
-        """The content of the part's file, compared with its checksum."""
+        Returns how many parts are whole, and what is wrong with the next.
+        """
+        symbols = [
+            (number, stored)
+            for number, sections in enumerate(read)
+            for stored in sections
+            if stored.section.kind == "symbols"
+        ]
+        with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
+            levels = {(stored.section.grid, stored.section.level) for _, stored in symbols}
+            rows = {key: pool.submit(self._grids[key[0]].rows_of, key[1]) for key in sorted(levels)}
+            wait(rows.values())
+            decoded = [
+                pool.submit(
+                    self._grids[stored.section.grid].read_symbols,
+                    stored,
+                    rows[stored.section.grid, stored.section.level].result(),
+                )
+                for _, stored in symbols
+            ]
+        for index, ((number, _), done) in enumerate(zip(symbols, decoded, strict=True)):
+            error = done.exception()
+            if error is None:
+                continue
+            if not isinstance(error, FormatError):
+                raise error
+            for _, stored in symbols[index:]:
+                self._grids[stored.section.grid].forget(stored.section)
+            return number, error
+        return len(read), None
+
+    def _sections(self, part: Part) -> list[StoredSection]:
+        """The sections of a part, whose file is compared with its checksum."""
         path, entry = self._folder / part.file, self._manifest.files[part.file]
         check_size(self._folder, part.file, entry)
         data = read_bytes(path, "a part of an asset", entry.bytes, self._folder)
         compare_sums(path, entry, hashlib.sha256(data).hexdigest())
-        return data
+        view, first, found = memoryview(data), 0, []
+        for section in part.sections:
+            end = first + section.bytes
+            found.append(StoredSection(section, view[first:end], f"{path}: {section.name}"))
+            first = end
+        return found
 
     def values(self, grid: Grid) -> PyramidValues:
         """What is known of a pyramid so far."""
         return self._grids[grid].values()
+
+    def _stated_bytes(self, parts: Sequence[Part]) -> int:
+        return 0
+
+    def _exact_bytes(self, parts: Sequence[Part]) -> int:
+        return 0
