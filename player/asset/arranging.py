@@ -1,9 +1,9 @@
 """Which sections the parts of a new asset hold: the first part is a whole, coarser picture.
 
 The order of the sections is that of what they show: first all that the coarsest picture needs, then what
-makes it sharper, the density before the features and the first channels before the others. It is cut where
-the first part would take more than a tenth of the bytes, and where those up to the middle would take more
-than half.
+makes it sharper, the density before the features and the first channels before the others. It is cut so that
+what the first picture needs, head and cameras with it, is at most a tenth of the bytes of the asset, and half
+of the bytes end with a part, too.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ from player.asset.manifest import Manifest
 from player.asset.parts import LIMITS
 from player.asset.pyramid import PyramidValues, symbols_of, values_of
 from player.asset.sections import Grid, Part, Section, part_name
-from player.asset.standin import encode_structure
+from player.asset.structure import encode_structure
 from player.asset.symbols import encode_level, level_rows
 from player.errors import FormatError
 
 SHARES = (0.1, 0.25, 0.5, 1.0)
-"""The most of all bytes that the first part takes, the first two together, ..."""
-N_GROUPS = 4
-"""Groups of channels that features are stored in, as far as there are so many channels."""
+"""The most of all bytes that are read with the first part, with the first two, ..."""
 
 
 class WrittenSection(NamedTuple):
@@ -42,8 +40,16 @@ class WrittenPart(NamedTuple):
     data: bytes
 
 
-def write_parts(densities: PyramidValues, features: PyramidValues, manifest: Manifest) -> list[WrittenPart]:
+def write_parts(
+    densities: PyramidValues, features: PyramidValues, manifest: Manifest, n_before: int, n_behind: int
+) -> list[WrittenPart]:
     """The parts of an asset.
+
+    Args:
+        densities, features: what is stored.
+        manifest: resolutions and steps.
+        n_before: bytes of what is read before the first part.
+        n_behind: bytes of what is read behind the last part.
 
     Raises FormatError: values that the steps of the manifest do not reach.
     """
@@ -51,7 +57,7 @@ def write_parts(densities: PyramidValues, features: PyramidValues, manifest: Man
         *_sections("densities", densities, manifest.density_steps),
         *_sections("features", features, manifest.feature_steps),
     ]
-    return list(_cut(sorted(sections, key=_turn)))
+    return list(_cut(sorted(sections, key=_turn), n_before, n_behind))
 
 
 def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterator[WrittenSection]:
@@ -67,43 +73,54 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
                 f"{channel}, got {wanted[row, channel]}"
             )
     for level, bricks in enumerate(pyramid.levels):
-        coarser = pyramid.levels[level + 1] if level + 1 < len(pyramid.levels) else None
+        if not len(bricks):
+            continue
+        data = encode_structure(pyramid, level)
         vertices = pyramid.vertices[level]
-        data = encode_structure(bricks, coarser)
         counts = {"n_bricks": len(bricks), "n_vertices": vertices.n}
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
         rows = level_rows(vertices)
-        bounds = channel_groups(stored.n_channels)
-        for first, end in pairwise(bounds):
+        for first, end in pairwise(channel_groups(stored.n_channels)):
             data = encode_level(symbols[level][:, first:end], rows)
             channels = {"first_channel": first, "n_channels": end - first}
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)
 
 
 def channel_groups(n_channels: int) -> list[int]:
-    """Where the groups of channels begin, and the number of channels.
+    """Where the groups of channels begin, and the number of channels: each group doubles those before it.
 
     >>> channel_groups(1), channel_groups(8), channel_groups(10)
-    ([0, 1], [0, 2, 4, 6, 8], [0, 2, 5, 7, 10])
+    ([0, 1], [0, 2, 4, 8], [0, 2, 4, 8, 10])
     """
-    n_groups = min(N_GROUPS, n_channels)
-    return [n_channels * i // n_groups for i in range(n_groups + 1)]
+    return [0, *(1 << n for n in range(1, n_channels.bit_length()) if 1 << n < n_channels), n_channels]
 
 
-def _turn(written: WrittenSection) -> tuple[int, ...]:
-    """By what the sections of an asset are sorted."""
+def _turn(written: WrittenSection) -> tuple[float, ...]:
+    """By what the sections of an asset are sorted: a level after the coarser one, but later channels when
+    finer levels have their first ones, half a level for each group of channels from the third on."""
     section = written.section
-    return (-section.level, section.kind != "structure", section.grid != "densities", section.first_channel)
+    late = max((section.end_channel - 1).bit_length() - 2, 0) if section.kind == "symbols" else 0
+    return (
+        late / 2 - section.level,
+        section.grid != "densities",
+        section.kind != "structure",
+        -section.level,
+        section.first_channel,
+    )
 
 
-def _cut(sections: Sequence[WrittenSection]) -> Iterator[WrittenPart]:
+def _cut(sections: Sequence[WrittenSection], n_before: int, n_behind: int) -> Iterator[WrittenPart]:
     """Parts of sections that follow each other, none of them empty."""
-    ends = np.cumsum([len(written.data) for written in sections])
+    ends = n_before + np.cumsum([len(written.data) for written in sections])
     firsts = [0]
     kinds = [(section.grid, section.kind) for section, _ in sections]
     whole = kinds.index(("features", "symbols")) + 1  # the least that can be shown
     for share in SHARES:
-        n = int(np.searchsorted(ends, share * ends[-1], side="right")) if share < 1 else len(sections)
+        n = (
+            int(np.searchsorted(ends, share * (ends[-1] + n_behind), side="right"))
+            if share < 1
+            else len(sections)
+        )
         if n > firsts[-1] and n >= whole:
             firsts.append(n)
     for number, (first, end) in enumerate(pairwise(firsts)):

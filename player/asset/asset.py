@@ -285,7 +285,8 @@ def write_asset(
         OutputError: the folder exists, or the disk is full.
     """
     arrays.check(manifest)
-    parts = write_parts(arrays.densities, arrays.features, manifest)
+    n_before = len(head) + len(cameras)
+    parts = write_parts(arrays.densities, arrays.features, manifest, n_before, len(mesh))
     manifest = replace(manifest, version=VERSION, parts=tuple(part.part for part in parts), files={})
     with new_folder(folder, force) as new:
         for part in parts:

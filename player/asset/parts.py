@@ -16,13 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.check_bricks import check_level
 from player.asset.coder.lanes import Neighbours
 from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
-from player.asset.standin import decode_structure
+from player.asset.structure import decode_structure
 from player.asset.symbols import LevelRows, decode_level, level_rows
 from player.errors import FormatError
 from player.files.files import read_bytes
@@ -41,7 +40,7 @@ class StoredSection(NamedTuple):
     """A section with its bytes."""
 
     section: Section
-    data: memoryview
+    data: bytes
     where: str
     """The file and the section, for messages."""
 
@@ -67,8 +66,7 @@ class PyramidReader:
         level, levels = section.level, self.pyramid.levels
         coarser = levels[level + 1] if level + 1 < len(levels) else None
         n_cells = self.pyramid.cells_per_axis(level)
-        bricks = decode_structure(data, section.n_bricks, coarser, n_cells, where)
-        check_level(bricks, coarser, n_cells, where)
+        bricks = decode_structure(data, n_cells, coarser, section.n_bricks, where)
         pyramid = self.pyramid.with_level(level, bricks)
         vertices = pyramid.vertices[level]
         if vertices.n != section.n_vertices:
@@ -184,10 +182,10 @@ class PartsReader:
         check_size(self._folder, part.file, entry)
         data = read_bytes(path, "a part of an asset", entry.bytes, self._folder)
         compare_sums(path, entry, hashlib.sha256(data).hexdigest())
-        view, first, found = memoryview(data), 0, []
+        first, found = 0, []
         for section in part.sections:
             end = first + section.bytes
-            found.append(StoredSection(section, view[first:end], f"{path}: {section.name}"))
+            found.append(StoredSection(section, data[first:end], f"{path}: {section.name}"))
             first = end
         return found
 
