@@ -80,7 +80,7 @@ def export_asset(
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
     if name not in ("exr", "json", "onnx"):
-        asset = inner_region(asset)
+        asset = inner_region(asset, options.max_memory)
     matrix = coordinates_from_world(options.coordinates, asset.world_from_model, name)
     if is_mesh:
         facts = export_mesh(asset, target, options, name, matrix, report)

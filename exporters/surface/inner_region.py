@@ -1,4 +1,5 @@
-"""The part of an unbounded scene that has a shape: what lies in the unit ball of the model frame.
+"""What of an asset has a shape, on one level: of an unbounded scene what lies in the unit ball of the model
+frame.
 
 There contracted coordinates are those of the model, so that the same vertices on the same grid are a volume
 like an object's. What is around it has been contracted, and would be a ball of warped surroundings in any
@@ -11,41 +12,52 @@ from dataclasses import replace
 
 import numpy as np
 
+from exporters.surface.one_level import one_level
 from player.asset.asset import Asset, GridArrays
-from player.asset.bricks import pack_vertices
-from player.asset.pyramid import PyramidValues
-from player.asset.single_level import VertexBricks, from_vertices
+from player.asset.bricks import bricks_per_axis, dense_index, live_cells, stored_bits
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues, packed_bits
 from player.errors import DataError
-
-REACH = 2.0
-"""How many cells around the ball keep their features; the diagonal of a cell is shorter."""
+from player.files.memory import allowed_bytes
 
 
-def inner_region(asset: Asset) -> Asset:
-    """The asset as exporters of surfaces and volumes take it: itself, or of an unbounded scene its inner
-    region, whose grid is a box's.
+def inner_region(asset: Asset, max_memory: float | None = None) -> Asset:
+    """The asset as exporters of surfaces and volumes take it: its densities on one level, and of an unbounded
+    scene those in the unit ball, whose grid is a box's.
 
-    Raises DataError: an unbounded scene that has nothing there.
+    Args:
+        asset: an open asset.
+        max_memory: gigabytes that the densities may take, as `Asset.open` has it.
+
+    Raises:
+        DataError: an unbounded scene that has nothing there.
+        ConfigError: it takes more memory than it may.
     """
-    m, a = asset.manifest, asset.arrays
-    if not m.contracted:
+    m, stored = asset.manifest, asset.arrays.densities
+    if not m.contracted and len(stored.pyramid.levels) == 1:
         return asset
-    densities = _inside(a.densities, 0.0)
-    # Cells of features reach over the ball's border, as the density's cells at it do.
-    features = _inside(a.features, REACH)
+    densities = one_level(stored, allowed_bytes(max_memory), str(asset.folder))
+    if m.contracted:
+        densities = _inside(densities)
     if not len(densities.values[0]):
         raise DataError(
             f"{asset.folder}: expected an unbounded scene with something in its unit ball, got all "
-            f"{len(a.densities.values[0])} vertices outside: surroundings without end are not exported"
+            f"{stored.first_rows[-1]} vertices outside: surroundings without end are not exported"
         )
-    return Asset(asset.folder, replace(m, contracted=False, near=0.0), GridArrays(densities, features))
+    manifest = replace(m, contracted=False, near=0.0)
+    return Asset(asset.folder, manifest, GridArrays(densities, asset.arrays.features))
 
 
-def _inside(grid: PyramidValues, reach: float) -> PyramidValues:
-    """What is stored in the unit ball, or within `reach` cells of it."""
-    resolution = grid.pyramid.resolution
-    index = grid.pyramid.vertices[0].index
-    edge = resolution / 4  # cells along a model unit; the middle is two model units from the corner
-    inside = np.linalg.norm(index / edge - 2, axis=-1) <= 1 + reach / edge
-    coords, masks, _ = pack_vertices(index[inside])  # the order stays: by brick, then by bit
-    return from_vertices(VertexBricks(coords, masks, grid.values[0][inside]), resolution)
+def _inside(grid: PyramidValues) -> PyramidValues:
+    """The cells of a grid of one level whose corners are all in the unit ball."""
+    (cells,), (vertices,), (values,) = grid.pyramid.levels, grid.pyramid.vertices, grid.values
+    edge = (
+        grid.pyramid.resolution / 4
+    )  # cells along a model unit; the middle is two model units from the corner
+    coords = vertices.bricks.coords
+    inside = stored_bits(vertices.bricks.masks)
+    inside[inside] = np.linalg.norm(vertices.index / edge - 2, axis=-1) <= 1
+    index = dense_index(coords, bricks_per_axis(grid.pyramid.resolution))
+    whole = Bricks(coords, live_cells(coords, packed_bits(inside), index))
+    kept = Bricks(cells.coords, cells.masks & whole.masks_at(cells.coords)).without_empty()
+    pyramid = Pyramid(grid.pyramid.resolution, (kept,))
+    return PyramidValues(pyramid, (values[vertices.rows(pyramid.vertices[0].index)],))
