@@ -1,4 +1,5 @@
-"""What a pyramid shows, as one grid of its finest level: surfaces and volumes are cut out of cells of one size.
+"""What a pyramid shows, as one grid of its finest level: surfaces and volumes are cut out of cells of one
+size.
 
 A coarse cell becomes the fine ones in its place, whose corners are interpolated as the format predicts them,
 in whole codes.
