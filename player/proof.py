@@ -128,23 +128,28 @@ def verdict() -> str:
 
 
 def _grid(contracted: bool) -> Any:
-    """Sixteen vertices an axis of codes and features that vary, some of them not stored."""
+    """Two levels, one beside the other, of codes and features that vary; some cells are not live."""
     from player.asset.bricks import pack_vertices
     from player.asset.grid import build_grid
-    from player.asset.single_level import VertexBricks, from_vertices
+    from player.asset.pyramid import Bricks, PyramidValues, whole_pyramid
     from player.march.contracted import MAX_SPEED
 
-    vertices = np.argwhere(np.ones((16, 16, 16)))
-    vertices = vertices[(vertices * (5, 3, 1)).sum(axis=1) % 29 != 0]
-    coords, masks, order = pack_vertices(vertices)
-    x, y, z = vertices[order].T
-    codes = (120 + 8 * x - 5 * y + 3 * z).astype(np.uint8)
-    features = np.stack([x * 8 - 60, y * 7 - 50, z * 5 - (x * y) // 4], axis=-1).astype(np.int8)
+    leaves = []
+    for level, (low, high) in enumerate(((0, 8), (4, 8))):
+        n_cells = 15 >> level
+        cells = np.argwhere(np.ones((high - low, n_cells, n_cells))) + np.array([low, 0, 0])
+        leaves.append(Bricks(*pack_vertices(cells[(cells * (5, 3, 1)).sum(axis=1) % 29 != 0])[:2]))
+    pyramid = whole_pyramid(15, leaves)
+    codes, features = [], []
+    for level, vertices in enumerate(pyramid.vertices):
+        x, y, z = vertices.index.T << level
+        codes.append((120 + 8 * x - 5 * y + 3 * z).astype(np.uint8)[:, None])
+        features.append(np.stack([x * 8 - 60, y * 7 - 50, z * 5 - (x * y) // 4], axis=-1).astype(np.int8))
     half = 2.0 if contracted else 1.0
     box = np.array([[-half] * 3, [half] * 3])
     step = 4 / 48 / float(MAX_SPEED) if contracted else 0.05
-    densities, stored = (from_vertices(VertexBricks(coords, masks, n), 15) for n in (codes, features))
-    return build_grid(densities, stored, box, step, (1,), (-3.0, 4.0), contracted)
+    densities, stored = (PyramidValues(pyramid, tuple(values)) for values in (codes, features))
+    return build_grid(densities, stored, box, step, (1, 2), (-3.0, 4.0), contracted)
 
 
 def _rays() -> tuple[np.ndarray, np.ndarray]:
