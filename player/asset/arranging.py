@@ -116,11 +116,8 @@ def _cut(sections: Sequence[WrittenSection], n_before: int, n_behind: int) -> It
     kinds = [(section.grid, section.kind) for section, _ in sections]
     whole = kinds.index(("features", "symbols")) + 1  # the least that can be shown
     for share in SHARES:
-        n = (
-            int(np.searchsorted(ends, share * (ends[-1] + n_behind), side="right"))
-            if share < 1
-            else len(sections)
-        )
+        most = share * (ends[-1] + n_behind)
+        n = int(np.searchsorted(ends, most, side="right"))
         if n > firsts[-1] and n >= whole:
             firsts.append(n)
     for number, (first, end) in enumerate(pairwise(firsts)):

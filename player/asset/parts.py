@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.coder.lanes import Neighbours
 from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
@@ -32,6 +33,8 @@ LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127,
 DTYPES: dict[Grid, type[np.generic]] = {"densities": np.uint8, "features": np.int8}
 
 
+NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
+GRIDS: tuple[Grid, Grid] = ("densities", "features")
 MAX_THREADS = 8
 """Sections that are decoded at a time at most: each takes memory of its own."""
 
@@ -53,11 +56,10 @@ class PyramidReader:
 
     def __init__(self, grid: Grid, manifest: Manifest) -> None:
         n_levels = manifest.n_levels[grid]
-        none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
         self.n_channels = manifest.n_channels if grid == "features" else 1
         self._steps = manifest.feature_steps if grid == "features" else manifest.density_steps
         self._limits, self._dtype = LIMITS[grid], DTYPES[grid]
-        self.pyramid = Pyramid(manifest.resolutions[grid], (none,) * n_levels)
+        self.pyramid = Pyramid(manifest.resolutions[grid], (NONE,) * n_levels)
         self._symbols = [np.zeros((0, self.n_channels), np.int16)] * n_levels
 
     def read_structure(self, stored: StoredSection) -> None:
@@ -89,14 +91,51 @@ class PyramidReader:
         self._symbols[section.level][:, section.first_channel : section.end_channel] = found
 
     def forget(self, section: Section) -> None:
-        """Make the symbols of a section 0 again."""
-        self._symbols[section.level][:, section.first_channel : section.end_channel] = 0
+        """Undo that a section was read, or that it was begun to be; the last one first."""
+        if section.kind == "structure":
+            self.pyramid = self.pyramid.with_level(section.level, NONE)
+            self._symbols[section.level] = self._symbols[section.level][:0]
+        else:
+            self._symbols[section.level][:, section.first_channel : section.end_channel] = 0
 
     def values(self) -> PyramidValues:
         """What is known so far."""
         vertices = self.pyramid.vertices
         values = values_of(vertices, self._symbols, self._steps, self._limits, self._dtype)
         return PyramidValues(self.pyramid, tuple(values))
+
+
+class Counts(NamedTuple):
+    """How much there is in all levels of a pyramid, as far as it is known."""
+
+    n_per_axis: int
+    """Bricks along an axis of the finest level."""
+    n_bricks: int
+    n_vertex_bricks: int
+    """Bricks of 8 x 8 x 8 vertices that have one."""
+    n_vertices: int
+    n_channels: int
+    n_held: int = 0
+    """Bricks that hold a cell with a stored corner, for features."""
+
+
+def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
+    """Most memory that is taken while `n_packed` bytes of parts become arrays and those a grid.
+
+    Bytes a brick, a vertex, a cell of a table are those of the arrays in `player.asset` and of their
+    temporaries; tests/player/asset/test_parts.py compares the sum with what numpy asks for.
+    """
+    d, f = densities, features
+    decoding = n_packed + sum(
+        6300 * grid.n_vertex_bricks + (30 + 5 * grid.n_channels) * grid.n_vertices for grid in (d, f)
+    )
+    kept = sum(
+        70 * grid.n_bricks + 700 * grid.n_vertex_bricks + grid.n_channels * grid.n_vertices for grid in (d, f)
+    )
+    tables = sum(17 * (grid.n_per_axis + 1) ** 3 for grid in (d, f))
+    densities_built = 2500 * d.n_bricks
+    features_built = 800 * d.n_bricks + 2560 * f.n_bricks + 8 * f.n_vertices + 5200 * f.n_held
+    return max(decoding, kept + tables + max(densities_built, features_built))
 
 
 class PartsReader:
@@ -119,33 +158,38 @@ class PartsReader:
         before it are read. ConfigError: it takes more memory than is allowed.
         """
         parts = self._manifest.parts[self.n_read : n_parts]
-        check_memory(self._stated_bytes(parts), self._allowed, str(self._folder))
+        check_memory(self._stated_bytes(n_parts), self._allowed, str(self._folder))
         read: list[list[StoredSection]] = []
-        error: FormatError | None = None
-        try:
-            for part in parts:
-                sections = self._sections(part)
-                for stored in sections:
-                    if stored.section.kind == "structure":
-                        self._grids[stored.section.grid].read_structure(stored)
-                if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given one
-                    raise FormatError(
-                        f"{self._folder / part.file}: expected a live cell of the features, got none"
-                    )
-                read.append(sections)
-        except FormatError as found:
-            error = found
-        check_memory(self._exact_bytes(parts), self._allowed, str(self._folder))
-        n_good, broken = self._read_symbols(read)
-        self.n_read += n_good
-        if broken is not None or error is not None:
-            raise broken or error  # type: ignore[misc]
+        n_whole, error = 0, None
+        for part in parts:
+            try:
+                read.append(self._sections(part))
+                self._read_structures(read[-1], part)
+                n_whole += 1
+            except FormatError as found:
+                error = found
+                break
+        check_memory(self._exact_bytes(n_parts), self._allowed, str(self._folder))
+        n_whole, error = self._read_symbols(read[:n_whole], error)
+        for stored in reversed([stored for sections in read[n_whole:] for stored in sections]):
+            self._grids[stored.section.grid].forget(stored.section)
+        self.n_read += n_whole
+        if error is not None:
+            raise error
 
-    def _read_symbols(self, read: Sequence[Sequence[StoredSection]]) -> tuple[int, FormatError | None]:
-        """Decode the symbols of parts, several sections at a time. Of the first section that breaks the
-        format, and of all behind it, nothing is kept.
+    def _read_structures(self, sections: Sequence[StoredSection], part: Part) -> None:
+        for stored in sections:
+            if stored.section.kind == "structure":
+                self._grids[stored.section.grid].read_structure(stored)
+        if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given one
+            raise FormatError(f"{self._folder / part.file}: expected a live cell of the features, got none")
 
-        Returns how many parts are whole, and what is wrong with the next.
+    def _read_symbols(
+        self, read: Sequence[Sequence[StoredSection]], error: FormatError | None
+    ) -> tuple[int, FormatError | None]:
+        """Decode the symbols of parts, several sections at a time.
+
+        Returns how many parts are whole, and what is wrong with the next: `error` if all of these are.
         """
         symbols = [
             (number, stored)
@@ -165,16 +209,12 @@ class PartsReader:
                 )
                 for _, stored in symbols
             ]
-        for index, ((number, _), done) in enumerate(zip(symbols, decoded, strict=True)):
-            error = done.exception()
-            if error is None:
-                continue
-            if not isinstance(error, FormatError):
-                raise error
-            for _, stored in symbols[index:]:
-                self._grids[stored.section.grid].forget(stored.section)
-            return number, error
-        return len(read), None
+        for (number, _), done in zip(symbols, decoded, strict=True):
+            try:
+                done.result()
+            except FormatError as found:
+                return number, found
+        return len(read), error
 
     def _sections(self, part: Part) -> list[StoredSection]:
         """The sections of a part, whose file is compared with its checksum."""
@@ -193,8 +233,43 @@ class PartsReader:
         """What is known of a pyramid so far."""
         return self._grids[grid].values()
 
-    def _stated_bytes(self, parts: Sequence[Part]) -> int:
-        return 0
+    def _stated_bytes(self, n_parts: int) -> int:
+        """What the first parts will take by the numbers of the manifest: every brick has vertices."""
+        stored = [section for part in self._manifest.parts[:n_parts] for section in part.sections]
+        counts = []
+        for grid in GRIDS:
+            structures = [s for s in stored if s.grid == grid and s.kind == "structure"]
+            n_bricks = sum(section.n_bricks for section in structures)
+            n_vertices = sum(section.n_vertices for section in structures)
+            n_channels = self._grids[grid].n_channels
+            counts.append(Counts(self._n_per_axis(grid), n_bricks, n_bricks, n_vertices, n_channels))
+        return needed_bytes(self._n_packed(n_parts), *counts)
 
-    def _exact_bytes(self, parts: Sequence[Part]) -> int:
-        return 0
+    def _exact_bytes(self, n_parts: int) -> int:
+        """What they take now that the bricks are known."""
+        counts = []
+        for grid in GRIDS:
+            reader = self._grids[grid]
+            pyramid, vertices = reader.pyramid, reader.pyramid.vertices
+            n_held = 0
+            if grid == "features":
+                for level, some in enumerate(vertices):
+                    n = bricks_per_axis(pyramid.cells_per_axis(level))
+                    n_held += len(with_corners(some.bricks.coords, some.bricks.masks, n))
+            counts.append(
+                Counts(
+                    self._n_per_axis(grid),
+                    sum(len(bricks) for bricks in pyramid.levels),
+                    sum(len(some.bricks) for some in vertices),
+                    sum(some.n for some in vertices),
+                    reader.n_channels,
+                    n_held,
+                )
+            )
+        return needed_bytes(self._n_packed(n_parts), *counts)
+
+    def _n_packed(self, n_parts: int) -> int:
+        return sum(part.bytes for part in self._manifest.parts[self.n_read : n_parts])
+
+    def _n_per_axis(self, grid: Grid) -> int:
+        return bricks_per_axis(self._manifest.resolutions[grid])

@@ -135,7 +135,7 @@ def test_output_that_is_not_empty(
 def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(shells_folder), "--info"]) == 0
     page = capsys.readouterr().out
-    for text in ("vfr-asset 3.1", "64 cells per axis", "4 channels", "at 5 places a ray", "161 parameters",
+    for text in ("vfr-asset 4.0", "64 cells per axis", "4 channels", "at 5 places a ray", "161 parameters",
                  "5 training views of 48x40", "psnr", "4 x 4 x 4 units, from -1, 0, 1 to 3, 4, 5",
                  "head.onnx"):  # fmt: skip
         assert text in page, text
