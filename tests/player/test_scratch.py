@@ -17,6 +17,7 @@ from player.compiled import march
 from player.compiling import compiled
 from player.scratch import check_scratch
 from tests.player.march.contracted_scene import contracted_grid
+from tests.player.march.pyramid_scene import random_scene
 from tests.player.march.test_contracted_march import bumps, some_rays
 from tests.player.march.test_march import random_rays
 
@@ -70,12 +71,16 @@ def arrays_in(argument: Any) -> Iterator[np.ndarray]:
         yield argument
 
 
-@pytest.mark.parametrize("kind", ["box", "space"])
+@pytest.mark.parametrize("kind", ["box", "space", "levels"])
 def test_a_march_looks_beside_every_array_that_it_writes(
     kind: str, asset: Asset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module: Any = march
-    grid = asset.grid if kind == "box" else contracted_grid(bumps, lambda x: np.linalg.norm(x, axis=-1) < 4)
+    grid = {
+        "box": lambda: asset.grid,
+        "space": lambda: contracted_grid(bumps, lambda x: np.linalg.norm(x, axis=-1) < 4),
+        "levels": lambda: random_scene(44, 30, (1, 2, 4), seed=0, contracted=True).grid,
+    }[kind]()
     rays = random_rays(40) if kind == "box" else some_rays(40)
     inner, handed = module._march_rays, []
 

@@ -255,13 +255,13 @@ class _Bake:
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
         rest = bytes_beside_features(arrays, mesh, len(write_cameras(self.model.cameras)), head)
-        sizes = [len(pack_codes(channel)) for channel in arrays.features.T]
+        sizes = [len(pack_codes(channel)) for channel in arrays.features.values[0].T]
         return channels_that_fit(self.config.max_mb, rest, sizes)
 
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
         arrays = layout.arrays(stored.density, stored.features)
-        scale = np.ones(arrays.features.shape[1])
+        scale = np.ones(arrays.features.n_channels)
 
         def head(width: int) -> bytes:
             shape = width, self.choice.head_layers, min(self.choice.head_bands, stored.head.sh_degree)
@@ -291,7 +291,7 @@ class _Bake:
             contracted=layout.contracted,
             near=layout.near,
             density_range=layout.density_range,
-            n_channels=arrays.features.shape[1],
+            n_channels=arrays.features.n_channels,
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
             n_fetches=self.n_fetches,

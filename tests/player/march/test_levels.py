@@ -101,8 +101,13 @@ def _without_gaps(resolution: int, leaves: list[np.ndarray]) -> Pyramid:
     filled_leaves, names = [], set()
     for level, cells in enumerate(leaves):
         all_cells = full(resolution, level)
-        names = {tuple(c >> 1 for c in brick) for brick in names} | {tuple(b) for b in (cells >> 3).tolist()}
-        there = np.array([tuple(brick) in names for brick in (all_cells >> 3).tolist()], bool)
+        names = {tuple(c >> 1 for c in brick) for brick in names} | set(
+            map(tuple, np.unique(cells >> 3, axis=0))
+        )
+        wanted = np.zeros((resolution,) * 3, bool)
+        for brick in names:
+            wanted[brick] = True
+        there = wanted[tuple((all_cells >> 3).T)]
         filled_leaves.append(bricks_of(all_cells[there]))
     return whole_pyramid(resolution, filled_leaves)
 
