@@ -25,7 +25,7 @@ from exporters.extras import needs
 from exporters.progress import silent
 from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
 from player.asset.grid import SparseGrid
-from player.errors import ConfigError, DataError
+from player.errors import ConfigError, DataError, ShapeError
 
 BLOCK = 64
 """Cells along each side of a block, whose codes take 1 MB."""
@@ -60,7 +60,7 @@ def cut_surface(
     """Where a grid's density equals `level`, roughly: `settled` makes the surface of it.
 
     Args:
-        grid: the sparse grid, cubic voxels.
+        grid: the sparse grid, of one level and cubic voxels.
         level: density in 1/model unit; None is `half_opaque`, or the middle of what is stored if
             nothing is that dense.
         progress: called with the share done in (0, 1] after each block.
@@ -69,9 +69,12 @@ def cut_surface(
 
     Raises:
         ConfigError: a level outside the stored densities; the message has their range.
-        DataError: no live cell, or no surface in those that there are.
+        ShapeError: a grid of several levels, which `exporters.surface.one_level` makes one of.
+        DataError: no live cell.
         MissingExtraError: scikit-image is not installed.
     """
+    if grid.n_levels > 1:
+        raise ShapeError(f"surface: expected a grid of one level, got {grid.n_levels} levels")
     code_level = _code_level(grid, level)
     corners, faces = [], []
     n_corners = 0

@@ -38,7 +38,7 @@ def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
     >>> coords, masks, _ = pack_vertices(np.concatenate([corners, [[1, 1, 2]]]))
     >>> codes = np.arange(9, dtype=np.uint8)
     >>> found = from_vertices(VertexBricks(coords, masks, codes), 4)
-    >>> stored_bits(found.pyramid.levels[0].masks).sum(), found.values[0][:, 0].tolist()
+    >>> int(stored_bits(found.pyramid.levels[0].masks).sum()), found.values[0][:, 0].tolist()
     (1, [0, 1, 2, 3, 4, 5, 6, 7])
     """
     coords, masks = np.asarray(stored.coords), np.asarray(stored.masks, np.uint64)

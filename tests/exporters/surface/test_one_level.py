@@ -14,7 +14,7 @@ from exporters.surface.one_level import one_level
 from player.asset.asset import Asset, GridArrays
 from player.asset.bricks import unpack_vertices
 from player.asset.pyramid import Pyramid, PyramidValues
-from player.errors import ConfigError
+from player.errors import ConfigError, ShapeError
 from tests.player.march.pyramid_scene import Reading, filled, random_pyramid, random_scene
 from tests.player.march.test_levels import linear, shapes
 
@@ -77,7 +77,10 @@ def test_the_surface_of_a_ball_is_closed_and_round(opened: Asset, contracted: bo
     manifest = replace(
         opened.manifest, resolution=40, feature_resolution=20, aabb=box, step=0.05, contracted=contracted
     )
-    asset = inner_region(Asset(opened.folder, manifest, GridArrays(stored, features)))
+    whole = Asset(opened.folder, manifest, GridArrays(stored, features))
+    with pytest.raises(ShapeError, match="expected a grid of one level, got 3 levels"):
+        extract_asset_surface(whole.grid)
+    asset = inner_region(whole)
     low, high = manifest.density_range
     level = float(np.exp(low + (high - low) * (160 if contracted else 128) / 255))
     surface = extract_asset_surface(asset.grid, level)
