@@ -24,13 +24,14 @@ from exporters.formats.ply import ply_bytes
 from exporters.options import check_options
 from player import Asset
 from player.app.options import parse as parse_play
-from player.asset.asset import write_asset
+from player.asset.asset import GridArrays, write_asset
 from player.asset.manifest import FILES, Manifest
 from player.cameras.transforms import write_cameras
 from player.cameras.views import read_views
 from player.child import python_command
 from player.render import render
 from tests.exporters.meshes import box
+from vfr_bake.baking.convert import with_coarser_levels
 from vfr_bake.cli import _parse as parse_tyro
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -353,15 +354,25 @@ def _write_as_baked(shells_folder: Path) -> None:
     size = (manifest.view_size[0], manifest.view_size[1])
     cameras = write_cameras(read_views(shells_folder / "cameras.json", size))
     mesh = ply_bytes(box((1.25, 2.25, 3.0), (1.75, 2.5, 4.0)))
-    write_asset(Path("out"), manifest, asset.arrays, asset.read("head.onnx"), mesh, cameras)
+    arrays = GridArrays(
+        with_coarser_levels(asset.arrays.densities, "densities"),
+        with_coarser_levels(asset.arrays.features, "features"),
+    )
+    steps = (1,) * len(arrays.densities.values)  # the features have as many
+    manifest = replace(manifest, parts=(), level_steps=steps, density_steps=steps, feature_steps=steps)
+    write_asset(Path("out"), manifest, arrays, asset.read("head.onnx"), mesh, cameras)
 
 
 def _compare_pixels(names: dict[str, Any]) -> None:
     """The page's own reader against the player, on pixels that show something and one that does not."""
     asset, camera = Asset.open("out"), read_views("out/cameras.json")[0]
     frame = render(asset, camera)
-    assert np.array_equal(names["density_codes"][:, 0], asset.arrays.densities.values[0][:, 0])
-    assert np.array_equal(names["feature_codes"], asset.arrays.features.values[0])
+    for grid in ("densities", "features"):
+        stored = getattr(asset.arrays, grid)
+        assert len(names[grid]) == len(stored.values) > 1
+        for level, vertices, values in zip(names[grid], stored.pyramid.vertices, stored.values, strict=True):
+            assert np.array_equal(level.vertices, vertices.index)
+            assert np.array_equal([level.values[vertex] for vertex in level.vertices], values)
     rays_d = camera.rays()[1].reshape(camera.height, camera.width, 3)
     to_model = np.linalg.inv(asset.world_from_model)
     shown = np.argwhere(frame.opacity > 0.05)

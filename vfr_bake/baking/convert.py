@@ -64,7 +64,7 @@ def convert(
     tell(2, STEPS)
     features = with_coarser_levels(asset.arrays.features, "features")
     tell(3, STEPS)
-    manifest = asset.manifest
+    manifest = replace(asset.manifest, parts=(), files={})
     n_levels = len(densities.values)
     if len(manifest.level_steps) < n_levels:
         steps = (1,) * n_levels
@@ -72,11 +72,8 @@ def convert(
     if len(manifest.feature_steps) < len(features.values):
         manifest = replace(manifest, feature_steps=(1,) * len(features.values))
     head, mesh, cameras = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
-    reports = {name: asset.read(name) for name in manifest.files if name.startswith("report.")}
-    write_asset(
-        new, replace(manifest, parts=(), files={}), GridArrays(densities, features), head, mesh, cameras,
-        force, lambda _: reports,
-    )  # fmt: skip
+    reports = {name: asset.read(name) for name in asset.manifest.files if name.startswith("report.")}
+    write_asset(new, manifest, GridArrays(densities, features), head, mesh, cameras, force, lambda _: reports)
     tell(STEPS, STEPS)
     n_bytes = sum(path.stat().st_size for path in new.iterdir())
     return Converted(asset, n_bytes, time.perf_counter() - begin)

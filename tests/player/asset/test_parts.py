@@ -237,7 +237,7 @@ LIES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda m: structures(m)[0].update(grid="colours"), 'grid: expected "densities" or "features"'),
     (lambda m: structures(m)[0].pop("n_bricks"), "expected the keys"),
     (lambda m: m["parts"][0]["sections"][-1].update(n_channels=99), "expected channels below"),
-    (lambda m: [s.update(level=2, n_bricks=1, n_vertices=8) for s in structures(m) if s["level"] == 1], "each structure once"),
+    (lambda m: [s.update(level=2, n_bricks=1, n_vertices=8) for s in structures(m)], "each structure once"),
     (lambda m: m.update(level_steps=[1]), "level_steps: expected 4, as many as density_steps, got 1"),
     (lambda m: m.update(level_steps=[1, 2, 1, 1]), "powers of two that do not fall"),
     (lambda m: m.update(level_steps=[1, 2, 3, 4]), "powers of two that do not fall"),
