@@ -155,3 +155,25 @@ def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndar
     live = masks & along_z
     live = live & ((live >> shift[2]) | (beyond(live, (0, 1, 0)) << shift[3]))
     return live & np.concatenate([live[:, 1:], beyond(live, (1, 0, 0))[:, :1]], axis=1)
+
+
+def corner_masks(brick_coords: np.ndarray, cells: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[n_bricks, 8] uint64 masks, laid out like `cells`, of the corners of cells, where the bricks hold all
+    of them; `live_cells` of what it returns has these cells again.
+
+    >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
+    >>> index = dense_index(coords, 2)
+    >>> bool((corner_masks(coords, live_cells(coords, masks, index), index) == masks).all())
+    True
+    """
+    zeros = np.zeros((1, BRICK), np.uint64)
+    padded = np.pad(index, ((1, 0),) * 3, constant_values=-1)
+    coords = np.asarray(brick_coords, np.int64) + 1
+
+    def before(words: np.ndarray, offset: tuple[int, int, int]) -> np.ndarray:
+        return np.concatenate([words, zeros])[padded[tuple((coords - offset).T)]]
+
+    one, seven, eight, fifty_six = (np.uint64(n) for n in (1, 7, 8, 56))
+    masks = cells | ((cells & ~_Z_LAST) << one) | ((before(cells, (0, 0, 1)) & _Z_LAST) >> seven)
+    masks = masks | (masks << eight) | (before(masks, (0, 1, 0)) >> fifty_six)
+    return masks | np.concatenate([before(masks, (1, 0, 0))[:, 7:], masks[:, :7]], axis=1)

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.bricks import bricks_per_axis, dense_index, live_cells, stored_bits
-from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.asset.bricks import bricks_per_axis, corner_masks, dense_index, live_cells, stored_bits
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues, Vertices
 
 
 class VertexBricks(NamedTuple):
@@ -44,14 +44,13 @@ def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
     coords, masks = np.asarray(stored.coords), np.asarray(stored.masks, np.uint64)
     values = stored.values[:, None] if stored.values.ndim == 1 else stored.values
     index = dense_index(coords, bricks_per_axis(resolution))
-    cells = Bricks(coords, live_cells(coords, masks, index)).without_empty()
-    pyramid = Pyramid(resolution, (cells,))
-    kept = pyramid.vertices[0].bricks
-    where = index[tuple(kept.coords.astype(np.int64).T)]
-    left = np.zeros_like(masks)
-    left[where] = kept.masks
-    if not np.array_equal(left, masks):
-        values = values[stored_bits(left)[stored_bits(masks)]]
+    live = live_cells(coords, masks, index)
+    pyramid = Pyramid(resolution, (Bricks(coords, live).without_empty(),))
+    kept = corner_masks(coords, live, index)
+    vertices = Bricks(coords, kept).without_empty()
+    vars(pyramid)["vertices"] = (Vertices(vertices, np.zeros_like(vertices.masks)),)  # they are known already
+    if not np.array_equal(kept, masks):
+        values = values[stored_bits(kept)[stored_bits(masks)]]
     return PyramidValues(pyramid, (values,))
 
 

@@ -15,6 +15,7 @@ from player.asset.bricks import (
 )
 from player.asset.density import decode_density, encode_density
 from player.asset.grid import MAX_DISTANCE, build_grid
+from player.asset.pyramid import Pyramid
 from player.asset.single_level import VertexBricks, from_vertices
 
 RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
@@ -59,6 +60,21 @@ def test_packing_round_trip_and_live_cells(resolution: int, share: float) -> Non
     for i, j, k in np.ndindex(2, 2, 2):
         expected &= dense[i : i + resolution, j : j + resolution, k : k + resolution]
     assert (found[:resolution, :resolution, :resolution] == expected).all() and found.sum() == expected.sum()
+
+
+@pytest.mark.parametrize("resolution", [1, 7, 8, 20])
+@pytest.mark.parametrize("share", [0.0, 0.8, 0.97, 1.0])
+def test_vertices_become_a_pyramid_of_one_level(resolution: int, share: float) -> None:
+    """Its vertices are those that a pyramid finds by itself, each with its own code."""
+    vertices = np.argwhere(random_vertices(resolution, share, seed=resolution))
+    coords, masks, order = pack_vertices(vertices)
+    codes = np.arange(len(vertices)).astype(np.uint16)
+    found = from_vertices(VertexBricks(coords, masks, codes), resolution)
+    (own,), (again,) = found.pyramid.vertices, Pyramid(resolution, found.pyramid.levels).vertices
+    assert own.n == again.n == len(found.values[0]) and not own.on_border.any()
+    assert (own.bricks.coords == again.bricks.coords).all() and (own.bricks.masks == again.bricks.masks).all()
+    assert (vertices[order][found.values[0][:, 0]] == own.index).all()
+    assert own.n == len(vertices) if share in (0, 1) else resolution < 20 or 0 < own.n < len(vertices)
 
 
 def test_one_missing_corner_kills_eight_cells() -> None:

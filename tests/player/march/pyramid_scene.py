@@ -226,3 +226,23 @@ def random_scene(
     features = filled(coarse, values(coarse, 3, 100), (-127, 127), np.int8)
     step = 4 / 2 / resolution if not contracted else 2 / resolution
     return PyramidScene(dense, features, step, level_steps, contracted)
+
+
+def sparse_scene(level_steps: tuple[int, ...], seed: int, contracted: bool) -> PyramidScene:
+    """Small cubes of noise, far apart in a fine grid."""
+    random, resolution = np.random.default_rng(seed), 300
+    leaves = []
+    for level in range(len(level_steps)):
+        n_cells = -(-resolution // 2**level)
+        corners = random.integers(0, n_cells, (30, 1, 3))
+        cells = (corners + np.argwhere(np.ones((5, 5, 5)))).reshape(-1, 3)
+        leaves.append(bricks_of(cells[(cells < n_cells).all(axis=1)]))
+    pyramid = whole_pyramid(resolution, leaves)
+    codes = [random.uniform(0, 255, (v.n, 1)) for v in pyramid.vertices]
+    features = [random.uniform(-127, 127, (v.n, 3)) for v in pyramid.vertices]
+    dense, coarse = (
+        filled(pyramid, codes, (0, 255), np.uint8),
+        filled(pyramid, features, (-127, 127), np.int8),
+    )
+    step = (2 if contracted else 4) / resolution
+    return PyramidScene(dense, coarse, step, level_steps, contracted, (0.0, 6.0))

@@ -11,7 +11,7 @@ from player.asset.pyramid import Pyramid, whole_pyramid
 from player.compiled import march as march_compiled
 from player.march import march
 from player.march.march import MIN_OPACITY
-from tests.player.march.pyramid_scene import PyramidScene, ball, bricks_of, filled, random_scene
+from tests.player.march.pyramid_scene import PyramidScene, ball, bricks_of, filled, random_scene, sparse_scene
 
 MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
 STEPS = [(1,), (1, 1), (1, 2), (1, 1, 2), (2, 2, 4), (1, 4, 4, 8)]
@@ -155,6 +155,22 @@ def test_numba_is_numpy_on_many_rays() -> None:
             same = a.n_density_samples == b.n_density_samples
             assert (~same).sum() <= 5, "cells are the same but where cosines are rounded differently"
             np.testing.assert_allclose(a.opacity[same], b.opacity[same], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
+@pytest.mark.parametrize("steps", [(1,), (4,), (1, 16), (1, 1, 2), (1, 1, 1, 1, 2, 4, 4, 16)])
+def test_what_is_far_apart_is_jumped_to(steps: tuple[int, ...], contracted: bool) -> None:
+    """Both marches, and the loop that jumps nowhere, on rays that meet something."""
+    scene = sparse_scene(steps, len(steps), contracted)
+    rays_o, rays_d = rays(2000, seed=2)
+    a, b = (module.march(scene.grid, rays_o, rays_d, 3) for module in (march, march_compiled))
+    assert (a.n_density_samples == b.n_density_samples).all()
+    np.testing.assert_allclose(a.opacity, b.opacity, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(a.features, b.features, rtol=0, atol=0.02)
+    some = np.flatnonzero(a.n_density_samples)[:8]
+    expected = [scene.march(rays_o[i], rays_d[i], 3) for i in some]
+    assert len(some) == 8 and a.n_density_samples[some].tolist() == [taken for _, _, taken, _ in expected]
+    np.testing.assert_allclose(a.opacity[some], [opacity for opacity, *_ in expected], rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("module", MARCHES)
