@@ -25,6 +25,7 @@ from player.app.info import facts, page
 from player.asset.asset import Asset, read_manifest
 from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
+from player.asset.single_level import VertexBricks
 from player.asset.version_3.packing import pack_codes, pack_masks
 from player.asset.version_3.unpacking import PLACES, read_arrays
 from player.compiling import available
@@ -32,7 +33,7 @@ from player.errors import FormatError
 from player.render import March, Renderer
 from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value
 from tests.reliability.fuzz.targets import Target, small_view
-from tests.vertex_grids import arrays_of
+from tests.version_3 import write_version_3
 
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19
@@ -41,8 +42,7 @@ MARCHES: tuple[March, ...] = ("numpy", "numba") if available() else ("numpy",)
 
 
 def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
-    """A ball and a wall, as small as they can be."""
-    from player.asset.asset import write_asset
+    """A ball and a wall, as small as they can be, in version 3.1."""
     from player.asset.manifest import Manifest
 
     axis = np.arange(RESOLUTION + 1)
@@ -58,10 +58,9 @@ def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
         generator="fuzz", resolution=RESOLUTION, feature_resolution=RESOLUTION, step=0.1,
         density_range=(-2, 4), n_channels=4, view_size=(8, 8), provenance={"bake": {"preset": "fast"}},
     )  # fmt: skip
-    stored = (coords, masks, density), (coarse_coords, coarse_masks, features)
-    arrays = arrays_of(*stored, (RESOLUTION, RESOLUTION))
-    write_asset(folder, manifest, arrays, head, mesh, cameras)
-    return folder
+    stored = VertexBricks(coords, masks, density), VertexBricks(coarse_coords, coarse_masks, features)
+    files = {"head.onnx": head, "mesh.ply": mesh, "cameras.json": cameras}
+    return write_version_3(folder, manifest, *stored, files)
 
 
 class BrokenAsset:
@@ -71,9 +70,16 @@ class BrokenAsset:
         self.folder = Path(shutil.copytree(whole, folder))
         self._whole = {path.name: path.read_bytes() for path in whole.iterdir()}
         self.manifest: dict[str, Any] = json.loads(self._whole["manifest.json"])
-        stored = read_arrays(whole, read_manifest(whole), 1 << 40)
-        self.arrays: Arrays = dict(zip(PLACES, (*stored[0], *stored[1]), strict=True))
+        self.arrays: Arrays = {}
+        if self.manifest["version"][0] == 3:
+            stored = read_arrays(whole, read_manifest(whole), 1 << 40)
+            self.arrays = dict(zip(PLACES, (*stored[0], *stored[1]), strict=True))
         self._changed: set[str] = set()
+
+    @property
+    def version(self) -> str:
+        """What tells its targets from those of the other version."""
+        return "" if self.manifest["version"][0] == 3 else " of version 4"
 
     def bytes_of(self, name: str) -> bytes:
         return self._whole[name]
@@ -224,14 +230,14 @@ def _packed(name: str, array: np.ndarray, random: np.random.Generator) -> bytes:
     return data
 
 
-def _settings(document: dict[str, Any], random: np.random.Generator) -> dict[str, Any]:
+def other_settings(document: dict[str, Any], random: np.random.Generator) -> dict[str, Any]:
     """Values that the specification allows, but that are not what the arrays were made with."""
     choices: dict[str, tuple[Any, ...]] = {
         "resolution": (1, 7, 8, 15, 16, 18, 20, 23, 24, 100, 400),
         "feature_resolution": (1, 7, 8, 16, 18, 20, 23, 24, 100, 400),
         "n_channels": (1, 2, 3, 5, 8, 16, 1024),
         "step": (1e-3, 0.01, 0.5, 3.0, 1e9),
-        "n_fetches": (0, 1, 2, 64, 1024),
+        ("n_samples" if document["version"][0] == 3 else "n_fetches"): (0, 1, 2, 64, 1024),
         "density_range": ((-80, 80), (79, 80), (-80, -79), (0, 1e-30)),
         "aabb": (((-1e9,) * 3, (1e9,) * 3), ((0, 0, 0), (1e-9, 1, 1)), ((-1, -1, -1), (1, 1, 1e-3))),
         "background": ((0, 0, 0),),
@@ -267,7 +273,7 @@ def _target_of_array(asset: BrokenAsset, name: str) -> Target:
         if share < 0.2:  # the file's bytes
             asset.write({PLACES[name]: broken_bytes(asset.bytes_of(PLACES[name]), random)})
             return
-        document = _settings(asset.manifest, random) if random.random() < 0.4 else dict(asset.manifest)
+        document = other_settings(asset.manifest, random) if random.random() < 0.4 else dict(asset.manifest)
         if share < 0.45:
             arrays[name] = _rows(arrays[name], random)
         else:
@@ -285,7 +291,7 @@ def _target_of_array(asset: BrokenAsset, name: str) -> Target:
 # --- what is no array ---
 
 
-def _special(asset: BrokenAsset) -> Target:
+def special_files(asset: BrokenAsset) -> Target:
     """A link, a pipe, a device, a socket, a folder or a terabyte in place of any file."""
 
     def prepare(random: np.random.Generator) -> None:
@@ -330,10 +336,10 @@ def _special(asset: BrokenAsset) -> Target:
             files = asset.manifest["files"] | {name: entry}
             asset.place("manifest.json").write_text(json.dumps(asset.manifest | {"files": files}))
 
-    return Target("special files", prepare, asset.read)
+    return Target(f"special files{asset.version}", prepare, asset.read)
 
 
-def _manifest(asset: BrokenAsset) -> Target:
+def broken_manifest(asset: BrokenAsset) -> Target:
     """Values, and the structure: keys that are renamed, repeated, in another order, nested."""
     data = asset.bytes_of("manifest.json")
 
@@ -346,7 +352,7 @@ def _manifest(asset: BrokenAsset) -> Target:
                 place.write_bytes(broken_json(data, random))
                 return
             case 2:
-                asset.write({}, _settings(asset.manifest, random))
+                asset.write({}, other_settings(asset.manifest, random))
                 return
             case 3:  # a key twice, with two values
                 key, value = pairs[random.integers(0, len(pairs))]
@@ -366,7 +372,7 @@ def _manifest(asset: BrokenAsset) -> Target:
             parse_manifest((asset.folder / "manifest.json").read_bytes(), "manifest.json")
         asset.read()
 
-    return Target("manifest", prepare, read)
+    return Target(f"manifest{asset.version}", prepare, read)
 
 
 def _mesh(asset: BrokenAsset) -> Target:
@@ -386,5 +392,5 @@ def _mesh(asset: BrokenAsset) -> Target:
 def asset_targets(asset: BrokenAsset) -> list[Target]:
     """All of them; they share one folder."""
     assert bricks_per_axis(RESOLUTION) == 3
-    makers: list[Callable[[BrokenAsset], Target]] = [_manifest, _special, _mesh]
+    makers: list[Callable[[BrokenAsset], Target]] = [broken_manifest, special_files, _mesh]
     return [*(make(asset) for make in makers), *(_target_of_array(asset, name) for name in PLACES)]

@@ -27,6 +27,7 @@ from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.fuzz.assets import BrokenAsset, asset_targets, whole_asset
 from tests.reliability.fuzz.data import camera_targets, colmap_targets, model_target, picture_target
 from tests.reliability.fuzz.heads import head_targets
+from tests.reliability.fuzz.parts import parts_targets, whole_parts
 from tests.reliability.fuzz.sections import section_targets
 from tests.reliability.fuzz.targets import Target, written
 
@@ -90,6 +91,7 @@ def targets(work: Path) -> list[Target]:
     whole = whole_asset(work / "whole", head, ply_bytes(mesh), cameras_bytes(2))
     return [
         *asset_targets(BrokenAsset(whole, work / "asset")),
+        *parts_targets(BrokenAsset(whole_parts(work / "whole_parts", whole), work / "parts")),
         *camera_targets(work),
         *colmap_targets(work),
         *head_targets(work, head),
