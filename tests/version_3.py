@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 
+from player.asset.asset import Asset
 from player.asset.manifest import FileEntry, Manifest, manifest_bytes
-from player.asset.single_level import VertexBricks
+from player.asset.single_level import VertexBricks, to_vertices
 from player.asset.version_3.packing import pack_codes, pack_masks
 from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
 
@@ -31,6 +33,16 @@ def write_version_3(
         (folder / name).write_bytes(data)
     (folder / "manifest.json").write_bytes(manifest_3(manifest, files))
     return folder
+
+
+def as_version_3(folder: Path) -> Path:
+    """Make the asset in a folder, of one level, one of version 3.1."""
+    asset = Asset.open(folder)
+    names = (name for name in asset.manifest.files if not name.startswith("part_"))
+    files = {name: asset.read(name) for name in names}
+    shutil.rmtree(folder)
+    stored = (to_vertices(grid) for grid in (asset.arrays.densities, asset.arrays.features))
+    return write_version_3(folder, asset.manifest, *stored, files)
 
 
 def manifest_3(manifest: Manifest, files: dict[str, bytes]) -> bytes:

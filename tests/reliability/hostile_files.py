@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from player.asset.version_3.packing import pack_codes, pack_masks
+from tests.version_3 import as_version_3
 
 BUDGET = 0.3
 """Gigabytes that the commands may take for the asset."""
@@ -104,6 +105,7 @@ def bomb(resolution: int, n_channels: int) -> Callable[[Path], None]:
     right."""
 
     def make(folder: Path) -> None:
+        as_version_3(folder)
         n = -(-(resolution + 1) // 8)
         coords = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         masks = np.full((len(coords), 8), 2**64 - 1, np.uint64)
@@ -124,6 +126,7 @@ def bomb(resolution: int, n_channels: int) -> Callable[[Path], None]:
 
 def scattered(folder: Path) -> None:
     """One vertex a brick of features: six bytes each on the disk, 23 kB each where a march looks them up."""
+    as_version_3(folder)
     resolution, n = 1023, 128
     axis = np.arange(0, n, 2)
     coords = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) + 1
@@ -134,6 +137,17 @@ def scattered(folder: Path) -> None:
     (folder / "feature_masks.bits").write_bytes(pack_masks(masks))
     (folder / "features.codes").write_bytes(pack_codes(np.zeros((len(coords), 4), np.int8)))
     vouch(folder, lambda document: document.update(feature_resolution=resolution))
+
+
+def stated(folder: Path) -> None:
+    """A manifest that states bricks and vertices which no section has, and that fill any memory."""
+
+    def many(document: dict[str, Any]) -> None:
+        document.update(resolution=2048)
+        section = document["parts"][0]["sections"][0]
+        section.update(n_bricks=256**3, n_vertices=2**31 - 1)
+
+    vouch(folder, many)
 
 
 def nested(folder: Path) -> None:
@@ -163,11 +177,12 @@ def obeyed_in_errors(folder: Path) -> None:
 
 RECIPES: dict[str, Callable[[Path], None]] = {
     "a terabyte of manifest": sparse("manifest.json"),
-    "a terabyte of codes": sparse("features.codes"),
-    "a terabyte of codes, vouched for": sparse("features.codes", vouched=True),
+    "a terabyte of a part": sparse("part_0.bin"),
+    "a terabyte of a part, vouched for": sparse("part_0.bin", vouched=True),
+    "vertices that are only stated": stated,
     "a terabyte of mesh, vouched for": sparse("mesh.ply", vouched=True),
     "a manifest that never ends": device("manifest.json"),
-    "codes that never end": device("density.codes"),
+    "a part that never ends": device("part_0.bin"),
     "a head that never ends": device("head.onnx"),
     "a manifest that is a pipe": pipe("manifest.json"),
     "cameras that are a pipe": pipe("cameras.json"),

@@ -27,6 +27,7 @@ from player.errors import ConfigError, DataError, FormatError
 from player.files.images import png_bytes, read_key
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.hostile_files import vouch
+from tests.version_3 import as_version_3
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.data.pictures import read_picture
 from vfr_bake.field.field import VfrField
@@ -78,7 +79,7 @@ def test_tensors_where_a_model_has_plain_values(tmp_path: Path) -> None:
 
 def test_an_asset_without_a_feature(broken: Path) -> None:
     """Rays that hit something found no row to take."""
-    asset = Asset.open(broken)
+    asset = Asset.open(as_version_3(broken))
     _, features = read_arrays(asset.folder, asset.manifest, 1 << 40)
     for name, data in (
         ("feature_masks.bits", pack_masks(np.zeros_like(features.masks))),

@@ -147,17 +147,17 @@ def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(broken_folder), "--check"]) == 0
-    assert len(re.findall(r"^ok ", capsys.readouterr().out, re.M)) == 9
+    assert len(re.findall(r"^ok ", capsys.readouterr().out, re.M)) == 4
     data = bytearray((broken_folder / "mesh.ply").read_bytes())
     data[0] ^= 1
     (broken_folder / "mesh.ply").write_bytes(bytes(data))
-    (broken_folder / "density.codes").unlink()
+    (broken_folder / "part_0.bin").unlink()
     assert cli.main([str(broken_folder), "--check"]) == 1
     printed = capsys.readouterr()
-    assert len(re.findall(r"^ok ", printed.out, re.M)) == 7
+    assert len(re.findall(r"^ok ", printed.out, re.M)) == 2
     assert re.search(r"^FAILED  mesh\.ply .*sha256", printed.out, re.M)
-    assert re.search(r"^FAILED  density\.codes .*no such file", printed.out, re.M)
-    assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 9 files failed\n"
+    assert re.search(r"^FAILED  part_0\.bin .*no such file", printed.out, re.M)
+    assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 4 files failed\n"
     assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
     assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"
 

@@ -1,0 +1,90 @@
+"""`vfr-bake --convert`: the same values and pictures, in the current version of the format."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset
+from player.asset.pyramid import coarser
+from player.cameras.views import asset_cameras
+from player.render import Renderer
+from tests.version_3 import as_version_3
+from vfr_bake.cli import bake_main
+
+
+@pytest.fixture
+def old(shells_folder: Path, tmp_path: Path) -> Path:
+    """The small asset of the tests in version 3.1, with a report."""
+    folder = as_version_3(Path(shutil.copytree(shells_folder, tmp_path / "old")))
+    data = b"{}"
+    (folder / "report.json").write_bytes(data)
+    document = json.loads((folder / "manifest.json").read_text())
+    document["files"]["report.json"] = {"bytes": 2, "sha256": hashlib.sha256(data).hexdigest()}
+    (folder / "manifest.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_the_finest_level_and_every_other_file_stay(
+    old: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new"
+    assert bake_main(["--convert", str(old), str(new), "--json", "-"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["version_before"] == [3, 1] and told["megabytes_before"] > 0
+    one, other = Asset.open(old, verify=True), Asset.open(new, verify=True)
+    assert other.manifest.version == (4, 0) and len(other.manifest.parts) > 1
+    for grid in ("densities", "features"):
+        before, after = getattr(one.arrays, grid), getattr(other.arrays, grid)
+        assert np.array_equal(before.values[0], after.values[0])
+        levels = after.pyramid.levels
+        assert len(levels) == 3 and after.pyramid.cells_per_axis(2) == 16
+        for fine, coarse in pairwise(levels):
+            assert np.array_equal(coarser(fine).masks, coarse.masks)
+        for fine, coarse in ((0, 1), (1, 2)):
+            vertices = after.pyramid.vertices
+            rows = vertices[fine].rows(vertices[coarse].index * 2)
+            assert np.array_equal(after.values[fine][rows[rows >= 0]], after.values[coarse][rows >= 0])
+    for name in ("head.onnx", "mesh.ply", "cameras.json", "report.json"):
+        assert one.read(name) == other.read(name)
+    keys = ("generator", "aabb", "step", "n_fetches", "density_range", "background", "provenance", "near")
+    assert all(getattr(one.manifest, key) == getattr(other.manifest, key) for key in keys)
+    camera = asset_cameras(one)[0]
+    with Renderer(one, 1, "numpy") as a, Renderer(other, 1, "numpy") as b:
+        x, y = a.render(camera), b.render(camera)
+    assert np.array_equal(x.opacity, y.opacity) and np.abs(x.rgb - y.rgb).max() < 0.02
+    assert np.square(x.rgb - y.rgb).mean() < 1e-7
+
+
+def test_converting_again_changes_nothing(old: Path, tmp_path: Path) -> None:
+    for before, after in ((old, "a"), (tmp_path / "a", "b")):
+        assert bake_main(["--convert", str(before), str(tmp_path / after)]) == 0
+    for path in (tmp_path / "a").iterdir():
+        assert (tmp_path / "b" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_what_cannot_be_converted(old: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    new = tmp_path / "new"
+    new.mkdir()
+    assert bake_main(["--convert", str(old), str(new)]) == 1
+    assert "new: already exists: add --force" in capsys.readouterr().err
+    assert bake_main(["--convert", str(old), str(new), "--force", "--preset", "fast"]) == 1
+    assert "--convert: expected no other setting than --max-memory, got ['preset']" in capsys.readouterr().err
+    assert bake_main(["--convert", str(tmp_path / "none"), str(tmp_path / "x")]) == 1
+    assert "expected the folder of an asset, got nothing" in capsys.readouterr().err
+    (old / "features.codes").write_bytes(b"short")
+    assert bake_main(["--convert", str(old), str(new), "--force"]) == 1
+    assert "features.codes: size: expected" in capsys.readouterr().err
+    assert list(new.iterdir()) == []
+
+
+def test_the_help_says_what_it_is_for(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        bake_main(["--help"])
+    assert "vfr-bake --convert old/ new/" in " ".join(capsys.readouterr().out.split())
