@@ -44,8 +44,8 @@ class GridArrays:
 
     def check(self, manifest: Manifest) -> None:
         """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
-        for grid, stored in (("densities", self.densities), ("features", self.features)):
-            _check_grid(grid, stored, manifest)
+        _check_grid("densities", self.densities, manifest)
+        _check_grid("features", self.features, manifest)
 
 
 def _check_grid(grid: Grid, stored: PyramidValues, manifest: Manifest) -> None:

@@ -199,7 +199,9 @@ class PartsReader:
         ]
         with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
             levels = {(stored.section.grid, stored.section.level) for _, stored in symbols}
-            rows = {key: pool.submit(self._grids[key[0]].rows_of, key[1]) for key in sorted(levels)}
+            rows = {
+                (grid, level): pool.submit(self._grids[grid].rows_of, level) for grid, level in sorted(levels)
+            }
             wait(rows.values())
             decoded = [
                 pool.submit(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +86,7 @@ def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
     A coarser vertex has the value of the finer one at its place; where none is stored there, the mean of
     those around it.
     """
-    if len(stored.values) > 1:
+    if len(stored.pyramid.levels) > 1:
         return stored
     resolution = stored.pyramid.resolution
     none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
@@ -108,8 +108,8 @@ def _coarser(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray
     out = values[rows]
     alone = np.flatnonzero(rows < 0)
     total, n = np.zeros((len(alone), values.shape[1])), np.zeros((len(alone), 1))
-    for offset in np.ndindex(3, 3, 3):
-        beside = fine.rows(places[alone] + np.array(offset, np.int32) - 1)
+    for offset in product((-1, 0, 1), repeat=3):
+        beside = fine.rows(places[alone] + np.array(offset, np.int32))
         there = beside >= 0
         total[there] += values[beside[there]]
         n[there] += 1

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from player.app.info import facts, page
 from player.asset.asset import Asset, GridArrays, write_asset
-from tests.reliability.fuzz.assets import BrokenAsset, broken_manifest, other_settings, special_files
+from tests.reliability.fuzz.assets import BrokenAsset, broken_manifest, other_settings, play, special_files
 from tests.reliability.fuzz.broken import broken_bytes, broken_value
 from tests.reliability.fuzz.targets import Target
 
@@ -29,6 +30,7 @@ def whole_parts(folder: Path, old: Path) -> Path:
     manifest = replace(asset.manifest, level_steps=steps, density_steps=steps, feature_steps=steps)
     rest = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
     write_asset(folder, manifest, arrays, *rest)
+    play(Asset.open(folder))  # what is compiled is read now, and not while an input is watched
     return folder
 
 
@@ -98,9 +100,6 @@ def _lax(asset: BrokenAsset) -> Target:
     made = _parts(asset)
 
     def read() -> None:
-        from player.app.info import facts, page
-        from tests.reliability.fuzz.assets import play
-
         for opened in Asset.growing(asset.folder):
             assert opened.missing is None or opened.missing.count("\n") == 0
             play(opened)
