@@ -138,8 +138,9 @@ class Asset:
 
         Arguments and errors as `open`; the assets yielded share what has not changed.
 
-        >>> [asset.n_parts for asset in Asset.growing("out/")]
-        [1, 2, 3, 4]
+        >>> for asset in Asset.growing("out/"):
+        ...     print(asset.n_parts, asset.missing)
+        1 None
         """
         opening = _Opening(Path(folder), verify, max_memory)
         for n_parts in range(1, max(len(opening.manifest.parts), 1) + 1):

@@ -30,7 +30,10 @@ def whole_parts(folder: Path, old: Path) -> Path:
     manifest = replace(asset.manifest, level_steps=steps, density_steps=steps, feature_steps=steps)
     rest = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
     write_asset(folder, manifest, arrays, *rest)
-    play(Asset.open(folder))  # what is compiled is read now, and not while an input is watched
+    opened = Asset.open(folder)
+    play(opened)  # what is compiled is read now, and not while an input is watched
+    space = replace(opened.manifest, contracted=True, aabb=((-2.0,) * 3, (2.0,) * 3), step=0.05)
+    play(replace(opened, manifest=space))
     return folder
 
 
