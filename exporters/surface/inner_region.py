@@ -43,7 +43,8 @@ def inner_region(asset: Asset, max_memory: float | None = None) -> Asset:
             f"{asset.folder}: expected an unbounded scene with something in its unit ball, got all "
             f"{stored.first_rows[-1]} vertices outside: surroundings without end are not exported"
         )
-    manifest = replace(m, contracted=False, near=0.0)
+    one = {"level_steps": (1,), "density_steps": (1,), "parts": ()}
+    manifest = replace(m, contracted=False, near=0.0, **one)
     return Asset(asset.folder, manifest, GridArrays(densities, asset.arrays.features))
 
 

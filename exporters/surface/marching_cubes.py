@@ -70,7 +70,7 @@ def cut_surface(
     Raises:
         ConfigError: a level outside the stored densities; the message has their range.
         ShapeError: a grid of several levels, which `exporters.surface.one_level` makes one of.
-        DataError: no live cell.
+        DataError: no live cell, or no surface in those that there are.
         MissingExtraError: scikit-image is not installed.
     """
     if grid.n_levels > 1:

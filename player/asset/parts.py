@@ -198,10 +198,11 @@ class PartsReader:
             if stored.section.kind == "symbols"
         ]
         with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
-            levels = {(stored.section.grid, stored.section.level) for _, stored in symbols}
-            rows = {
-                (grid, level): pool.submit(self._grids[grid].rows_of, level) for grid, level in sorted(levels)
-            }
+            rows = {}
+            for section in (stored.section for _, stored in symbols):
+                if (section.grid, section.level) not in rows:
+                    found = pool.submit(self._grids[section.grid].rows_of, section.level)
+                    rows[section.grid, section.level] = found
             wait(rows.values())
             decoded = [
                 pool.submit(

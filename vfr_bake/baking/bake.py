@@ -22,13 +22,12 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
-from player.asset.version_3.packing import pack_codes
 from player.cameras.transforms import write_cameras
-from player.errors import ConfigError, TrainingError
+from player.errors import ConfigError
 from player.files.files import check_target
 from player.head.head import Head
 from vfr_bake import __version__
-from vfr_bake.baking.cells import find_cells
+from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
     Layout,
@@ -43,9 +42,9 @@ from vfr_bake.baking.grids import (
 from vfr_bake.baking.head import fold_head, runner, small_head
 from vfr_bake.baking.held_out import BETWEEN, HeldOut, views_between
 from vfr_bake.baking.limits import (
-    bytes_beside_features,
     channels_that_fit,
     check_budget,
+    coded_bytes,
     file_sizes,
     frame_ms,
     keep_to_time,
@@ -63,10 +62,11 @@ from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
+LEAST_REFINED = 0.4
+"""Share of a bake's minutes that refinement may take however long everything before it took: a small head
+that is hardly trained is worse than a bake that takes longer."""
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
-PLAYS_NOTHING = 6.0
-"""Loss in dB over which the asset does not show what the model shows."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,8 @@ class _Bake:
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
-        left = REFINED_BY * 60 * self.choice.minutes - (time.monotonic() - self._begun)
+        seconds = 60 * self.choice.minutes
+        left = max(REFINED_BY * seconds - (time.monotonic() - self._begun), LEAST_REFINED * seconds)
         tuning = Tuning(self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, teacher)
@@ -178,17 +179,18 @@ class _Bake:
             )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        n_cells = int(np.count_nonzero(visible)) * (plan.resolutions.features // len(visible)) ** 3
-        if n_cells > plan.most_cells:
-            raise TrainingError(
-                f"bake: cells: expected at most {plan.most_cells:,}, which fit into "
-                f"{self.config.max_memory:g} GB of memory, got {n_cells:,} of "
-                f"{plan.resolutions.features**3:,}: is the model "
-                "a fog? Lower --resolution, raise --weight-floor, or allow more by --max-memory"
+        fitted = fit_cells(visible, plan.resolutions, plan.most_cells)
+        unbounded, resolutions = model.field.config.unbounded, fitted.resolutions
+        if resolutions != plan.resolutions:
+            self.left_out["resolution"] = (
+                f"{resolutions.densities} cells along an axis for densities, {resolutions.features} for "
+                f"features, in place of {plan.resolutions.densities} and {plan.resolutions.features}: more "
+                f"do not fit into {self.config.max_memory:g} GB of memory; part of the loss after 'grid'"
             )
+            step = lattice_step(resolutions.densities) if unbounded else step
         near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
-        layout = make_layout(visible, step, plan.resolutions, model.field.config.unbounded, near)
-        return layout, plan.n_rays(n_cells)
+        layout = make_layout(fitted.cells, step, resolutions, unbounded, near, self.choice.density_step)
+        return layout, plan.n_rays(fitted.n_cells)
 
     def _mesh(self, asset: Asset, sizes: dict[str, int]) -> tuple[TriangleMesh, Removed]:
         """The mesh of an asset that has everything else, whose files have these sizes."""
@@ -251,16 +253,18 @@ class _Bake:
         if self.config.max_mb is None:
             return features.shape[1]
         arrays = layout.arrays(density, features)
+        densities = coded_bytes(arrays.densities, "densities", layout.density_step)
+        coded = coded_bytes(arrays.features, "features", 1)
         mesh = mesh_bytes(round(self.config.max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
-        rest = bytes_beside_features(arrays, mesh, len(write_cameras(self.model.cameras)), head)
-        sizes = [len(pack_codes(channel)) for channel in arrays.features.values[0].T]
-        return channels_that_fit(self.config.max_mb, rest, sizes)
+        rest = densities.structure + sum(densities.channels) + coded.structure
+        rest += mesh + len(write_cameras(self.model.cameras)) + head
+        return channels_that_fit(self.config.max_mb, rest, coded.channels)
 
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
-        arrays = layout.arrays(stored.density, stored.features)
+        arrays = layout.finest(stored.density, stored.features)
         scale = np.ones(arrays.features.n_channels)
 
         def head(width: int) -> bytes:
@@ -291,6 +295,9 @@ class _Bake:
             contracted=layout.contracted,
             near=layout.near,
             density_range=layout.density_range,
+            level_steps=(1,) * len(arrays.densities.values),
+            density_steps=(layout.density_step,) * len(arrays.densities.values),
+            feature_steps=(1,) * len(arrays.features.values),
             n_channels=arrays.features.n_channels,
             view_size=(camera.width, camera.height),
             world_from_model=tuple(tuple(row) for row in model.world_from_model.tolist()),
@@ -309,12 +316,6 @@ class _Bake:
         asked."""
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
-        if last.loss.db > PLAYS_NOTHING:
-            raise TrainingError(
-                f"bake: loss: expected written files that show what the model shows, got {last.psnr:.1f} dB "
-                "to its pictures: it is empty or a fog, or too little is stored: train longer, or lower "
-                "--weight-floor"
-            )
         megabytes = sum(n_bytes.values()) / 1e6
         timed = self.config.target_ms is not None
         ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None

@@ -73,6 +73,51 @@ class StoredCells(NamedTuple):
     """What is not stored, in words."""
 
 
+class FittedCells(NamedTuple):
+    """Cells of which no more are stored than there is room for."""
+
+    cells: np.ndarray
+    """[n, n, n] bool: cells of the features' grid, or blocks of them."""
+    resolutions: Resolutions
+    n_cells: int
+    """Cells of the features' grid, roughly."""
+
+
+def fit_cells(cells: np.ndarray, resolutions: Resolutions, most: int) -> FittedCells:
+    """The finest grids of which no more than `most` cells of the features lie in `cells`, [n, n, n] bool over
+    the same box: those asked for, or coarser ones.
+
+    >>> fog = np.ones((8, 8, 8), bool)
+    >>> fit_cells(fog, Resolutions(20, 16), 5000)[1:]
+    (Resolutions(densities=20, features=16), 4096)
+    >>> fit_cells(fog, Resolutions(20, 16), 1000)[1:]
+    (Resolutions(densities=12, features=10), 1000)
+    """
+    while True:
+        n = int(np.count_nonzero(cells))
+        finest = int(len(cells) * (most / n) ** (1 / 3))
+        if finest >= resolutions.features:
+            return FittedCells(cells, resolutions, int(n * (resolutions.features / len(cells)) ** 3))
+        if finest >= len(cells):
+            densities = resolutions.densities * finest // resolutions.features
+            return FittedCells(cells, Resolutions(densities, finest), int(n * (finest / len(cells)) ** 3))
+        cells = _halved(cells)
+
+
+def _halved(cells: np.ndarray) -> np.ndarray:
+    """Half as many cells along each axis, rounded up, which are those that overlap one of `cells` [n, n, n]
+    bool."""
+    n, half = len(cells), -(-len(cells) // 2)
+    first = np.arange(half) * n // half
+    last = -(-(np.arange(half) + 1) * n // half)
+    for axis in range(3):
+        reached = [
+            cells.take(np.minimum(first + k, last - 1), axis) for k in range(int((last - first).max()))
+        ]
+        cells = np.logical_or.reduce(reached)
+    return cells
+
+
 def find_cells(
     model: Model, config: BakeConfig, resolutions: Resolutions, held_out: HeldOut, progress: Progress
 ) -> StoredCells:

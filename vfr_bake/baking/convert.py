@@ -6,19 +6,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
 from pathlib import Path
 
-import numpy as np
-
 from player.asset.asset import Asset, GridArrays, write_asset
-from player.asset.parts import LIMITS
-from player.asset.pyramid import MAX_LEVELS, Bricks, PyramidValues, Vertices, whole_pyramid
-from player.asset.sections import Grid
 from player.files.files import check_target
+from vfr_bake.baking.coarser_levels import with_coarser_levels
 
-COARSEST = 16
-"""Cells along each axis that the coarsest level has at most, if there are levels enough."""
 STEPS = 6
 """Steps that `progress` is told of."""
 
@@ -77,41 +70,3 @@ def convert(
     tell(STEPS, STEPS)
     n_bytes = sum(path.stat().st_size for path in new.iterdir())
     return Converted(asset, n_bytes, time.perf_counter() - begin)
-
-
-def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
-    """What is stored at one level, with coarser levels beneath that nothing is read from while it is there;
-    what has several levels stays as it is.
-
-    A coarser vertex has the value of the finer one at its place; where none is stored there, the mean of
-    those around it.
-    """
-    if len(stored.pyramid.levels) > 1:
-        return stored
-    resolution = stored.pyramid.resolution
-    none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
-    n_levels = 1
-    while n_levels < MAX_LEVELS and resolution > COARSEST << (n_levels - 1):
-        n_levels += 1
-    pyramid = whole_pyramid(resolution, [stored.pyramid.levels[0], *[none] * (n_levels - 1)])
-    low, high = LIMITS[grid]  # version 3 has features of -128, which bakes did not write
-    values = [np.clip(stored.values[0], low, high)]
-    for fine, coarse in pairwise(pyramid.vertices):
-        values.append(_coarser(fine, coarse, values[-1]))
-    return PyramidValues(pyramid, tuple(values))
-
-
-def _coarser(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
-    """The values [n_coarse, n_channels] of the next coarser level."""
-    places = coarse.index * 2
-    rows = fine.rows(places)
-    out = values[rows]
-    alone = np.flatnonzero(rows < 0)
-    total, n = np.zeros((len(alone), values.shape[1])), np.zeros((len(alone), 1))
-    for offset in product((-1, 0, 1), repeat=3):
-        beside = fine.rows(places[alone] + np.array(offset, np.int32))
-        there = beside >= 0
-        total[there] += values[beside[there]]
-        n[there] += 1
-    out[alone] = np.rint(total / n)  # a cell with this corner is live, and a finer one in it
-    return out

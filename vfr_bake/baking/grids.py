@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,9 +25,10 @@ from player.asset.asset import GridArrays
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, VertexRows, build_grid, vertex_rows
-from player.asset.pyramid import PyramidValues
+from player.asset.pyramid import Pyramid, PyramidValues
 from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
+from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
 from vfr_bake.training.model_file import Model
 
@@ -81,6 +83,8 @@ class Layout:
     contracted: bool = False
     near: float = 0.0
     """Distance at which rays begin in contracted space, model units."""
+    density_step: int = 1
+    """Density codes from one that is stored to the next."""
 
     @property
     def aabb(self) -> tuple[tuple[float, ...], ...]:
@@ -88,15 +92,38 @@ class Layout:
         edge = 2.0 if self.contracted else 1.0
         return (-edge,) * 3, (edge,) * 3
 
+    @cached_property
+    def _pyramids(self) -> tuple[Pyramid, Pyramid]:
+        """Densities and features with coarser levels."""
+        none = (np.zeros((len(vertices), 1), np.uint8) for vertices in (self.densities, self.features))
+        densities, features = (
+            pyramid_beneath(vertices.values(codes).pyramid)
+            for vertices, codes in zip((self.densities, self.features), none, strict=True)
+        )
+        return densities, features
+
+    def _densities(self, codes: np.ndarray) -> PyramidValues:
+        """The pyramid of density codes [n] that need not be whole."""
+        whole = np.clip(np.rint(codes), 0, 255).astype(np.uint8)[:, None]
+        return values_beneath(self._pyramids[0], whole, "densities", self.density_step)
+
     def arrays(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
         """The asset's arrays, from codes that need not be whole: one for each vertex of the densities,
         [n, n_channels] for each of the features."""
-        whole = np.clip(np.rint(density), 0, 255).astype(np.uint8)
-        return GridArrays(self.densities.values(whole), self.features.values(encode_features(features)))
+        codes = encode_features(features)
+        return GridArrays(self._densities(density), values_beneath(self._pyramids[1], codes, "features"))
+
+    def finest(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
+        """The finest level of `arrays`, which has all that is shown."""
+        (codes, *_), pyramid = self._densities(density).values, self._pyramids[0]
+        return GridArrays(
+            PyramidValues(Pyramid(pyramid.resolution, pyramid.levels[:1]), (codes,)),
+            self.features.values(encode_features(features)),
+        )
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
-        """The grid that a player makes of `arrays`."""
-        a = self.arrays(density, features)
+        """The grid that a player makes of `finest`."""
+        a = self.finest(density, features)
         return build_grid(
             a.densities,
             a.features,
@@ -115,6 +142,7 @@ def make_layout(
     resolutions: Resolutions,
     contracted: bool = False,
     near: float = 0.0,
+    density_step: int = 1,
 ) -> Layout:
     """What is stored of the cells `visible` [n, n, n] bool, for march steps of `step`, from `near` on.
 
@@ -126,7 +154,7 @@ def make_layout(
     densities = _corners(visible, resolutions.densities)
     same = resolutions.features == resolutions.densities
     features = densities if same else _corners(visible, resolutions.features)
-    return Layout(densities, features, step, density_range, contracted, near)
+    return Layout(densities, features, step, density_range, contracted, near, density_step)
 
 
 def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.ndarray:

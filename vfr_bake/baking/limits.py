@@ -9,13 +9,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.asset import Asset, GridArrays
 from player.asset.manifest import FileEntry, Manifest
-from player.asset.single_level import to_vertices
-from player.asset.version_3.packing import pack_codes, pack_masks
+from player.asset.parts import LIMITS
+from player.asset.pyramid import PyramidValues, symbols_of
+from player.asset.sections import Grid
+from player.asset.structure import encode_structure
+from player.asset.symbols import encode_level, level_rows
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.render import Renderer
@@ -41,11 +45,25 @@ Measure = Callable[[int, int], float]
 """Milliseconds of a frame by (width of the head, 0 for the model's own; lookups a ray, 0 for all)."""
 
 
-def bytes_beside_features(arrays: GridArrays, mesh: int, cameras: int, head: int) -> int:
-    """Bytes of an asset of these arrays without its features; mesh, cameras and head are given in bytes."""
-    stored = [to_vertices(grid) for grid in (arrays.densities, arrays.features)]
-    structure = sum(grid.coords.nbytes + len(pack_masks(grid.masks)) for grid in stored)
-    return structure + len(pack_codes(stored[0].values)) + mesh + cameras + head
+class CodedBytes(NamedTuple):
+    """Bytes of a pyramid as it is written."""
+
+    structure: int
+    channels: list[int]
+    """Those of the symbols of each channel."""
+
+
+def coded_bytes(stored: PyramidValues, grid: Grid, step: int) -> CodedBytes:
+    """What a pyramid, of which a `step` apart are the values that are stored, takes in a file."""
+    vertices, n_levels = stored.pyramid.vertices, len(stored.values)
+    symbols = symbols_of(vertices, stored.values, (step,) * n_levels, LIMITS[grid])
+    rows = [level_rows(level) for level in vertices]
+    structure = sum(len(encode_structure(stored.pyramid, level)) for level in range(n_levels))
+    channels = [
+        sum(len(encode_level(some[:, c : c + 1], at)) for some, at in zip(symbols, rows, strict=True))
+        for c in range(stored.n_channels)
+    ]
+    return CodedBytes(structure, channels)
 
 
 def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:

@@ -63,6 +63,9 @@ DIRECTION_SHARE = 0.1
 aims at."""
 ROUNDING_LEFT = 0.5
 """Share of what a head loses by 8 bits that is left after it was tuned with them (docs/bake.md)."""
+WORTH_A_ROUND = 0.03
+"""Loss in dB by fewer lookups and a head in 8 bits for which a round of refinement at these lookups is
+made."""
 N_WARM, N_TIMED = 10, 40
 """Steps of a round that are not timed, because something may be compiled for the first time, and steps that
 are."""
@@ -134,8 +137,10 @@ class Tuning:
             stored.features[:] = played
             del grid
             grid = layout.grid(stored.density, stored.features)
+        every = self._held_out.look("all", grid, runner(stored.head), 0)
         before = self._choose_lookups_and_bits(stored, grid, teacher)
-        if self.n_fetches:
+        lost = self._held_out.lost(every.shown, before.shown)
+        if self.n_fetches and lost.most > WORTH_A_ROUND:
             rays = collect_training_rays(teacher, grid, self.n_fetches)
             rates = head_rate * AT_K[choice.head_width > 0], code_rate / 2  # little is left to be trained
             with self._steps("refinement at k", choice.refine_steps) as steps:

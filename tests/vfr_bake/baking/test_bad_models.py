@@ -43,12 +43,14 @@ def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-def test_more_than_memory_holds_is_refused(model: Model, tmp_path: Path) -> None:
+def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.83 GB for 48 .* got 0\.8 "):
         bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), quiet)
-    with pytest.raises(TrainingError, match=r"at most [\d,]+, .* got [\d,]+ of [\d,]+: is the model"):
-        bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.832), quiet)
     assert list(tmp_path.iterdir()) == []
+    settings = BakeConfig(resolution=48, max_memory=0.832, refine_steps=0, check_views=1)
+    result = bake(model, tmp_path / "asset", settings, quiet)
+    assert "do not fit into 0.832 GB" in result.figures["left_out"]["resolution"]
+    assert 8 <= Asset.open(tmp_path / "asset").manifest.resolution < 48
 
 
 def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:

@@ -1,0 +1,79 @@
+"""Coarser levels beneath a grid of one level: nothing is read from them while that is there, but they are
+what its first part shows, and what its values are predicted from."""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+
+import numpy as np
+
+from player.asset.parts import LIMITS
+from player.asset.pyramid import (
+    MAX_LEVELS,
+    Bricks,
+    Pyramid,
+    PyramidValues,
+    Vertices,
+    symbols_of,
+    values_of,
+    whole_pyramid,
+)
+from player.asset.sections import Grid
+
+COARSEST = 16
+"""Cells along each axis that the coarsest level has at most, if there are levels enough."""
+
+
+def pyramid_beneath(finest: Pyramid) -> Pyramid:
+    """The pyramid of a grid of one level, `finest`, and coarser ones.
+
+    >>> one = Bricks(np.zeros((1, 3), np.uint16), np.ones((1, 8), np.uint64))
+    >>> [len(level) for level in pyramid_beneath(Pyramid(64, (one,))).levels]
+    [1, 1, 1]
+    """
+    none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
+    n_coarser = 0
+    while n_coarser + 1 < MAX_LEVELS and finest.resolution > COARSEST << n_coarser:
+        n_coarser += 1
+    return whole_pyramid(finest.resolution, [finest.levels[0], *[none] * n_coarser])
+
+
+def values_beneath(pyramid: Pyramid, finest: np.ndarray, grid: Grid, step: int = 1) -> PyramidValues:
+    """A pyramid with the values `finest` [n_vertices, n_channels] on its finest level, which has all that is
+    shown, as close to them as a `step` of the symbols allows.
+
+    A coarser vertex has the value of the finer one at its place; where none is stored there, the mean of
+    those around it.
+    """
+    low, high = LIMITS[grid]
+    values = [np.clip(finest, low, high)]
+    for fine, coarse in pairwise(pyramid.vertices):
+        values.append(_coarser(fine, coarse, values[-1]))
+    if step > 1:
+        steps = (step,) * len(values)
+        symbols = symbols_of(pyramid.vertices, values, steps, LIMITS[grid])
+        reached = values_of(pyramid.vertices, symbols, steps, LIMITS[grid])
+        values = [level.astype(finest.dtype) for level in reached]
+    return PyramidValues(pyramid, tuple(values))
+
+
+def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
+    """What is stored, with coarser levels if it has only one."""
+    finest, *coarser = stored.values
+    return stored if coarser else values_beneath(pyramid_beneath(stored.pyramid), finest, grid)
+
+
+def _coarser(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
+    """The values [n_coarse, n_channels] of the next coarser level."""
+    places = coarse.index * 2
+    rows = fine.rows(places)
+    out = values[rows]
+    alone = np.flatnonzero(rows < 0)
+    total, n = np.zeros((len(alone), values.shape[1])), np.zeros((len(alone), 1))
+    for offset in product((-1, 0, 1), repeat=3):
+        beside = fine.rows(places[alone] + np.array(offset, np.int32))
+        there = beside >= 0
+        total[there] += values[beside[there]]
+        n[there] += 1
+    out[alone] = np.rint(total / n)  # a cell with this corner is live, and a finer one in it
+    return out
