@@ -23,7 +23,7 @@ LACKING = {
 }
 """What this platform does not have: the programs that `make` installs from Debian's or Ubuntu's packages,
 Open3D where pyproject.toml does not ask for it, and Ctrl-C that is sent to a process."""
-N_TESTS = {"programs": 13, "open3d": 29, "signals": 1}
+N_TESTS = {"programs": 13, "open3d": 35, "signals": 1}
 """Tests marked `needs(...)`: so many are skipped where that is lacking, and no other test anywhere."""
 
 

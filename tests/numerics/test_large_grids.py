@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from player.asset.asset import GridArrays
+from player.asset.asset import MAX_ROWS, GridArrays
 from player.asset.bricks import bricks_per_axis
 from player.asset.grid import SPARE, SparseGrid, VertexRows
 from player.asset.manifest import MAX_RESOLUTION, Manifest
@@ -224,20 +224,20 @@ def test_what_is_counted_in_32_bits_fits() -> None:
     assert MOST_SLOTS * 16 < 2**31
 
 
-def test_more_vertices_than_rows_have_numbers_are_refused() -> None:
-    n_bricks = 2**31 // 512
+def test_more_vertices_than_rows_have_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert MAX_ROWS == 2**31 - 1, "rows are int32"
+    monkeypatch.setattr("player.asset.asset.MAX_ROWS", 7)
     manifest = Manifest(
         generator="test",
-        resolution=MAX_RESOLUTION,
-        feature_resolution=MAX_RESOLUTION,
+        resolution=8,
+        feature_resolution=8,
         step=0.1,
         density_range=(-5, 5),
         n_channels=1,
         view_size=(4, 3),
     )
-    coords = np.broadcast_to(np.uint16(0), (n_bricks, 3))
-    masks = np.broadcast_to(np.uint64(2**64 - 1), (n_bricks, 8))
-    pyramid = Pyramid(MAX_RESOLUTION, (Bricks(coords, masks),))
-    arrays = GridArrays(*(PyramidValues(pyramid, (np.zeros((1, 1), kind),)) for kind in (np.uint8, np.int8)))
-    with pytest.raises(FormatError, match="at most 2147483647 vertices, got 2147483648"):
-        arrays.check(manifest, "")
+    cell = Bricks(np.zeros((1, 3), np.uint16), np.array([[1, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
+    pyramid = Pyramid(8, (cell,))
+    arrays = GridArrays(*(PyramidValues(pyramid, (np.zeros((8, 1), kind),)) for kind in (np.uint8, np.int8)))
+    with pytest.raises(FormatError, match="at most 7 vertices, got 8"):
+        arrays.check(manifest)

@@ -164,7 +164,7 @@ def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pyt
 
     # in a round the only ray either jumps or takes a chunk
     monkeypatch.setattr(BoxPath, "jump", counted(BoxPath.jump))
-    monkeypatch.setattr(march, "_take_chunk", counted(march._take_chunk))
+    monkeypatch.setattr(march, "_take", counted(march._take))
     rays = [np.float32([row]) for row in NAMED["from a corner, inwards"]]
     for size in (1.0, 1e-20, 1e-3):
         rounds = 0

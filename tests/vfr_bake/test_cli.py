@@ -391,7 +391,7 @@ def test_a_disk_that_fills_in_a_temporary_folder_is_one_line(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/tmp/head.onnx")
 
     monkeypatch.setattr("vfr_bake.baking.bake.unwritten_asset", full)
-    settings = ["--resolution", "24", "--refine-steps", "0", "--check-views", "1"]
+    settings = ["--resolution", "24", "--refine-steps", "0", "--check-views", "1", "--target-ms", "1000"]
     assert bake_main([str(model), str(tmp_path / "asset"), *settings]) == 1
     one_error(capsys, "vfr-bake: error: /tmp/head.onnx: No space left on device")
     assert not (tmp_path / "asset").exists()

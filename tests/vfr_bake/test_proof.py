@@ -31,7 +31,11 @@ def test_a_bake_asks_before_it_begins(
     monkeypatch.setattr(plan, "expected_seconds", lambda *_: 1.0)
     monkeypatch.setattr(bake, "bake", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     options = SimpleNamespace(
-        asset=tmp_path / "asset", model=None, config=SimpleNamespace(max_memory=None), force=False
+        asset=tmp_path / "asset",
+        model=None,
+        config=SimpleNamespace(max_memory=None),
+        force=False,
+        convert=None,
     )
     with pytest.raises(KeyboardInterrupt):
         cli._bake(options)

@@ -66,6 +66,7 @@ def test_pycolmap_reads_the_model(
 
     target = tmp_path / "sparse"
     arguments = [str(shells_asset), f"{target}/", "--format", "colmap", "--points", "50", "--frame", "model"]
+    arguments += ["--method", "baked"]
     assert cli.main(arguments) == 0
     assert "5 cameras, 50 points" in capsys.readouterr().out
     model = pycolmap.Reconstruction(str(target))

@@ -9,7 +9,7 @@ import pytest
 
 from exporters.shapes.volume import asset_volume
 from exporters.surface.inner_region import inner_region
-from exporters.surface.marching_cubes import extract_asset_surface
+from exporters.surface.marching_cubes import cut_surface, settled
 from exporters.surface.one_level import one_level
 from player.asset.asset import Asset, GridArrays
 from player.asset.bricks import unpack_vertices
@@ -75,15 +75,24 @@ def test_the_surface_of_a_ball_is_closed_and_round(opened: Asset, contracted: bo
     half = 2.0 if contracted else 1.0
     box = ((-half,) * 3, (half,) * 3)
     manifest = replace(
-        opened.manifest, resolution=40, feature_resolution=20, aabb=box, step=0.05, contracted=contracted
+        opened.manifest,
+        resolution=40,
+        feature_resolution=20,
+        aabb=box,
+        step=0.05,
+        contracted=contracted,
+        level_steps=(1, 1, 1),
+        density_steps=(1, 1, 1),
+        feature_steps=(1,) * len(none.pyramid.levels),
+        parts=(),
     )
     whole = Asset(opened.folder, manifest, GridArrays(stored, features))
     with pytest.raises(ShapeError, match="expected a grid of one level, got 3 levels"):
-        extract_asset_surface(whole.grid)
+        cut_surface(whole.grid)
     asset = inner_region(whole)
     low, high = manifest.density_range
     level = float(np.exp(low + (high - low) * (160 if contracted else 128) / 255))
-    surface = extract_asset_surface(asset.grid, level)
+    surface = settled(asset.grid, cut_surface(asset.grid, level))
     radius = np.linalg.norm(surface.vertices, axis=1)
     expected = (10 - (8 if contracted else 0)) * half / 20
     assert np.abs(radius - expected).max() < 0.3 * half / 20, "a third of a cell: codes are interpolated"

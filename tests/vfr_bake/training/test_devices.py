@@ -34,7 +34,8 @@ def psnr(trainer: Trainer, scene: Scene) -> float:
 @pytest.mark.parametrize("kind", ["object", "unbounded"])
 def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None:
     scene = small_scene(kind)
-    settings = {"pilot_steps": 40, "batch_samples": 4096, "batch_rays": 48}
+    # Room for the samples of all rays: of those that do not fit, the two backends leave out different ones.
+    settings = {"pilot_steps": 40, "batch_samples": 16384, "batch_rays": 48}
     settings["steps"] = 150 if kind == "object" else 120
     ours = Trainer(scene, config(**settings | {"device": device.type}), backend="torch")
     expected = Trainer(scene, config(**settings))

@@ -68,6 +68,6 @@ def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
     # About every second seed fails; the field becomes empty then, and the picture white.
-    failed = next((seed for seed in (2, 0, 3, 1) if psnr(scene, 0, seed) < blank + 1), None)
+    failed = next((seed for seed in (2, 0, 3, 1, 4, 5, 6, 7, 8, 9) if psnr(scene, 0, seed) < blank + 1), None)
     assert failed is not None
     assert psnr(scene, 100, failed) > blank + 6
