@@ -206,7 +206,7 @@ class Taken(NamedTuple):
 
 
 def _take(grid: SparseGrid, path: Path, ray: np.ndarray, chunk: Chunk, tau: np.ndarray) -> Taken:
-    """Of a chunk's samples of the rays `ray` [n] those in live cells, up to the one that passes MAX_TAU;
+    """Take the samples of a chunk of the rays `ray` [n] in live cells, up to the one that passes MAX_TAU;
     `tau` [n_rays] is updated."""
     at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
     row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
