@@ -31,9 +31,9 @@ def _answer(*command: str) -> dict[str, Any]:
 
 
 def test_broken_inputs_are_refused_or_read() -> None:
-    result = run("tests.reliability.fuzz", "--inputs", "500", "--seed", "7")
+    result = run("tests.reliability.fuzz", "--inputs", "580", "--seed", "7")
     assert result["failures"] == [], result["watched_by"]
-    assert result["inputs"] == 500 and len(result["targets"]) == 29
+    assert result["inputs"] == 580 and len(result["targets"]) == 29
     for counts in result["targets"].values():
         assert counts["refused"] + counts["read"] == 20
         assert counts["refused"] > 5, "inputs that break nothing test nothing"
