@@ -62,8 +62,13 @@ class Vertices:
     def __len__(self) -> int:
         return len(self.index)
 
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The cells of which these are the corners, on one level."""
+        return self.values(np.zeros((len(self), 1), np.uint8)).pyramid
+
     def rows(self) -> VertexRows:
-        return vertex_rows(self.values(np.zeros((len(self), 1), np.uint8)).pyramid)
+        return vertex_rows(self.pyramid)
 
     def values(self, codes: np.ndarray) -> PyramidValues:
         """The pyramid of one level with the codes [n] or [n, n_channels] of these vertices."""
@@ -95,12 +100,7 @@ class Layout:
     @cached_property
     def _pyramids(self) -> tuple[Pyramid, Pyramid]:
         """Densities and features with coarser levels."""
-        none = (np.zeros((len(vertices), 1), np.uint8) for vertices in (self.densities, self.features))
-        densities, features = (
-            pyramid_beneath(vertices.values(codes).pyramid)
-            for vertices, codes in zip((self.densities, self.features), none, strict=True)
-        )
-        return densities, features
+        return pyramid_beneath(self.densities.pyramid), pyramid_beneath(self.features.pyramid)
 
     def _densities(self, codes: np.ndarray) -> PyramidValues:
         """The pyramid of density codes [n] that need not be whole."""
