@@ -2,8 +2,8 @@
 
 The order of the sections is that of what they show: first all that the coarsest picture needs, then what
 makes it sharper, the density before the features and the first channels before the others. It is cut so that
-what the first picture needs, head and cameras with it, is at most a tenth of the bytes of the asset, and half
-of the bytes end with a part, too.
+what the first picture needs, head and cameras with it, is a few hundredths of the bytes of the asset, so that
+it is there at once; a tenth and half of the bytes end with a part, too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from player.asset.structure import encode_structure
 from player.asset.symbols import encode_level, level_rows
 from player.errors import FormatError
 
-SHARES = (0.1, 0.25, 0.5, 1.0)
+SHARES = (0.025, 0.1, 0.25, 0.5, 1.0)
 """The most of all bytes that are read with the first part, with the first two, ..."""
 
 

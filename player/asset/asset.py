@@ -136,18 +136,23 @@ class Asset:
         """Open the asset in `folder` part by part: first a whole, coarser picture, then sharper ones. Each
         part is read and decoded once.
 
-        Arguments and errors as `open`; the assets yielded share what has not changed.
+        Arguments and errors as `open`, but that an asset and the one yielded before it take no more than
+        `max_memory` together: that one may still be shown.
 
         >>> for asset in Asset.growing("out/"):
         ...     print(asset.n_parts, asset.missing)
         1 None
         """
         opening = _Opening(Path(folder), verify, max_memory)
-        for n_parts in range(1, max(len(opening.manifest.parts), 1) + 1):
+        n_all = max(len(opening.manifest.parts), 1)
+        for n_parts in range(1, n_all):
             asset = opening.asset(n_parts)
             yield asset
             if asset.missing is not None:
                 return
+        asset = opening.asset(n_all)
+        del opening  # its symbols take more than the values
+        yield asset
 
     def path(self, name: str) -> Path:
         """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""

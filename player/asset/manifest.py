@@ -409,6 +409,11 @@ def _check_together(manifest: Manifest) -> None:
         raise FormatError(
             f"manifest: level_steps: expected powers of two that do not fall, got {list(steps)}"
         )
+    if manifest.contracted and not steps[-1] * manifest.step < math.pi:
+        raise FormatError(
+            "manifest: level_steps: expected less than pi in all where contracted, "
+            f"got {steps[-1]} steps of {manifest.step}"
+        )
     check_parts(manifest.parts, manifest.resolutions, manifest.n_levels, manifest.n_channels)
 
 

@@ -98,6 +98,12 @@ class PyramidReader:
         else:
             self._symbols[section.level][:, section.first_channel : section.end_channel] = 0
 
+    @property
+    def n_symbol_bytes(self) -> int:
+        """What the symbols of the levels that are there take."""
+        n_vertices = sum(vertices.n for vertices in self.pyramid.vertices)
+        return n_vertices * self.n_channels * np.dtype(np.int16).itemsize
+
     def values(self) -> PyramidValues:
         """What is known so far."""
         vertices = self.pyramid.vertices
@@ -150,15 +156,19 @@ class PartsReader:
         }
         self.n_read = 0
         """Parts that have been read."""
+        self._taken = 0
+        """Bytes that the parts before took, which may still be shown."""
 
     def read(self, n_parts: int) -> None:
-        """Read on until `n_parts` are read, or one cannot be.
+        """Read on until `n_parts` are read, or one cannot be. What was read before may still be shown: its
+        memory counts.
 
         Raises FormatError, IntegrityError: a part is not there, or another one, or breaks the format; those
         before it are read. ConfigError: it takes more memory than is allowed.
         """
         parts = self._manifest.parts[self.n_read : n_parts]
-        check_memory(self._stated_bytes(n_parts), self._allowed, str(self._folder))
+        allowed = self._allowed - self._taken
+        check_memory(self._stated_bytes(n_parts), allowed, str(self._folder))
         read: list[list[StoredSection]] = []
         n_whole, error = 0, None
         for part in parts:
@@ -169,11 +179,15 @@ class PartsReader:
             except FormatError as found:
                 error = found
                 break
-        check_memory(self._exact_bytes(n_parts), self._allowed, str(self._folder))
+        taken = self._exact_bytes(n_parts)
+        if n_parts < len(self._manifest.parts):  # symbols are kept for the parts to come
+            taken += sum(reader.n_symbol_bytes for reader in self._grids.values())
+        check_memory(taken, allowed, str(self._folder))
         n_whole, error = self._read_symbols(read[:n_whole], error)
         for stored in reversed([stored for sections in read[n_whole:] for stored in sections]):
             self._grids[stored.section.grid].forget(stored.section)
         self.n_read += n_whole
+        self._taken = taken
         if error is not None:
             raise error
 

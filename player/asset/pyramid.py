@@ -116,6 +116,8 @@ class Vertices:
 
     def rows(self, index: np.ndarray) -> np.ndarray:
         """[n] int32: the rows of vertices [n, 3]; -1 where there is none."""
+        if not len(self.bricks):
+            return np.full(len(index), -1, np.int32)
         brick = self.bricks.find(index >> 3)
         x, y, z = (index & 7).T
         return np.where(
@@ -320,8 +322,8 @@ def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
     return Pyramid(resolution, tuple(levels))
 
 
-def _places(fine: Vertices, coarse: Vertices) -> Places:
-    """Where the vertices of the next coarser level around those of a level are."""
+def places_between(fine: Vertices, coarse: Vertices) -> Places:
+    """Where the vertices `coarse` of the next coarser level are around the vertices `fine` of a level."""
     rows = np.append(coarse.row_of_bit, np.full(BRICK**3, -1, np.int32)).reshape(-1, BRICK, BRICK, BRICK)
     apron = np.empty((len(coarse.bricks), BRICK + 1, BRICK + 1, BRICK + 1), np.int32)
     for offset in np.ndindex(2, 2, 2):
@@ -347,7 +349,7 @@ def predicted(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarra
         [n, n_channels] int16: (the sum of the values at floor(v / 2) and ceil(v / 2) of each axis + 4) >> 3.
     """
     masks, none = fine.bricks.masks, np.zeros((0, values.shape[1]), np.int16)
-    return values_from(masks, fine.border, _places(fine, coarse), values, none, 1, (0, 0), np.int16)
+    return values_from(masks, fine.border, places_between(fine, coarse), values, none, 1, (0, 0), np.int16)
 
 
 def values_of(
@@ -375,7 +377,7 @@ def values_of(
     for level in reversed(range(len(vertices))):
         here, change, step = vertices[level], symbols[level], steps[level]
         if found:
-            places = _places(here, vertices[level + 1])
+            places = places_between(here, vertices[level + 1])
             values = values_from(
                 here.bricks.masks, here.border, places, found[-1], change, step, limits, dtype
             )

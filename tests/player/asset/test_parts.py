@@ -17,65 +17,21 @@ import pytest
 from player.app import cli
 from player.asset.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.asset.bricks import pack_vertices
-from player.asset.manifest import Manifest, manifest_bytes, parse_manifest
+from player.asset.manifest import manifest_bytes, parse_manifest
 from player.asset.parts import LIMITS, Counts, needed_bytes
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues, symbols_of, values_of, whole_pyramid
-from player.asset.sections import Grid
 from player.errors import ConfigError, FormatError, IntegrityError
 from player.render import Renderer
 from tests.player.conftest import cameras_bytes, head_bytes
+from tests.player.in_parts import MANIFEST, RESOLUTION, STEPS, cells, stored, write_in_parts
 from tests.reliability.fuzz.targets import small_view
 
-RESOLUTION = 45
 NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
-
-
-def cells(levels: int, thickness: float) -> list[Bricks]:
-    """A hollow ball, finer towards +x."""
-    centre = np.indices((RESOLUTION + 3,) * 3).reshape(3, -1).T
-    found = []
-    for level in range(levels):
-        n = -(-RESOLUTION >> level)
-        some = centre[(centre < n).all(axis=1)]
-        place = (some + 0.5) / RESOLUTION * 2 ** (level + 1) - 1
-        ball = np.abs(np.linalg.norm(place, axis=1) - 0.6) < thickness * 2**level
-        own = np.clip(((0.3 - place[:, 0]) * levels).astype(int), 0, levels - 1) == level
-        coords, masks, _ = pack_vertices(some[ball & own])
-        found.append(Bricks(coords, masks))
-    return found
-
-
-def stored(grid: Grid, leaves: list[Bricks], n_channels: int, steps: tuple[int, ...]) -> PyramidValues:
-    """Values that vary slowly, with noise, as close as the steps allow."""
-    random = np.random.default_rng(len(leaves) + n_channels)
-    pyramid, (low, high) = whole_pyramid(RESOLUTION, leaves), LIMITS[grid]
-    wanted = [
-        (low + high) / 2
-        + 90 * np.sin(vertices.index.sum(axis=1)[:, None] * 2.0**level / 20 + np.arange(n_channels))
-        + random.normal(0, 20, (vertices.n, n_channels))
-        for level, vertices in enumerate(pyramid.vertices)
-    ]
-    symbols = symbols_of(pyramid.vertices, wanted, steps, LIMITS[grid])
-    kind = np.uint8 if grid == "densities" else np.int8
-    return PyramidValues(pyramid, tuple(values_of(pyramid.vertices, symbols, steps, LIMITS[grid], kind)))
-
-
-STEPS = (3, 2, 1, 1)
-MANIFEST = Manifest(
-    generator="tests", resolution=RESOLUTION, feature_resolution=RESOLUTION, step=0.03,
-    level_steps=(1, 1, 2, 4), density_range=(-2, 6), density_steps=STEPS, n_channels=9,
-    feature_steps=(2, 2, 1), view_size=(48, 40),
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("parts") / "asset"
-    arrays = GridArrays(
-        stored("densities", cells(4, 0.06), 1, STEPS), stored("features", cells(3, 0.09), 9, (2, 2, 1))
-    )
-    write_asset(folder, MANIFEST, arrays, head_bytes(9), b"ply\n", cameras_bytes())
-    return folder
+    return write_in_parts(tmp_path_factory.mktemp("parts") / "asset")
 
 
 @pytest.fixture
@@ -168,7 +124,25 @@ def swapped(folder: Path, file: str) -> None:
     shutil.copyfile(folder / other, folder / file)
 
 
-@pytest.mark.parametrize("do", [cut, changed, swapped, lambda folder, file: (folder / file).unlink()])
+def endless(folder: Path, file: str) -> None:
+    """A terabyte that takes no room on the disk; read, it would not fit into memory."""
+    with (folder / file).open("r+b") as data:
+        data.truncate(1 << 40)
+
+
+def a_folder(folder: Path, file: str) -> None:
+    (folder / file).unlink()
+    (folder / file).mkdir()
+
+
+def missing(folder: Path, file: str) -> None:
+    (folder / file).unlink()
+
+
+BROKEN = [missing, cut, changed, swapped, endless, a_folder]
+
+
+@pytest.mark.parametrize("do", BROKEN)
 def test_a_later_part_that_is_broken_is_told_and_the_others_play(
     do: Callable[[Path, str], None], broken: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,12 +162,50 @@ def test_a_later_part_that_is_broken_is_told_and_the_others_play(
     assert said == f"vfr-play: warning: {asset.missing}\n"
 
 
-@pytest.mark.parametrize("do", [cut, changed, swapped, lambda folder, file: (folder / file).unlink()])
+@pytest.mark.parametrize("do", BROKEN)
 def test_the_first_part_has_to_be_there(do: Callable[[Path, str], None], broken: Path) -> None:
     do(broken, "part_0.bin")
     with pytest.raises(FormatError, match=r"part_0\.bin: ") as caught:
         Asset.open(broken)
     assert "\n" not in str(caught.value)
+
+
+def test_the_part_of_another_bake_is_told(broken: Path, tmp_path: Path) -> None:
+    """It has the same name, and is whole: only its checksum tells."""
+    asset = Asset.open(broken)
+    values = tuple(np.maximum(level, 0) for level in asset.arrays.features.values)
+    manifest = replace(asset.manifest, feature_steps=(1,) * 3)
+    features = values_of(
+        asset.arrays.features.pyramid.vertices,
+        symbols_of(asset.arrays.features.pyramid.vertices, values, (1,) * 3, LIMITS["features"]),
+        (1,) * 3, LIMITS["features"], np.int8,
+    )  # fmt: skip
+    arrays = replace(asset.arrays, features=PyramidValues(asset.arrays.features.pyramid, tuple(features)))
+    rest = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
+    write_asset(tmp_path / "other", manifest, arrays, *rest)
+    shutil.copyfile(tmp_path / "other" / "part_1.bin", broken / "part_1.bin")
+    shown = Asset.open(broken)
+    assert shown.n_parts == 1 and shown.missing is not None and "\n" not in shown.missing
+    assert shown.missing.startswith(f"{broken / 'part_1.bin'}: ")
+
+
+def test_an_asset_that_grows_counts_what_is_still_shown(whole: Path) -> None:
+    """Each takes less than the limit, and two of them more."""
+    least = next(gb for gb in np.arange(0.001, 0.1, 0.0001) if _opens(whole, float(gb)))
+    assert len(list(Asset.growing(whole, max_memory=2 * float(least)))) == len(read_manifest(whole).parts)
+    grown = []
+    with pytest.raises(ConfigError, match=r"memory: expected at most .* allow more by --max-memory"):
+        for asset in Asset.growing(whole, max_memory=float(least)):
+            grown.append(asset.n_parts)
+    assert grown and grown[0] == 1, "what there is room for was shown"
+
+
+def _opens(folder: Path, gigabytes: float) -> bool:
+    try:
+        Asset.open(folder, max_memory=gigabytes)
+    except ConfigError:
+        return False
+    return True
 
 
 def test_a_vouched_part_that_breaks_the_format_leaves_those_before_it(broken: Path) -> None:
@@ -243,6 +255,10 @@ LIES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda m: m.update(level_steps=[1]), "level_steps: expected 4, as many as density_steps, got 1"),
     (lambda m: m.update(level_steps=[1, 2, 1, 1]), "powers of two that do not fall"),
     (lambda m: m.update(level_steps=[1, 2, 3, 4]), "powers of two that do not fall"),
+    (
+        lambda m: m.update(contracted=True, aabb=[[-2.0] * 3, [2.0] * 3], level_steps=[1, 1, 2, 128]),
+        "level_steps: expected less than pi in all where contracted, got 128 steps of 0.03",
+    ),
     (lambda m: m.update(feature_steps=[]), "feature_steps: expected 1 to 8 integers"),
     (lambda m: m.update(feature_steps=[256, 1, 1]), r"feature_steps: expected an integer in 1\.\.255"),
     (lambda m: m["files"].pop("part_1.bin"), r"files: expected part_1\.bin"),
