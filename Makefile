@@ -19,7 +19,7 @@ SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:l
 # Programs that open our exports or look at the viewer in the tests, as check:package. Debian's Blender, because it works
 # beside any Python of the tests and is half of what the `bpy` wheel is (160 MB against 370 MB), which in turn wants one
 # Python and numpy 1.
-OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium
+OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium glslangValidator:glslang-tools
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
@@ -71,7 +71,7 @@ WHEEL_TESTS := cd $(WHEEL)/checkout && VFR_DATA="$${VFR_DATA:-$(abspath ../share
 TOOLS_OF_TESTS := pytest hypothesis onnx scipy opencv-python-headless pycolmap
 FILES_OF_EXTRAS := compiled/test_compiling compiled/test_lanes compiled/test_processor compiled/test_scratch \
   march/test_contracted_march march/test_march head/test_head_compiled test_proof \
-  viewer/test_viewer viewer/test_viewer_guard viewer/viewer_client
+  viewer/test_viewer viewer/test_viewer_guard viewer/test_viewer_pages viewer/viewer_client
 test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## build, check the packages, run the player's tests on the wheel
 	rm -rf build dist $(WHEEL)
 	$(BIN)/python -m build
@@ -85,7 +85,7 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 	mkdir $(WHEEL)/checkout
 	cp -R tests conftest.py pyproject.toml $(WHEEL)/checkout
 	cd $(WHEEL)/checkout && $(WHEEL)/bin/python -c 'import player, sys; assert player.__file__.startswith(sys.prefix + "/lib")'
-	$(WHEEL_TESTS) -m 'not extra' $(FILES_OF_EXTRAS:%=--ignore=tests/player/%.py)
+	$(WHEEL_TESTS) -m 'not extra' $(FILES_OF_EXTRAS:%=--ignore=tests/player/%.py) --ignore=tests/player/page
 	$(WHEEL_PIP) "$$(echo dist/*.whl)[fast,viewer,video,cluster]" playwright
 	$(WHEEL_TESTS)
 

@@ -9,7 +9,7 @@ A room may import `player` and the rooms above it in this table, never one besid
 | `shapes` | what is exported: meshes, colours, textures, crops, volumes |
 | `mesh`, `formats`, `head` | what is done to a mesh; one file format a module; the head as ONNX |
 | `surface` | how an asset's surface is found, and its colours |
-| `pictures`, `export_mesh` | the exports that are several files |
+| `pictures`, `pages`, `export_mesh` | the exports that are several files |
 | `export` | every export |
 | `cli` | the command `vfr-export` |
 """

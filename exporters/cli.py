@@ -20,7 +20,7 @@ Write a baked asset, or a part of it, for another program.
 The suffix of FILE picks the format:
   {files}
 
-Two formats are folders, and have to be named:
+Some formats are folders, and have to be named:
   {folders}
 
 Places are in the world that the cameras of the data set are in, with its unit, unless --frame says otherwise.
@@ -47,6 +47,10 @@ volumes:
   vfr-export out/ scene.vdb --colour                 for Houdini and others: density and linear colour
   vfr-export out/ scene.vdb --frame blender          for Blender's renderer
   vfr-export out/ scene.npz                          the same as numpy arrays
+
+pages:
+  vfr-export out/ scene.html                         one file that plays in any browser: open it, mail it
+  vfr-export out/ site/ --format web                 the same for a web server: shows something sooner
 
 cameras:
   vfr-export out/ cameras.json --frame gltf          transforms.json, turned as the mesh is
@@ -109,7 +113,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     add("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
     add("file", type=Path, metavar="FILE", help="file or folder to write: " + ", ".join(FORMATS) + ", DIR/")
-    value("--format", "NAME", "exr or colmap for a folder; or a suffix without its dot")
+    value("--format", "NAME", "exr, colmap or web for a folder; or a suffix without its dot")
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
     value("--crop", "X,Y,Z,W,D,H[,YAW]", "only what is in this box of the world; or a .json file")
     faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
@@ -128,6 +132,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
     add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
     add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
+    value("--max-gpu-mb", "N", "page: graphics memory that it may take (512)", type=whole(example=256))
     add("--force", action="store_true", help="replace FILE if it exists")
     value("--max-memory", "GB", MAX_MEMORY, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
@@ -164,6 +169,9 @@ def _sentence(summary: dict[str, Any]) -> str:
     if "inputs" in summary:
         counts.append(f"{', '.join(summary['inputs'])} -> {', '.join(summary['outputs'])}")
     parts = [*counts, f"{summary['bytes'] / 1e6:.1f} MB"]
+    if "viewer_bytes" in summary:
+        parts.append(f"{summary['viewer_bytes'] / 1e3:.0f} kB of it the viewer")
+        parts.append(f"{summary['gpu_bytes'] / 1e6:.0f} MB of graphics memory")
     if "bounds" in summary:
         low, high = summary["bounds"]
         parts.append(f"bounds {_corner(low)} to {_corner(high)}")

@@ -20,6 +20,7 @@ from exporters.formats.parity import check_points_bytes, check_volume_bytes
 from exporters.formats.transforms import moved_cameras, transforms_bytes
 from exporters.head.asset_head import head_bytes
 from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
+from exporters.pages import export_page
 from exporters.pictures import export_pictures
 from exporters.progress import Report, silent
 from exporters.shapes.crop import parse_crop
@@ -33,6 +34,7 @@ from player.cameras.transforms import frame_names, read_cameras
 from player.cameras.views import asset_cameras
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
+from player.page.page import is_site_file
 
 Facts = dict[str, Any]
 """What is said of an export: JSON values."""
@@ -60,11 +62,12 @@ def export_asset(
         was made again `method`, `unseen_faces_removed`, `haze_faces_removed`, `floaters_removed`,
         `floater_faces_removed`;
         `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit of the frame;
-        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`.
+        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`; of a page `viewer_bytes` (all but
+        the scene's data and the poster) and `gpu_bytes`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
-            asset that takes more memory than it may.
+            asset that takes more memory than it may, or a page more graphics memory.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.
@@ -79,7 +82,7 @@ def export_asset(
             _check_target(asset_path, path, name, options.force)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
-    if name not in ("exr", "json", "onnx"):
+    if name not in ("exr", "json", "onnx", "html", "web"):
         asset = inner_region(asset, options.max_memory)
     matrix = coordinates_from_world(options.coordinates, asset.world_from_model, name)
     if is_mesh:
@@ -89,6 +92,8 @@ def export_asset(
         facts = export_pictures(
             asset, target, cameras, names, options.half, force, partial(report, "picture")
         )
+    elif name in ("html", "web"):
+        facts = export_page(asset, target, name, options.max_gpu_mb, force)
     elif name == "colmap":
         facts = _export_colmap(asset, target, options, matrix, force, report)
     else:
@@ -184,7 +189,11 @@ def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> boo
     """
     is_folder = name in FOLDERS
     if target.is_dir() and is_folder:
-        belongs = {"exr": lambda file: file.endswith(".exr"), "colmap": COLMAP_FILES.__contains__}[name]
+        belongs = {
+            "exr": lambda file: file.endswith(".exr"),
+            "colmap": COLMAP_FILES.__contains__,
+            "web": is_site_file,
+        }[name]
         found = sorted(path.name for path in target.iterdir())
         other = [file for file in found if not belongs(file)]
         if other:

@@ -21,6 +21,7 @@ FORMATS = {
     ".vdb": "OpenVDB volume: `density`, and with --colour `color` (linear)",
     ".npz": "the same volume as numpy arrays, and what they mean as JSON inside",
     ".json": "transforms.json of the training cameras",
+    ".html": "a page that plays the scene in any browser with WebGL2: one file, no server",
     ".onnx": "the head as an ONNX graph; --decode puts the decode of the features in front",
 }
 """Files, by suffix."""
@@ -28,6 +29,7 @@ FORMATS = {
 FOLDERS = {
     "exr": "pictures of many layers (colour, depth, position, normals, features), one OpenEXR a camera",
     "colmap": "COLMAP text: the training cameras and a point cloud",
+    "web": "the page as files for a web server, which shows something before all of it is there",
 }
 """Folders, by --format."""
 
@@ -51,6 +53,8 @@ _TAKES = {
     "colmap": _SURFACE | {"points"},
     "exr": {"cameras", "views", "size", "half"},
     "onnx": {"decode"},
+    "html": {"max_gpu_mb"},
+    "web": {"max_gpu_mb"},
 }
 
 
@@ -91,6 +95,8 @@ class ExportOptions:
     """Colours in a volume."""
     decode: bool = False
     """The head takes codes and weights instead of features."""
+    max_gpu_mb: int | None = None
+    """Megabytes of graphics memory that a page may take; None is `player.page.page.MAX_GPU_MB`."""
     force: bool = False
     """Replace what is there."""
     max_memory: float | None = None
@@ -120,7 +126,7 @@ def check_options(target: Path, options: ExportOptions) -> str:
         if suffix not in FORMATS:
             raise ConfigError(
                 f"{target}: suffix: expected one of {', '.join(FORMATS)}, or a folder with --format "
-                f"{' or '.join(FOLDERS)}, got {suffix or 'none'}"
+                f"exr, colmap or web, got {suffix or 'none'}"
             )
         name = suffix[1:]
     elif name not in FOLDERS and f".{name}" not in FORMATS:
@@ -151,7 +157,13 @@ def _flag(key: str) -> str:
 
 
 def _check_ranges(options: ExportOptions) -> None:
-    for key, low, high in (("faces", 1, None), ("points", 1, None), ("lods", 2, 10), ("texture", 16, 16384)):
+    for key, low, high in (
+        ("faces", 1, None),
+        ("points", 1, None),
+        ("lods", 2, 10),
+        ("texture", 16, 16384),
+        ("max_gpu_mb", 1, None),
+    ):
         value = getattr(options, key)
         if value is not None and (value < low or (high is not None and value > high)):
             wanted = f"{low} or more" if high is None else f"{low} to {high}"

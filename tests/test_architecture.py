@@ -129,13 +129,13 @@ def test_imports_have_no_circle(node: Callable[[str], str]) -> None:
 
 
 def test_a_folder_can_be_looked_through() -> None:
-    """At most 15 modules, or 8 folders, beside an `__init__`."""
+    """At most 15 modules, or 9 folders, beside an `__init__`."""
     for folder in {
         path.parent for package in (*PACKAGES, "tests") for path in (REPOSITORY / package).rglob("*.py")
     }:
         modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
         rooms = [path for path in folder.iterdir() if path.is_dir() and any(path.rglob("*.py"))]
-        assert len(modules) <= 15 and len(rooms) <= 8, folder
+        assert len(modules) <= 15 and len(rooms) <= 9, folder
 
 
 STARTERS = re.compile(

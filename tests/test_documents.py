@@ -41,8 +41,8 @@ DOCUMENTS = sorted([*(f"docs/{page}" for page in PAGES), "README.md", "CHANGELOG
 MANUAL = [document for document in DOCUMENTS if not document.startswith("docs/notes/")]
 """What speaks of today. A note says how something was measured on its day, and stays as it is."""
 USER_PAGES = (
-    *("index", "install", "photographing", "train", "bake", "play", "export", "python", "conventions"),
-    *("format", "troubleshooting", "benchmarks"),
+    *("index", "install", "photographing", "train", "bake", "play", "page", "export", "python"),
+    *("conventions", "format", "troubleshooting", "benchmarks"),
 )
 OF_ANOTHER_TIME = (
     *(
@@ -325,7 +325,7 @@ def python_blocks(document: str) -> list[str]:
     return [text for language, text in parsed(document).blocks if language == "python"]
 
 
-RUN = {"docs/python.md", "docs/conventions.md", "docs/export.md", "docs/format.md"}
+RUN = {"docs/python.md", "docs/conventions.md", "docs/export.md", "docs/format.md", "docs/page.md"}
 
 
 def test_every_page_with_python_is_run() -> None:

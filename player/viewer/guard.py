@@ -30,6 +30,7 @@ from websockets.http11 import Request, Response
 
 from player.errors import MissingExtraError
 from player.viewer.messages import CAMERA_FIELDS, MAX_BYTES, UPDATE_FIELDS, Check, cleaned
+from player.viewer.pages import NO_PAGES, PAGE_SECONDS, Pages
 
 MOST_CLIENTS = 24
 MOST_SOCKETS = 128
@@ -38,6 +39,8 @@ CAMERA_SECONDS = 1 / 60
 """Seconds between two moves of a camera, at least: of the messages in between the newest counts."""
 RATE = 200.0
 """Messages of one client that are read in a second; a window that is dragged about sends 50."""
+OPEN_SECONDS = 10.0
+"""Seconds in which a request has to be there, and in which its answer, but for a page, has to be taken."""
 FIRST_SECONDS = 60.0
 """Seconds after which a client that has not told its camera is dropped."""
 MOST_FRAGMENTS = 16
@@ -57,10 +60,12 @@ CONNECTION: ContextVar[GuardedConnection] = ContextVar("CONNECTION")
 class Guard:
     """The rules of one server, and its open connections."""
 
-    def __init__(self, host: str, version: str) -> None:
-        """`host`: the address that is served at. `version`: viser's, which its pages have to have as well."""
+    def __init__(self, host: str, version: str, pages: Pages = NO_PAGES) -> None:
+        """`host`: the address that is served at. `version`: viser's, which its pages have to have as well.
+        `pages`: what is served beside them."""
         self._host = host.lower()
         self.version = version
+        self.pages = pages
         self.sockets: set[GuardedConnection] = set()
         self.clients: set[GuardedConnection] = set()
         self.installed = False
@@ -85,6 +90,7 @@ class Guard:
             "create_connection": lambda *args, **kwargs: GuardedConnection(self, *args, **kwargs),
             "max_size": MAX_BYTES,
             "compression": None,
+            "open_timeout": PAGE_SECONDS,  # a connection itself waits less long for all else
             "logger": _logger(),
         }
 
@@ -153,6 +159,18 @@ class GuardedConnection(ServerConnection):
         self._guard.sockets.discard(self)
         self._guard.clients.discard(self)
         super().connection_lost(exc)
+
+    async def handshake(self, *args: Any, **kwargs: Any) -> None:
+        """Answer the connection's first request: a page is sent here, all else as websockets does."""
+        waited = (self.request_rcvd, self.connection_lost_waiter)
+        await asyncio.wait(waited, timeout=OPEN_SECONDS, return_when=asyncio.FIRST_COMPLETED)
+        request, guard = self.request, self._guard
+        if request is None:
+            raise ConnectionError("expected a request")
+        if request.path in guard.pages and "Upgrade" not in request.headers:
+            if guard.refusal(request.path, request.headers) is None:
+                return await guard.pages.send(self, request.path)
+        await asyncio.wait_for(super().handshake(*args, **kwargs), OPEN_SECONDS)
 
     def process_event(self, event: Any) -> None:
         if isinstance(event, Frame):

@@ -21,6 +21,7 @@ from player.files.images import png_bytes
 from player.render import Frame, Renderer
 from player.terminal import printable
 from player.viewer.layers import LAYERS, layer_picture
+from player.viewer.pages import page_path
 from player.viewer.resolution import STILL_SECONDS, Pace, fitted
 
 if TYPE_CHECKING:
@@ -120,6 +121,7 @@ class Window:
             degrees = round(math.degrees(self._client.camera.fov), 1)
             self._fov = gui.add_slider("Field of view", 1.0, 150.0, 0.1, min(max(degrees, 1.0), 150.0))
             self._state = gui.add_text("Now", "", disabled=True)
+            self._link = gui.add_markdown(_link(0))
         for control in (self._layer, self._samples, self._background):
             control.on_update(lambda _: self.touch())
         self._fov.on_update(lambda _: self._set_fov())
@@ -162,6 +164,7 @@ class Window:
     def _switch(self) -> None:
         """Show another asset, with the number of fetches that it was baked for."""
         self._renderer = self._renderers[self._asset.value]
+        self._link.content = _link(list(self._renderers).index(self._asset.value))
         n_fetches = self._renderer.asset.manifest.n_fetches
         self._samples.max = max(self._samples.max, n_fetches)
         self._samples.value = n_fetches
@@ -316,6 +319,11 @@ class Window:
     def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
         self._state.value = state
+
+
+def _link(index: int) -> str:
+    """A line with the address of an asset's page."""
+    return f"[The same on this device's own GPU]({page_path(index)})"
 
 
 def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:

@@ -97,9 +97,10 @@ def test_unknown_suffix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert cli.main([str(tmp_path), str(tmp_path / "mesh.fbx")]) == 1
     error = capsys.readouterr().err
     assert (
-        "suffix: expected one of .ply, .obj, .glb, .stl, .usdc, .usda, .vdb, .npz, .json, .onnx, or" in error
+        "suffix: expected one of .ply, .obj, .glb, .stl, .usdc, .usda, .vdb, .npz, .json, .html, .onnx,"
+        in error
     )
-    assert error.endswith("exr or colmap, got .fbx\n")
+    assert error.endswith("or a folder with --format exr, colmap or web, got .fbx\n")
     assert cli.main([str(tmp_path), str(tmp_path / "mesh")]) == 1
     assert "got none" in capsys.readouterr().err
 

@@ -69,12 +69,12 @@ def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None
     [
         (
             "a.fbx",
-            "suffix: expected one of .ply, .obj, .glb, .stl, .usdc, .usda, .vdb, .npz, .json, .onnx, or a",
+            ".stl, .usdc, .usda, .vdb, .npz, .json, .html, .onnx, or a folder with --format",
         ),
         ("frames/", "got none"),
         (
             "a.ply --format usd",
-            "expected one of ply, obj, glb, stl, usdc, usda, vdb, npz, json, onnx, exr, colmap, got usd",
+            "vdb, npz, json, html, onnx, exr, colmap, web, got usd",
         ),
         ("a.ply --faces 0", "--faces: expected 1 or more, got 0"),
         ("a.ply --points 0", "--points: expected 1 or more, got 0"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,6 +45,8 @@ WAYS = {
     "onnx": "a.onnx",
     "onnx with the decode": "a.onnx --decode",
     "colmap": "a --format colmap --points 40",
+    "html": "a.html",
+    "web": "a --format web",
     "exr": "a --format exr --views 0:2 --size 6x5",
 }
 
@@ -89,7 +92,7 @@ def test_the_old_stays_until_the_new_is_complete(
         target.write_text("old")
     else:
         target.mkdir()
-        (target / {"colmap": "cameras.txt", "exr": "old.exr"}[way]).write_text("old")
+        (target / {"colmap": "cameras.txt", "exr": "old.exr", "web": "main.js"}[way]).write_text("old")
     before = content(tmp_path)
 
     def full(self: Path, other: Path) -> Path:
@@ -161,6 +164,15 @@ def damage(way: str, monkeypatch: pytest.MonkeyPatch) -> str:
             asset_head, "Head", lambda *given: lambda *inputs: head(*given)(*inputs) + np.float32(0.01)
         )
         return "rgb, one pixel: pixel 0"
+    page = import_module("player.page.page")  # its package has a function of that name
+    if way == "html":
+        text = page.text_of_bytes
+        monkeypatch.setattr(page, "text_of_bytes", lambda data: text(data[:-1] + bytes([data[-1] ^ 1])))
+        return "cameras.json: expected sha256"
+    if way == "web":
+        data = page.scene_files
+        monkeypatch.setattr(page, "scene_files", lambda asset: {**data(asset), "part_0.bin": b"other"})
+        return "part_0.bin: expected sha256"
     if way == "exr":
 
         def file(first: Any, *rest: Any, **more: Any) -> Any:

@@ -1,0 +1,84 @@
+"""A head as a page has it: `head.json`, which says what there is, and `head.bin`, the numbers.
+
+A layer in the JSON is {"n_in", "n_out", "weight", "bias", "scale"}, the last three {"type": "float32", "int8"
+or "int32", "first": its first byte in `head.bin`, a multiple of 4} or null; the names of layers are those of
+`player.head.graph.HeadArrays`. `monomials` are [parent, axis]: each is the product of an earlier one, -1 for
+1, and a component of the direction.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from player.head.graph import HeadArrays, Layer, monomials
+
+_TYPES = {"float32": "<f4", "int8": "<i1", "int32": "<i4"}
+
+
+class HeadData(NamedTuple):
+    """The two files of a head."""
+
+    description: bytes
+    """`head.json`."""
+    numbers: bytes
+    """`head.bin`."""
+
+
+class _Numbers:
+    def __init__(self) -> None:
+        self.data = b""
+
+    def add(self, array: np.ndarray | None) -> dict[str, Any] | None:
+        if array is None:
+            return None
+        first = len(self.data)
+        data = np.ascontiguousarray(array, _TYPES[array.dtype.name]).tobytes()
+        self.data += data + bytes(-len(data) % 4)
+        return {"type": array.dtype.name, "first": first}
+
+    def layer(self, layer: Layer) -> dict[str, Any]:
+        n_in, n_out = layer.weight.shape
+        names = {name: self.add(getattr(layer, name)) for name in Layer._fields}
+        return {"n_in": n_in, "n_out": n_out, **names}
+
+
+def head_data(head: HeadArrays) -> HeadData:
+    """The files of a head."""
+    numbers = _Numbers()
+    n_in, n_out = head.from_sh.shape
+    from_sh = {"n_in": n_in, "n_out": n_out, "weight": numbers.add(head.from_sh), "bias": None, "scale": None}
+    description = {
+        "sh_degree": head.form.sh_degree,
+        "in_8_bits": head.form.in_8_bits,
+        "n_channels": head.n_channels,
+        "spatial": [numbers.layer(layer) for layer in head.spatial],
+        "to_sh": numbers.layer(head.to_sh),
+        "harmonics": numbers.layer(head.harmonics),
+        "bottleneck": numbers.layer(head.bottleneck),
+        "from_sh": from_sh,
+        "directional": [numbers.layer(layer) for layer in head.directional],
+        "output": numbers.layer(head.output),
+        "roundings": [{"scale": float(r.scale), "zero": int(r.zero)} for r in head.roundings],
+        "monomials": monomial_products(head.form.sh_degree),
+    }
+    return HeadData(json.dumps(description, separators=(",", ":")).encode(), numbers.data)
+
+
+def monomial_products(sh_degree: int) -> list[tuple[int, int]]:
+    """For each monomial of the orders 1 to `sh_degree` - 1: its parent's place in this list, -1 for 1, and
+    the axis, 0 to 2, that it is the product of.
+
+    >>> monomial_products(3)[:5]
+    [(-1, 0), (-1, 1), (-1, 2), (0, 0), (1, 0)]
+    """
+    found: list[tuple[int, int]] = []
+    below = -1  # where the monomials of the order below begin
+    for order in range(1, sh_degree):
+        _, parents, axes = monomials(order)
+        begin = len(found)
+        found += [(below + parent, axis) for parent, axis in zip(parents, axes, strict=True)]
+        below = begin
+    return found

@@ -1,0 +1,224 @@
+"""An asset as one HTML file that plays it in any browser, or as a folder for a web server.
+
+Both have the same modules, shaders, styles and data (`player/page/web`, and for the data
+`player.page.scene_files`). The file has them inside: the modules as one script (`player.page.modules`),
+packed by zlib, and the data, both as text (`player.page.text_bytes`). All of it is ASCII, so that no charset
+that a server claims can change it.
+
+Files of `player/page/web`:
+
+- `*.js` are ES modules that keep to the rules of `player.page.modules`: `main.js` begins, `worker.js`
+  decodes; `boot.js` unpacks the script of the one file and runs it.
+- `*.glsl` are shaders. They come as the module `shaders.js`, which is written here:
+  `import { shaders } from "./shaders.js";`, then `shaders["march.glsl"]`.
+- `style.css` is the style.
+- `index.html` is the page. `{{title}}` in it becomes text, `{{poster}}` an address for `src`; `{{policy}}`,
+  `{{style}}`, `{{data}}` and `{{script}}` become whole elements.
+
+In the file, each file of the data is an element `<script type="text/plain" data-file="NAME">`, the manifest
+as it is and the others as text. The script is the element with the id `script`, whose text is also what its
+worker runs. What begins comes before the data, so that it can tell where these are cut short.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+import zlib
+from collections.abc import Mapping
+from importlib import resources
+from typing import NamedTuple
+
+from player.asset.asset import Asset
+from player.errors import ConfigError
+from player.page.gpu_memory import gpu_bytes
+from player.page.modules import joined, without_comments
+from player.page.poster import poster_bytes
+from player.page.scene_files import MANIFEST, scene_files
+from player.page.text_bytes import text_of_bytes
+
+INDEX = "index.html"
+STYLE = "style.css"
+BOOT = "boot.js"
+POSTER = "poster.jpg"
+MAX_GPU_MB = 512
+"""Megabytes of graphics memory that a page may take, unless more are allowed."""
+_POLICY = (
+    "default-src 'none'; script-src {script}; style-src {style}; img-src data: blob: {img}; "
+    "worker-src {worker}; connect-src {connect}; base-uri 'none'; form-action 'none'"
+)
+
+
+class WebPage(NamedTuple):
+    """What an asset's page consists of."""
+
+    files: dict[str, bytes]
+    """Content by name: `index.html` alone for one file."""
+    viewer_bytes: int
+    """Bytes of all but the scene's data and the poster."""
+    gpu_bytes: int
+    """Graphics memory that it will take."""
+
+
+def page(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> bytes:
+    """One HTML file, ASCII, which asks for nothing beside itself.
+
+    Args:
+        asset: an open asset, all of its parts.
+        title: the page's title; the name of the asset's folder if None.
+        max_gpu_mb: megabytes of graphics memory that it may take.
+
+    Raises:
+        ConfigError: it takes more graphics memory, or was opened with fewer parts.
+        FormatError: a file of the asset is broken, or a part is missing.
+
+    >>> page(Asset.open("out/"))[:15]
+    b'<!doctype html>'
+    """
+    return page_of_one_file(asset, title, max_gpu_mb).files[INDEX]
+
+
+def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
+    """As `page`, with what there is to say about it."""
+    n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
+    sources = web_files()
+    style, script = _escaped_style(sources[STYLE] + _behind(asset)), page_script(sources)
+    boot, packed = page_script(sources, BOOT, BOOT), zlib.compress(script.encode(), 9)
+    policy = _POLICY.format(
+        script=f"{_hash(boot)} {_hash(script)}",
+        style=_hash(style),
+        img="",
+        worker="blob:",
+        connect="'none'",
+    )
+    viewer = text_of_bytes(packed).decode()
+    poster = base64.b64encode(poster_bytes(asset)).decode()
+    filled = {
+        "policy": _policy_element(policy),
+        "title": _title(asset, title),
+        "style": f"<style>{style}</style>",
+        "poster": f"data:image/jpeg;base64,{poster}",
+        "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
+        f'<script type="module">{boot}</script>',
+        "data": "{{data}}",
+    }
+    before, behind = map(_ascii_html, _filled(sources[INDEX], filled).split("{{data}}"))
+    content = before + data_elements(scene_files(asset)) + behind
+    return WebPage({INDEX: content}, len(before) + len(behind) - len(poster), n_gpu)
+
+
+def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
+    """The files of a folder for a web server. The page, `index.html`, shows something after the first part.
+    Arguments and errors as `page`.
+
+    >>> files = page_of_many_files(Asset.open("out/")).files
+    >>> {"index.html", "main.js", "part_0.bin"} <= set(files)
+    True
+    """
+    n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
+    sources = {name: text for name, text in web_files().items() if name != BOOT}
+    policy = _POLICY.format(script="'self'", style="'self'", img="'self'", worker="'self'", connect="'self'")
+    filled = {
+        "policy": _policy_element(policy),
+        "title": _title(asset, title),
+        "style": f'<link rel="stylesheet" href="{STYLE}">',
+        "poster": POSTER,
+        "script": '<script type="module" id="script" src="main.js"></script>',
+        "data": "",
+    }
+    sources[INDEX] = _filled(sources[INDEX], filled)
+    sources[STYLE] += _behind(asset)
+    viewer = {name: _ascii_html(text) if name == INDEX else text.encode() for name, text in sources.items()}
+    files = {**viewer, POSTER: poster_bytes(asset), **scene_files(asset)}
+    return WebPage(files, sum(map(len, viewer.values())), n_gpu)
+
+
+def is_site_file(name: str) -> bool:
+    """Whether `page_of_many_files` writes a file of that name.
+
+    >>> is_site_file("main.js"), is_site_file("part_3.bin"), is_site_file("mine.js")
+    (True, True, False)
+    """
+    data = r"manifest\.json|cameras\.json|head\.(json|bin)|part_\d+\.bin"
+    return name in web_files() or name == POSTER or re.fullmatch(data, name) is not None
+
+
+def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
+    found = gpu_bytes(asset)
+    if found > max_gpu_mb * 1_000_000:
+        raise ConfigError(
+            f"{asset.folder}: graphics memory: expected at most {max_gpu_mb} MB, got "
+            f"{found / 1e6:.0f} MB: bake it smaller (vfr-bake --preset), or allow more (--max-gpu-mb)"
+        )
+    return found
+
+
+def _behind(asset: Asset) -> str:
+    """A rule of style: beside the poster there is the scene's background."""
+    red, green, blue = (round(255 * value) for value in asset.manifest.background)
+    return f"#stage {{ background: rgb({red}, {green}, {blue}); }}\n"
+
+
+def _title(asset: Asset, title: str | None) -> str:
+    return html.escape(asset.folder.resolve().name if title is None else title)
+
+
+def web_files() -> dict[str, str]:
+    """The modules, styles and the page itself by file name, without comments, with the shaders as
+    `shaders.js`."""
+    folder = resources.files("player.page") / "web"
+    files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
+    found = {name: _stripped(name, text) for name, text in sorted(files.items())}
+    shaders = {name: found.pop(name) for name in list(found) if name.endswith(".glsl")}
+    found["shaders.js"] = f"export const shaders = {json.dumps(shaders, indent=0)};\n"
+    return found
+
+
+def data_elements(files: Mapping[str, bytes]) -> bytes:
+    """The elements of a page that hold the files of `scene_files`."""
+    texts = {
+        name: data.replace(b"<", b"\\u003c") if name == MANIFEST else text_of_bytes(data)
+        for name, data in files.items()
+    }
+    return b"".join(
+        b'<script type="text/plain" data-file="%s">%s</script>\n' % (name.encode(), text)
+        for name, text in texts.items()
+    )
+
+
+def _stripped(name: str, text: str) -> str:
+    return without_comments(text) if name.endswith((".js", ".glsl", ".css")) else text
+
+
+def page_script(files: Mapping[str, str], begin: str = "main.js", worker: str = "worker.js") -> str:
+    """The one script of a page, in ASCII, of those modules among `web_files` that it needs."""
+    script = joined(files, begin, worker)
+    script = re.sub(r"</(?=script)", r"<\\/", script, flags=re.IGNORECASE).replace("<!--", r"<\!--")
+    units = script.encode("utf-16-le")
+    codes = (int.from_bytes(units[i : i + 2], "little") for i in range(0, len(units), 2))
+    return "".join(chr(code) if code < 128 else f"\\u{code:04x}" for code in codes)
+
+
+def _escaped_style(style: str) -> str:
+    return "".join(letter if letter.isascii() else f"\\{ord(letter):x} " for letter in style)
+
+
+def _ascii_html(text: str) -> bytes:
+    return text.encode("ascii", "xmlcharrefreplace")
+
+
+def _hash(text: str) -> str:
+    """As a Content-Security-Policy names an element by its text."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _policy_element(policy: str) -> str:
+    return f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+
+
+def _filled(index: str, values: Mapping[str, str]) -> str:
+    """The page with each `{{name}}` filled in; what is filled in is not looked at again."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], index)

@@ -1,0 +1,32 @@
+"""The picture that a page shows before anything else, and where nothing else can be shown."""
+
+from __future__ import annotations
+
+import io
+
+from player.asset.asset import Asset
+from player.cameras.views import asset_cameras
+from player.page.rest import rest_camera
+from player.render import Renderer
+
+LONGEST = 800
+"""Pixels of the longer side, at most."""
+QUALITY = 85
+
+
+def poster_bytes(asset: Asset) -> bytes:
+    """A JPEG of what the page begins with, over the asset's background.
+
+    >>> poster_bytes(Asset.open("out/"))[:3]
+    b'\\xff\\xd8\\xff'
+    """
+    from PIL import Image
+
+    camera = rest_camera(asset_cameras(asset))
+    scale = min(LONGEST / max(camera.width, camera.height), 1.0)
+    size = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
+    with Renderer(asset) as renderer:
+        frame = renderer.render(camera.resized(*size))
+    buffer = io.BytesIO()
+    Image.fromarray(frame.to_uint8()).save(buffer, "JPEG", quality=QUALITY, optimize=True, progressive=True)
+    return buffer.getvalue()

@@ -1,0 +1,74 @@
+"""The data of a page: the files that its loader asks for, by name.
+
+| file | content |
+|---|---|
+| `manifest.json` | the asset's manifest as version 4.0, without provenance, and with these `files` |
+| `cameras.json` | for each camera its name, width, height, fx, fy, cx, cy and c2w (16 numbers by rows) |
+| `head.json`, `head.bin` | the head (`player.page.head_data`) |
+| `part_0.bin`, ... | the asset's own parts |
+
+An asset of version 3 has its densities and features written as the parts of a pyramid of one level, which
+holds the same values.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+
+from player.asset.arranging import write_parts
+from player.asset.asset import Asset
+from player.asset.manifest import NAME, VERSION, FileEntry, manifest_bytes
+from player.cameras.views import asset_cameras
+from player.errors import ConfigError, FormatError
+from player.head.head import read_head_file
+from player.page.head_data import head_data
+
+MANIFEST = NAME
+
+
+def scene_files(asset: Asset) -> dict[str, bytes]:
+    """The data of a page, in the order in which they are asked for.
+
+    Raises FormatError: a file of the asset is broken, or a part is missing; ConfigError: it was opened with
+    fewer parts.
+
+    >>> list(scene_files(Asset.open("out/")))
+    ['manifest.json', 'cameras.json', 'head.json', 'head.bin', 'part_0.bin']
+    """
+    if asset.missing is not None:
+        raise FormatError(asset.missing)
+    manifest = asset.manifest
+    if asset.n_parts < len(manifest.parts):
+        raise ConfigError(
+            f"{asset.folder}: parts: expected an asset that was opened with all of its "
+            f"{len(manifest.parts)}, got {asset.n_parts}"
+        )
+    _, arrays = read_head_file(asset.path("head.onnx"), manifest.n_channels)
+    head = head_data(arrays)
+    files = {"cameras.json": _cameras(asset), "head.json": head.description, "head.bin": head.numbers}
+    if manifest.parts:
+        files |= {part.file: asset.read(part.file) for part in manifest.parts}
+    else:
+        stored = asset.arrays
+        written = write_parts(stored.densities, stored.features, manifest, 0, 0)
+        manifest = replace(manifest, parts=tuple(each.part for each in written))
+        files |= {each.part.file: each.data for each in written}
+    entries = {name: FileEntry(len(data), hashlib.sha256(data).hexdigest()) for name, data in files.items()}
+    document = manifest_bytes(replace(manifest, version=VERSION, files=entries, provenance={}))
+    compact = json.dumps(json.loads(document), separators=(",", ":")).encode()
+    return {MANIFEST: compact, **files}
+
+
+def _cameras(asset: Asset) -> bytes:
+    numbers = ("width", "height", "fx", "fy", "cx", "cy")
+    cameras = [
+        {
+            "name": camera.name,
+            **{key: getattr(camera, key) for key in numbers},
+            "c2w": camera.c2w.reshape(-1).tolist(),
+        }
+        for camera in asset_cameras(asset)
+    ]
+    return json.dumps(cameras, separators=(",", ":")).encode()

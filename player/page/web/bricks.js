@@ -1,0 +1,92 @@
+// Bricks of one level, each with a mask of 512 bits, and how to find them. The twin of Bricks and Vertices in
+// player/asset/pyramid.py.
+
+// A coordinate of three components from 0 to 511 as one integer, which rises with (x, y, z).
+export const keyOf = (x, y, z) => (x << 18) | (y << 9) | z;
+
+export function popcount(word) {
+  word -= (word >>> 1) & 0x55555555;
+  word = (word & 0x33333333) + ((word >>> 2) & 0x33333333);
+  return Math.imul((word + (word >>> 4)) & 0x0f0f0f0f, 0x01010101) >>> 24;
+}
+
+export class Bricks {
+  // - keys: Int32Array [n], sorted, each at most once;
+  // - masks: Uint32Array [16 n]: bit b = 64 x + 8 y + z of a brick is bit b & 31 of its word b >> 5.
+  constructor(keys, masks) {
+    this.keys = keys;
+    this.masks = masks;
+    this.n = keys.length;
+    const size = 1 << Math.max(2, 32 - Math.clz32(2 * this.n));
+    this.slots = new Int32Array(size).fill(-1);
+    for (let i = 0; i < this.n; i++) {
+      let slot = hash(keys[i]) & (size - 1);
+      while (this.slots[slot] >= 0) slot = (slot + 1) & (size - 1);
+      this.slots[slot] = i;
+    }
+  }
+
+  // The coordinates as Uint16Array [3 n].
+  coords() {
+    const found = new Uint16Array(3 * this.n);
+    for (let i = 0; i < this.n; i++) {
+      found[3 * i] = this.keys[i] >> 18;
+      found[3 * i + 1] = (this.keys[i] >> 9) & 511;
+      found[3 * i + 2] = this.keys[i] & 511;
+    }
+    return found;
+  }
+
+  // Which brick has the coordinate, -1 if none.
+  find(x, y, z) {
+    if ((x | y | z) < 0) return -1;
+    const key = keyOf(x, y, z);
+    const last = this.slots.length - 1;
+    for (let slot = hash(key) & last; ; slot = (slot + 1) & last) {
+      const i = this.slots[slot];
+      if (i < 0 || this.keys[i] === key) return i;
+    }
+  }
+
+  // Those whose masks are not all 0.
+  withoutEmpty() {
+    const kept = [];
+    for (let i = 0; i < this.n; i++) {
+      if (this.masks.subarray(16 * i, 16 * i + 16).some((word) => word !== 0)) kept.push(i);
+    }
+    if (kept.length === this.n) return this;
+    const masks = new Uint32Array(16 * kept.length);
+    kept.forEach((i, to) => masks.set(this.masks.subarray(16 * i, 16 * i + 16), 16 * to));
+    return new Bricks(Int32Array.from(kept, (i) => this.keys[i]), masks);
+  }
+}
+
+export const NO_BRICKS = new Bricks(new Int32Array(0), new Uint32Array(0));
+
+function hash(key) {
+  const mixed = Math.imul(key, 0x9e3779b1);
+  return mixed ^ (mixed >>> 15);
+}
+
+// Numbers of vertices in the order of bricks and then of bits.
+export class Ranks {
+  constructor(bricks, masks) {
+    this.bricks = bricks;
+    this.masks = masks;
+    this.first = new Int32Array(masks.length); // of each word
+    let n = 0;
+    for (let word = 0; word < masks.length; word++) {
+      this.first[word] = n;
+      n += popcount(masks[word]);
+    }
+    this.n = n;
+  }
+
+  // The number of bit b of a brick; `none` if the bit is not set, or the brick is -1.
+  at(brick, b, none) {
+    if (brick < 0) return none;
+    const word = 16 * brick + (b >> 5);
+    const bits = this.masks[word];
+    return (bits >>> (b & 31)) & 1 ? this.first[word] + popcount(bits & ((1 << (b & 31)) - 1)) : none;
+  }
+}

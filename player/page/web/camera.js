@@ -1,0 +1,42 @@
+// From a view, a camera in the world's frame, to the rays of its pixels in the model frame.
+//
+// The ray through pixel (x, y) goes along centre + (x - px) across + (y - py) down, where `centre` has length 1 and
+// belongs to the pixel (px, py). That pixel is the one that the box's middle is in, if the camera is far away, and rays
+// begin beside the box then: what is left of float32 is what lies between the pixels of the box.
+
+const FAR_AWAY = 64; // half diagonals of the box
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const sum = (a, s, b) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
+
+// { rotation [9], row-major, scale, move [3] } of a similarity [4][4]: x -> scale rotation x + move.
+function similarity(matrix) {
+  const scale = Math.hypot(matrix[0][0], matrix[0][1], matrix[0][2]);
+  return { scale, rotation: matrix.slice(0, 3).map((row) => row.slice(0, 3).map((x) => x / scale)), move: matrix.slice(0, 3).map((row) => row[3]) };
+}
+
+// What the shaders' uniforms of the same names are to be.
+export function raysOf(view, manifest) {
+  const { scale, rotation, move } = similarity(manifest.world_from_model);
+  const turn = (v) => [0, 1, 2].map((i) => rotation[0][i] * v[0] + rotation[1][i] * v[1] + rotation[2][i] * v[2]);
+  const column = (i) => [view.c2w[i], view.c2w[4 + i], view.c2w[8 + i]];
+  const [right, up, back] = [0, 1, 2].map((i) => turn(column(i)));
+  const eye = turn(sum(column(3), -1, move)).map((x) => x / scale);
+  const [low, high] = manifest.aabb;
+  const middle = low.map((x, i) => (x + high[i]) / 2), radius = Math.hypot(...low.map((x, i) => high[i] - x)) / 2;
+  const way = sum(middle, -1, eye), distance = Math.hypot(...way);
+  const start = !manifest.contracted && distance > FAR_AWAY * radius ? distance - radius : 0;
+  const ahead = -dot(way, back);
+  let pixel = [view.cx, view.cy];
+  if (start && ahead > 0.01 * distance) {
+    pixel = [view.cx + (view.fx * dot(way, right)) / ahead, view.cy - (view.fy * dot(way, up)) / ahead];
+  }
+  const centre = sum(sum(back.map((x) => -x), (pixel[0] - view.cx) / view.fx, right), -(pixel[1] - view.cy) / view.fy, up);
+  const norm = Math.hypot(...centre), unit = centre.map((x) => x / norm);
+  return {
+    uOrigin: sum(eye, start, unit), uStart: start, uCentre: unit, uPixel: pixel,
+    uAcross: right.map((x) => x / (view.fx * norm)), uDown: up.map((x) => -x / (view.fy * norm)),
+    uScale: scale, uDepths: [Math.max(distance - radius, 0) * scale, (distance + radius) * scale],
+    uWorldFromModel: [0, 1, 2].flatMap((i) => rotation.map((row) => row[i])),
+  };
+}

@@ -1,0 +1,213 @@
+// Decodes sections of small integers: interleaved rANS with contexts (docs/format.md, "Coder"). The twin of
+// player/asset/coder, with its names.
+
+const END = 63; // the largest magnitude that has a place of its own in a table
+const N_SYMBOLS = 2 * END + 1;
+const BITS = 12;
+const TOTAL = 1 << BITS;
+const MAX_TABLES = 64;
+const MAX_LANES = 4096;
+const MAX_SYMBOL = 255;
+const N_CONTEXTS = 81;
+const NEAR = 15;
+const HALF = 64;
+const SUM_STEPS = [1, 2, 3, 5, 8, 12, 18, 30];
+const LEAN_STEPS = [1, 2, 4, 8];
+
+// Magnitude and sign of clipped symbols in one integer, 128 |s| + s, by the symbol + 63.
+const MIXED = Int16Array.from({ length: N_SYMBOLS }, (_, i) => {
+  const near = Math.max(-NEAR, Math.min(NEAR, i - END));
+  return 128 * Math.abs(near) + near;
+});
+
+// The context by the sum of the three neighbours' MIXED and 64.
+const CONTEXT_OF_SUM = Uint8Array.from({ length: (3 * NEAR + 1) << 7 }, (_, i) => {
+  const total = i >> 7;
+  const lean = i - HALF - (total << 7);
+  const rise = SUM_STEPS.filter((most) => most <= total).length;
+  const side = LEAN_STEPS.filter((most) => most <= Math.abs(lean)).length * Math.sign(lean);
+  return rise * (2 * LEAN_STEPS.length + 1) + side + LEAN_STEPS.length;
+});
+
+// What a zlib stream holds, at most `most` bytes; null if it is none, or holds more.
+async function inflated(bytes, most) {
+  const found = new Uint8Array(most);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const reader = stream.getReader();
+  let length = 0;
+  try {
+    for (;;) {
+      const { done, value } = await reader.read();
+      if (done) return found.subarray(0, length);
+      if (length + value.length > most) {
+        reader.cancel().catch(() => {});
+        return null;
+      }
+      found.set(value, length);
+      length += value.length;
+    }
+  } catch {
+    return null;
+  }
+}
+
+// A section's tables: symbols [n_tables * 4096], the symbol + 63 at each place; entries [n_tables * 128], for each
+// symbol + 63 its count, times 4096, and where its places begin; ofContext, the table of each context.
+async function unpackTables(bytes, nNamed, where) {
+  const content = await inflated(bytes, nNamed + 1 + MAX_TABLES * (2 + 2 * N_SYMBOLS));
+  if (!content || content.length <= nNamed) throw new Error(`${where}: tables: expected one whole zlib stream`);
+  const nTables = content[nNamed];
+  let at = nNamed + 1 + 2 * nTables;
+  if (nTables < 1 || nTables > MAX_TABLES || at > content.length) {
+    throw new Error(`${where}: tables: expected 1 to ${MAX_TABLES}`);
+  }
+  const ofContext = content.subarray(0, nNamed);
+  for (let i = 0; i < nNamed; i++) {
+    if (ofContext[i] >= nTables) throw new Error(`${where}: tables: expected contexts that name one of them`);
+  }
+  const symbols = new Uint8Array(nTables * TOTAL);
+  const entries = new Int32Array(nTables * 128);
+  let hasEnds = false;
+  for (let table = 0; table < nTables; table++) {
+    const first = content[nNamed + 1 + 2 * table];
+    const n = content[nNamed + 2 + 2 * table];
+    if (first + n > N_SYMBOLS || at + 2 * n > content.length) {
+      throw new Error(`${where}: tables: expected counts of symbols from -${END} to ${END}`);
+    }
+    let place = 0;
+    for (let symbol = first; symbol < first + n; symbol++, at += 2) {
+      const count = content[at] | (content[at + 1] << 8);
+      if (place + count > TOTAL) break;
+      symbols.fill(symbol, table * TOTAL + place, table * TOTAL + place + count);
+      entries[table * 128 + symbol] = (count << BITS) | (place & (TOTAL - 1));
+      hasEnds ||= count > 0 && (symbol === 0 || symbol === N_SYMBOLS - 1);
+      place += count;
+    }
+    if (place !== TOTAL) throw new Error(`${where}: tables: expected counts that add up to ${TOTAL}`);
+  }
+  if (at !== content.length) throw new Error(`${where}: tables: expected nothing behind the counts`);
+  return { symbols, entries, ofContext, hasEnds };
+}
+
+// Decodes a section channel by channel.
+export class Decoder {
+  // - bytes: a section's bytes;
+  // - neighbours: [alongZ, alongY, alongX], each Int32Array [n]: the rows beside each row, n for one that is not there;
+  // - nChannels, nClasses: as it was encoded;
+  // - where: the section's name in messages.
+  // Rejects with an Error if it is not a section of so many rows and channels. Memory is bounded by the rows, by the
+  // length of `bytes`, and by 2 MB.
+  static async open(bytes, neighbours, nChannels, nClasses, where) {
+    const n = neighbours[0].length;
+    const decoder = new Decoder();
+    Object.assign(decoder, { where, neighbours, nChannels, nClasses, n, channelsDone: 0 });
+    decoder.isEmpty = n * nChannels === 0;
+    if (decoder.isEmpty) {
+      if (bytes.length) throw new Error(`${where}: expected no bytes for no symbols, got ${bytes.length}`);
+      return decoder;
+    }
+    if (bytes.length < 12) throw new Error(`${where}: expected a header of 12 bytes, got ${bytes.length}`);
+    const header = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
+    const [nLanes, nPacked, nWords] = [0, 4, 8].map((at) => header.getUint32(at, true));
+    if (nLanes < 1 || nLanes > Math.min(MAX_LANES, n)) {
+      throw new Error(`${where}: lanes: expected 1 to ${Math.min(MAX_LANES, n)}, got ${nLanes}`);
+    }
+    const begin = 12 + nPacked;
+    const wordsBegin = begin + 4 * nLanes;
+    const end = wordsBegin + 2 * nWords;
+    if (bytes.length < end) throw new Error(`${where}: expected at least ${end} bytes, got ${bytes.length}`);
+    decoder.tables = await unpackTables(bytes.subarray(12, begin), nChannels * nClasses * N_CONTEXTS, where);
+    decoder.states = new Int32Array(bytes.slice(begin, wordsBegin).buffer);
+    if (decoder.states.some((state) => state >>> 16 === 0)) throw new Error(`${where}: states: expected 65536 or more`);
+    decoder.words = new Uint16Array(nWords + nLanes);
+    decoder.words.set(new Uint16Array(bytes.slice(wordsBegin, end).buffer));
+    decoder.nWords = nWords;
+    decoder.wordsTaken = 0;
+    // For each symbol of -63 or 63, channel by channel and row by row: how much further from 0 it is.
+    decoder.beyond = bytes.subarray(end);
+    if (decoder.beyond.some((more) => more > MAX_SYMBOL - END)) {
+      throw new Error(`${where}: symbols: expected magnitudes up to ${MAX_SYMBOL}`);
+    }
+    decoder.beyondTaken = 0;
+    decoder.near = new Int16Array(n + 1);
+    decoder.ofStep = new Uint8Array(nLanes);
+    return decoder;
+  }
+
+  // Decodes the next channel into `found` Uint8Array [n], the symbols + 63, for `classes` Uint8Array [n]; returns how
+  // many of `beyond` are those of earlier channels. Throws an Error.
+  channel(classes, found) {
+    if (this.isEmpty) return 0;
+    const { n, tables, states, words, neighbours, near, ofStep } = this;
+    near.fill(0);
+    const ofContext = tables.ofContext.slice(
+      this.channelsDone * this.nClasses * N_CONTEXTS,
+      (this.channelsDone + 1) * this.nClasses * N_CONTEXTS,
+    );
+    this.wordsTaken = decodeChannel(
+      words, this.wordsTaken, states, tables.symbols, tables.entries, ofContext, classes,
+      neighbours[0], neighbours[1], neighbours[2], near, ofStep, found,
+    );
+    if (this.wordsTaken < 0) throw new Error(`${this.where}: words: expected more than ${this.nWords}`);
+    this.channelsDone++;
+    const before = this.beyondTaken;
+    if (tables.hasEnds) {
+      for (let row = 0; row < n; row++) if (found[row] === 0 || found[row] === 2 * END) this.beyondTaken++;
+      if (this.beyondTaken > this.beyond.length) {
+        throw new Error(`${this.where}: symbols beyond ${END}: expected more than ${this.beyond.length}`);
+      }
+    }
+    return before;
+  }
+
+  // Throws an Error unless all is read that there is, and every state is what encoding began with.
+  finish() {
+    if (this.isEmpty) return;
+    if (this.channelsDone !== this.nChannels || this.wordsTaken !== this.nWords) {
+      throw new Error(`${this.where}: words: expected ${this.wordsTaken}, got ${this.nWords}`);
+    }
+    if (this.beyondTaken !== this.beyond.length) {
+      throw new Error(`${this.where}: symbols beyond ${END}: expected ${this.beyondTaken}, got ${this.beyond.length}`);
+    }
+    if (this.states.some((state) => state !== 1 << 16)) throw new Error(`${this.where}: damaged: states do not end`);
+  }
+}
+
+// The symbols + 63 of a channel into `found`; returns how many words are taken then, -1 if there are too few.
+function decodeChannel(
+  words, at, states, symbolOf, entries, ofContext, classes, alongZ, alongY, alongX, near, ofStep, found,
+) {
+  const n = classes.length;
+  const nLanes = states.length;
+  const nWords = words.length - nLanes;
+  const nSteps = Math.floor(n / nLanes);
+  const nLonger = n % nLanes;
+  for (let step = 0; step <= nSteps; step++) {
+    const nActive = step < nSteps ? nLanes : nLonger;
+    let row = step;
+    for (let lane = 0; lane < nActive; lane++) {
+      const total = near[alongZ[row]] + near[alongY[row]] + near[alongX[row]] + HALF;
+      const table = ofContext[classes[row] * N_CONTEXTS + CONTEXT_OF_SUM[total]];
+      let x = states[lane];
+      const place = x & (TOTAL - 1);
+      const symbol = symbolOf[(table << BITS) | place];
+      const entry = entries[(table << 7) | symbol];
+      x = (Math.imul(entry >> BITS, x >>> BITS) + place - (entry & (TOTAL - 1))) | 0;
+      if (x >>> 16 === 0) x = (x << 16) | words[at++];
+      states[lane] = x;
+      ofStep[lane] = symbol;
+      row += lane < nLonger ? nSteps + 1 : nSteps;
+    }
+    row = step;
+    for (let lane = 0; lane < nActive; lane++) { // only now: what is coded at the same step is not known
+      const symbol = ofStep[lane];
+      near[row] = MIXED[symbol];
+      found[row] = symbol;
+      row += lane < nLonger ? nSteps + 1 : nSteps;
+    }
+    if (at > nWords) return -1;
+  }
+  return at;
+}
+
+export const SYMBOL_OF_ZERO = END;

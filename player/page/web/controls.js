@@ -1,0 +1,152 @@
+// Mouse, fingers and keys move the camera.
+//
+//     drag, one finger            turn around the scene; look around while flying
+//     right or Shift drag         move sideways; so do two fingers
+//     wheel, pinch                nearer and away; ahead and back while flying
+//     double click, double tap    turn around what was hit
+//     arrow keys, + and -         turn, nearer and away; with Shift move sideways
+//     W A S D Q E                 fly: ahead, left, back, right, down, up; faster with Shift
+
+import { looked, moved, orbited, zoomed } from "./pose.js";
+
+const WHEEL = { 0: 1, 1: 16, 2: 400 }; // pixels that a step of a wheel stands for, by its unit
+const TURN_SPEED = 1.2; // radians a second, by key
+const FLY_SPEED = 0.5; // radii of the cameras' orbit a second
+const KEY_SECONDS = 0.06; // a key that is only tapped moves as far as in so many seconds
+const TAP_SECONDS = 0.35, TAP_PIXELS = 12; // between the two taps of a double tap
+
+// What each held key does: [right, up, ahead, to the right, to the top, nearer]: flying, turning and zooming, -1 to 1.
+const KEYS = {
+  KeyD: [1, 0, 0, 0, 0, 0], KeyA: [-1, 0, 0, 0, 0, 0], KeyE: [0, 1, 0, 0, 0, 0], KeyQ: [0, -1, 0, 0, 0, 0],
+  KeyW: [0, 0, 1, 0, 0, 0], KeyS: [0, 0, -1, 0, 0, 0],
+  ArrowRight: [0, 0, 0, 1, 0, 0], ArrowLeft: [0, 0, 0, -1, 0, 0], ArrowUp: [0, 0, 0, 0, 1, 0],
+  ArrowDown: [0, 0, 0, 0, -1, 0], "+": [0, 0, 0, 0, 0, 1], "=": [0, 0, 0, 0, 0, 1], "-": [0, 0, 0, 0, 0, -1],
+};
+
+export class Controls {
+  // Listens on the viewer's canvas, and for keys in the whole page where no other control takes them.
+  constructor(viewer) {
+    this.viewer = viewer;
+    this.flies = false;
+    this.pointers = new Map(); // by identity: { x, y, button }
+    this.held = new Map(); // the keys that are held: name to whether Shift was, too
+    this.tap = { at: 0, x: 0, y: 0, moved: 0 };
+    this.engaged = window.self === window.top; // an embedded page takes the wheel once it was clicked
+    const { canvas } = viewer;
+    const on = (target, type, handler, options) => target.addEventListener(type, handler.bind(this), options);
+    on(canvas, "pointerdown", this.down);
+    on(canvas, "pointermove", this.drag);
+    for (const type of ["pointerup", "pointercancel"]) on(canvas, type, this.up);
+    on(canvas, "wheel", this.wheel, { passive: false });
+    on(canvas, "mousedown", (event) => event.button === 1 && event.preventDefault()); // it would scroll
+    on(canvas, "contextmenu", (event) => event.preventDefault());
+    on(window, "keydown", this.keyDown);
+    on(window, "keyup", this.keyUp);
+    on(window, "blur", () => this.held.clear());
+    viewer.step = (seconds) => this.step(seconds);
+  }
+
+  down(event) {
+    const { viewer, pointers, tap } = this;
+    this.engaged = true;
+    viewer.touch();
+    viewer.canvas.setPointerCapture(event.pointerId);
+    const sideways = event.button > 0 || event.shiftKey;
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, sideways });
+    tap.moved = pointers.size > 1 || event.button > 0 ? Infinity : 0;
+  }
+
+  drag(event) {
+    const pointer = this.pointers.get(event.pointerId);
+    if (!pointer) return;
+    const dx = event.clientX - pointer.x, dy = event.clientY - pointer.y;
+    this.tap.moved += Math.hypot(dx, dy);
+    const before = this.spread();
+    Object.assign(pointer, { x: event.clientX, y: event.clientY });
+    if (!dx && !dy) return;
+    if (this.pointers.size === 1 && !pointer.sideways) return this.turn(dx, dy);
+    const n = this.pointers.size; // each finger moves the middle of all by its share
+    this.slide(dx / n, dy / n);
+    if (before) this.near(before / Math.max(this.spread(), 1));
+  }
+
+  up(event) {
+    const { tap } = this;
+    if (!this.pointers.delete(event.pointerId) || event.type === "pointercancel" || tap.moved > TAP_PIXELS) return;
+    const [x, y] = [event.offsetX, event.offsetY];
+    const double = event.timeStamp - tap.at < TAP_SECONDS * 1000 && Math.hypot(x - tap.x, y - tap.y) < 2 * TAP_PIXELS;
+    Object.assign(tap, { at: double ? 0 : event.timeStamp, x, y });
+    if (double) this.viewer.turnAround(x, y);
+  }
+
+  // The distance between two fingers, pixels; 0 for one.
+  spread() {
+    const [a, b] = this.pointers.values();
+    return b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
+  }
+
+  wheel(event) {
+    if (!this.engaged) return;
+    event.preventDefault();
+    const pixels = event.deltaY * WHEEL[event.deltaMode] * (event.ctrlKey ? 6 : 1); // Ctrl: a pinch on a touch pad
+    this.near(Math.exp(Math.min(Math.max(pixels, -400), 400) * 0.0012));
+  }
+
+  // --- what moves mean ---
+
+  turn(dx, dy) {
+    const { frame, canvas } = this.viewer, angle = Math.PI / Math.max(canvas.clientHeight, 1);
+    if (this.flies) this.viewer.move((pose) => looked(frame, pose, dx * angle / 2, dy * angle / 2));
+    else this.viewer.move((pose) => orbited(pose, -dx * angle, dy * angle));
+  }
+
+  slide(dx, dy) {
+    const { viewer } = this, { canvas, frame } = viewer;
+    const { fx } = viewer.view(canvas.clientWidth, canvas.clientHeight);
+    viewer.move((pose) => moved(frame, pose, -dx * pose.distance / fx, dy * pose.distance / fx, 0));
+  }
+
+  // Go nearer (factor below 1) or away.
+  near(factor) {
+    const { frame } = this.viewer;
+    if (this.flies) this.viewer.move((pose) => moved(frame, pose, 0, 0, -Math.log(factor) * frame.radius));
+    else this.viewer.move((pose) => zoomed(frame, pose, factor));
+  }
+
+  keyDown(event) {
+    const name = KEYS[event.code] ? event.code : event.key;
+    const taken = event.target.closest?.("select, input, dialog[open]");
+    if (!KEYS[name] || taken || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    if (!this.held.has(name)) this.press(name, event.shiftKey, KEY_SECONDS);
+    this.held.set(name, event.shiftKey);
+    this.viewer.wake();
+  }
+
+  keyUp(event) {
+    this.held.delete(event.code);
+    for (const name of ["+", "=", "-"]) this.held.delete(name);
+  }
+
+  // Move as the held keys say for so many seconds; whether there are any.
+  step(seconds) {
+    for (const [name, shift] of this.held) this.press(name, shift, seconds);
+    return this.held.size > 0;
+  }
+
+  press(name, shift, seconds) {
+    const { viewer } = this, { frame } = viewer;
+    const [right, up, ahead, turnRight, turnUp, nearer] = KEYS[name];
+    const way = FLY_SPEED * frame.radius * seconds, angle = TURN_SPEED * seconds;
+    if (turnRight || turnUp) {
+      if (shift) viewer.move((pose) => moved(frame, pose, turnRight * way, turnUp * way, 0));
+      else if (this.flies) viewer.move((pose) => looked(frame, pose, -turnRight * angle, turnUp * angle));
+      else viewer.move((pose) => orbited(pose, turnRight * angle, turnUp * angle));
+    } else if (nearer) {
+      this.near(Math.exp(-nearer * seconds));
+    } else {
+      const far = way * (shift ? 3 : 1);
+      viewer.move((pose) => moved(frame, pose, right * far, up * far, ahead * far));
+    }
+  }
+}

@@ -1,0 +1,79 @@
+// Where along a ray to fetch features: at the samples, or at the centroids of k bins of equal mass. The twin of
+// player/march/fetches.py.
+//
+// A ray is marched once, and its samples are kept; one with more than KEPT is marched again.
+
+uniform int uFetches; // k; 0 fetches at every sample
+
+vec2 kept[KEPT]; // s and weight
+float total = 0.0, moment = 0.0;
+int nWeights = 0;
+
+void keepSamples(inout March march) {
+  float s, weight;
+  for (int guard = 0; guard < MOST_STEPS; guard++) {
+    if (!nextSample(march, s, weight)) break;
+    if (nWeights < KEPT) kept[nWeights] = vec2(s, weight);
+    nWeights++;
+    total += weight;
+    moment += weight * s;
+  }
+}
+
+bool again(inout March march, inout int i, out float s, out float weight) {
+  if (nWeights > KEPT) return nextSample(march, s, weight);
+  if (i >= nWeights) return false;
+  s = kept[i].x;
+  weight = kept[i].y;
+  i++;
+  return true;
+}
+
+#if LAYER == 0
+void fetchFeatures(float opacity) {
+  March march = begun();
+  int i = 0;
+  bool few = uFetches == 0 || nWeights <= uFetches;
+  int nBins = few ? nWeights : uFetches;
+  float mass = total / float(nBins), s = 0.0, left = 0.0;
+  for (int bin = 0; bin < MOST_STEPS; bin++) {
+    if (bin >= nBins) break;
+    float place, weight, heavy;
+    if (few) {
+      again(march, i, place, weight);
+      heavy = place;
+    } else {
+      float filled = 0.0, sum = 0.0, most = -1.0;
+      for (int guard = 0; guard < MOST_STEPS; guard++) {
+        if (left <= 0.0 && !again(march, i, s, left)) break;
+        float part = min(left, mass - filled);
+        sum += part * s;
+        filled += part;
+        left -= part;
+        if (part > most) {
+          most = part;
+          heavy = s;
+        }
+        if (filled >= mass) break;
+      }
+      if (filled <= 0.0) break;
+      place = sum / filled;
+      weight = opacity / float(uFetches);
+    }
+    if (!addFeatures(placeAt(place), weight) && !few) addFeatures(placeAt(heavy), weight);
+  }
+}
+#endif
+
+// Where half of the mass is reached.
+float middlePlace() {
+  March march = begun();
+  int i = 0;
+  float s = 0.0, weight, mass = 0.0;
+  for (int guard = 0; guard < MOST_STEPS; guard++) {
+    if (!again(march, i, s, weight)) break;
+    mass += weight;
+    if (mass >= 0.5 * total) break;
+  }
+  return s;
+}

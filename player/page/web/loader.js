@@ -1,0 +1,202 @@
+// Finds the files of a scene, in the page or beside it, has them decoded in a worker, and yields what is known:
+//
+//     for await (const scene of loadScene(onProgress)) ...
+//
+// yields after the first part, and after later ones. A scene is
+//
+//     { manifest, cameras, head, densities, features, n_parts, problem }
+//
+// - manifest: the asset's manifest (docs/format.md), without its provenance;
+// - cameras: [{ name, width, height, fx, fy, cx, cy, c2w: [16], row-major, OpenGL axes, world frame }, ...];
+// - head: { sh_degree, in_8_bits, n_channels, spatial: [layer, ...], to_sh: layer, harmonics: layer, bottleneck: layer,
+//   from_sh: layer, directional: [layer, ...], output: layer, roundings: [{ scale, zero }, ...],
+//   monomials: [[parent, axis], ...] }, as player/head/graph.py names them. A layer is { n_in, n_out, weight, bias, scale }:
+//   weight [n_in * n_out] row-major, bias [n_out] (null for from_sh), scale [n_out] or null: Float32Array, or in 8 bits
+//   weight an Int8Array and bias an Int32Array. A monomial is the product of an earlier one (its place in the list, -1
+//   for 1) and the axis 0 to 2 of the direction;
+// - densities, features: { n_channels, levels: [{ coords: Uint16Array [3 n], cells: Uint32Array [16 n] }, ...], values,
+//   firstRows: [n_levels + 1] }: the finest level first; cells are the 512 bits of each brick, bit b in word b >> 5;
+//   values [n_rows * n_channels] Uint8Array for densities, Int8Array for features, a row for each vertex of each
+//   level, the border's too, levels one after the other, in a level by brick of vertices and then by bit;
+// - n_parts: how many parts are read; problem: a sentence about a part that could not be, or null.
+//
+// onProgress({ done, total }) tells how far it is, half of it for bytes that are there and half for those decoded.
+
+import { SceneReader, checkedFile } from "./scene_reader.js";
+
+const MANIFEST = "manifest.json";
+
+export async function* loadScene(onProgress) {
+  const isFile = document.querySelector("script[data-file]") !== null;
+  const manifest = parsed(MANIFEST, await (isFile ? textInPage(MANIFEST) : fetched(MANIFEST)), isFile);
+  const nParts = manifest.parts.length;
+  const total = manifest.parts.reduce((sum, part) => sum + manifest.files[part.file].bytes, 0);
+  const done = { there: isFile ? total : 0, decoded: 0 };
+  const tell = () => onProgress({ done: done.there + done.decoded, total: 2 * total });
+  const get = async (name) => (isFile ? { text: textInPage(name) } : { bytes: await fetched(name, manifest.files[name], (n) => {
+    if (name.startsWith("part_")) done.there += n;
+    tell();
+  }) });
+  const small = async (name) => checkedFile(name, await get(name), manifest.files[name]);
+  const cameras = JSON.parse(new TextDecoder().decode(await small("cameras.json")));
+  const head = headOf(JSON.parse(new TextDecoder().decode(await small("head.json"))), await small("head.bin"));
+  const reader = await startReader(manifest);
+  let scene = null;
+  let problem = null;
+  try {
+    let next = get(manifest.parts[0].file);
+    for (let part = 0; part < nParts && problem === null; part++) {
+      let read = 0;
+      try {
+        const file = await next;
+        if (part + 1 < nParts) {
+          next = get(manifest.parts[part + 1].file);
+          next.catch(() => {}); // told when it is its turn
+        }
+        await reader.read(file, (n) => {
+          done.decoded += n;
+          tell();
+        });
+        read = 1;
+      } catch (error) {
+        if (part === 0) throw error;
+        problem = `${error.message}: shown as the first ${part} of ${nParts} parts have it`;
+        if (!reader.isWhole) {
+          yield { ...scene, problem };
+          return;
+        }
+      }
+      const isLast = problem !== null || part + 1 === nParts;
+      if (isLast || part === 0 || !isFile) { // what a page holds is there at once: one picture, and the whole
+        const values = await reader.values(isLast);
+        scene = { manifest, cameras, head, ...values, n_parts: part + read, problem };
+        yield scene;
+      }
+    }
+  } finally {
+    reader.close();
+  }
+}
+
+// The text of a file of the data in the page, which gives it away.
+function textInPage(name) {
+  const element = document.querySelector(`script[data-file="${name}"]`);
+  if (!element) throw new Error(`${name}: expected it in the page, got none: the page was cut short`);
+  const text = element.textContent;
+  if (name !== MANIFEST) element.remove();
+  return text;
+}
+
+// A file beside the page, as bytes; `onBytes` is told how many more are there.
+async function fetched(name, entry, onBytes = () => {}) {
+  const response = await fetch(name);
+  if (!response.ok) throw new Error(`${name}: expected it beside the page, got ${response.status}`);
+  const most = entry?.bytes ?? 1 << 24;
+  const data = new Uint8Array(most);
+  let length = 0;
+  const reader = response.body.getReader();
+  for (;;) {
+    const { done, value } = await reader.read();
+    if (done) return data.subarray(0, length);
+    if (length + value.length > most) throw new Error(`${name}: expected at most ${most} bytes, got more`);
+    data.set(value, length);
+    length += value.length;
+    onBytes(value.length);
+  }
+}
+
+function parsed(name, content, isFile) {
+  try {
+    return JSON.parse(isFile ? content : new TextDecoder().decode(content));
+  } catch {
+    throw new Error(`${name}: expected JSON: the page was cut short or changed`);
+  }
+}
+
+const TYPES = { float32: Float32Array, int8: Int8Array, int32: Int32Array };
+
+// The head's description with the numbers in their places.
+function headOf(description, data) {
+  const numbers = data.slice().buffer;
+  const array = (entry, length) => entry && new TYPES[entry.type](numbers, entry.first, length);
+  const layer = ({ n_in, n_out, weight, bias, scale }) => ({
+    n_in, n_out, weight: array(weight, n_in * n_out), bias: array(bias, n_out), scale: array(scale, n_out),
+  });
+  const head = { ...description };
+  for (const name of ["to_sh", "harmonics", "bottleneck", "from_sh", "output"]) head[name] = layer(head[name]);
+  for (const name of ["spatial", "directional"]) head[name] = head[name].map(layer);
+  return head;
+}
+
+// A SceneReader in a worker; in the page itself where no worker can be had.
+async function startReader(manifest) {
+  try {
+    const reader = new WorkerReader();
+    await reader.isReady;
+    await reader.ask("open", manifest);
+    return reader;
+  } catch (error) {
+    if (error instanceof SceneError) throw error;
+    const pause = () => new Promise((resolve) => { setTimeout(resolve); });
+    return Object.assign(new SceneReader(manifest, pause), { close() {} });
+  }
+}
+
+// What is wrong with a scene, where the worker is not to blame.
+class SceneError extends Error {}
+
+class WorkerReader {
+  constructor() {
+    const own = document.getElementById("script").textContent; // of a page in one file
+    const address = own && URL.createObjectURL(new Blob([own], { type: "text/javascript" }));
+    this.worker = own ? new Worker(address) : new Worker("worker.js", { type: "module" });
+    this.waiting = new Map();
+    this.asked = 0;
+    this.isWhole = true;
+    this.onProgress = () => {};
+    this.isReady = new Promise((resolve, reject) => {
+      this.worker.onerror = (event) => {
+        event.preventDefault();
+        const error = new Error(event.message || "the worker does not start");
+        reject(error);
+        for (const { reject: refuse } of this.waiting.values()) refuse(error);
+      };
+      this.worker.onmessage = ({ data }) => {
+        if (data.isReady) resolve();
+        else if (data.progress !== undefined) this.onProgress(data.progress);
+        else this.take(data);
+      };
+    }).finally(() => URL.revokeObjectURL(address));
+  }
+
+  take({ id, result, error, isWhole }) {
+    const { resolve, reject } = this.waiting.get(id);
+    this.waiting.delete(id);
+    if (error === undefined) {
+      resolve(result);
+    } else {
+      this.isWhole = isWhole;
+      reject(new SceneError(error));
+    }
+  }
+
+  ask(call, ...args) {
+    return new Promise((resolve, reject) => {
+      this.waiting.set(++this.asked, { resolve, reject });
+      this.worker.postMessage({ call, args, id: this.asked });
+    });
+  }
+
+  read(file, onProgress) {
+    this.onProgress = onProgress;
+    return this.ask("read", file);
+  }
+
+  values(isLast) {
+    return this.ask("values", isLast);
+  }
+
+  close() {
+    this.worker.terminate();
+  }
+}

@@ -1,0 +1,98 @@
+// The bar below the picture: its buttons and their keys, the help card, the picture as a file, full screen, and the line
+// that says how far things are.
+
+import { Views } from "./views.js";
+
+const LAYERS = ["colour", "depth", "normals", "opacity"];
+const element = (id) => document.getElementById(id);
+
+export class Panel {
+  // What is there before a scene is: `options` are those of the page's address.
+  constructor(options) {
+    document.body.classList.toggle("plain", Boolean(options.noui));
+    document.body.classList.toggle("clear", options.background === "transparent");
+    element("title").textContent = document.title;
+    element("poster").alt = `Preview of ${document.title}`;
+    const card = element("card");
+    card.addEventListener("click", (event) => event.target === card && card.close()); // beside the card
+  }
+
+  // A line below the picture; "" takes it away.
+  say(text) {
+    element("status").textContent = text;
+  }
+
+  // How much of the scene is there, 0..1; 1 takes the bar of progress away.
+  progress(share) {
+    element("progress").value = share;
+    element("progress").hidden = share >= 1;
+  }
+
+  // The scene cannot be shown: the poster stays, and a sentence says what to do.
+  fail(text) {
+    document.body.classList.add("failed");
+    this.progress(1);
+    this.say(text);
+  }
+
+  // Connect the buttons with a viewer.
+  connect(viewer, controls, cameras) {
+    this.viewer = viewer;
+    const layer = element("layer");
+    const views = new Views(viewer, cameras, { select: element("views"), before: element("before"), after: element("after") });
+    const press = (id, on) => element(id).setAttribute("aria-pressed", on);
+    const show = (index) => {
+      layer.selectedIndex = index;
+      viewer.set({ layer: LAYERS[index] });
+    };
+    const actions = {
+      home: () => viewer.flyHome(),
+      turn: () => {
+        const on = !viewer.turning;
+        viewer.touch();
+        viewer.turn(on);
+      },
+      fly: () => press("fly", (controls.flies = !controls.flies)),
+      save: () => this.save(),
+      full: () => this.fullScreen(),
+      help: () => element("card").showModal(),
+    };
+    const keys = {
+      Home: actions.home, " ": actions.turn, g: actions.fly, p: actions.save, f: actions.full, "?": actions.help,
+      "[": () => views.go(-1), "]": () => views.go(1),
+    };
+    LAYERS.forEach((_, index) => (keys[index + 1] = () => show(index)));
+    for (const id in actions) element(id).addEventListener("click", actions[id]);
+    layer.addEventListener("change", () => show(layer.selectedIndex));
+    element("full").hidden = !document.fullscreenEnabled;
+    viewer.onturn = (on) => press("turn", on);
+    press("turn", viewer.turning);
+    window.addEventListener("keydown", (event) => {
+      const action = keys[event.key.length > 1 ? event.key : event.key.toLowerCase()];
+      const taken = event.target.closest?.(`select, input, dialog[open]${event.key === " " ? ", button" : ""}`);
+      if (!action || taken || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      action();
+    });
+    element("bar").inert = false;
+  }
+
+  fullScreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else if (document.fullscreenEnabled) document.documentElement.requestFullscreen().catch(() => {});
+  }
+
+  // Save what the window shows, every pixel of it.
+  async save() {
+    const { width, height, rgba } = await this.viewer.picture();
+    const canvas = Object.assign(document.createElement("canvas"), { width, height });
+    canvas.getContext("2d").putImageData(new ImageData(rgba, width, height), 0, 0);
+    canvas.toBlob((blob) => {
+      const link = Object.assign(document.createElement("a"), {
+        href: URL.createObjectURL(blob), download: `${document.title.replace(/[^\p{L}\p{N} ._-]/gu, "_")}.png`,
+      });
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    }, "image/png");
+  }
+}

@@ -1,0 +1,143 @@
+// Decodes the parts of a scene, one after another. The twin of player/asset/parts.py.
+
+import { Decoder } from "./coder.js";
+import { Pyramid, putValues } from "./pyramid.js";
+import { decodeStructure } from "./structure.js";
+
+// Most memory that a scene may take while it is decoded, bytes: browsers end a page that asks for much more.
+const MOST_BYTES = 3 * 2 ** 30;
+
+// One of the two pyramids, as far as its sections have been read: values of levels that are not known are not there,
+// symbols that are not known are 0.
+class PyramidReader {
+  // `structures`: the structure sections that the parts will bring.
+  constructor(grid, manifest, structures) {
+    const isFeatures = grid === "features";
+    this.steps = isFeatures ? manifest.feature_steps : manifest.density_steps;
+    this.nChannels = isFeatures ? manifest.n_channels : 1;
+    [this.low, this.high] = isFeatures ? [-127, 127] : [0, 255];
+    this.pyramid = new Pyramid(isFeatures ? manifest.feature_resolution : manifest.resolution, this.steps.length);
+    this.nKnown = this.steps.map(() => 0); // channels of each level whose symbols are read
+    this.rows = null; // of the level whose symbols were read last
+    this.rowsLevel = -1;
+    // Rows of all levels, the finest first; a level that is not known yet has none in what is handed out.
+    const nRows = this.steps.map((_, level) => structures.find((s) => s.level === level)?.n_vertices ?? 0);
+    this.firstRows = [0];
+    for (const n of nRows) this.firstRows.push(this.firstRows.at(-1) + n);
+    this.all = new (isFeatures ? Int8Array : Uint8Array)(this.firstRows.at(-1) * this.nChannels);
+  }
+
+  valuesOf(level) {
+    return this.all.subarray(this.firstRows[level] * this.nChannels, this.firstRows[level + 1] * this.nChannels);
+  }
+
+  async readStructure(section, data, where) {
+    const { pyramid } = this;
+    const coarser = pyramid.levels[section.level + 1] ?? null;
+    const n = pyramid.cellsPerAxis(section.level);
+    pyramid.setLevel(section.level, await decodeStructure(data, n, coarser, section.n_bricks, where));
+    const found = pyramid.vertices[section.level].n;
+    if (found !== section.n_vertices) {
+      throw new Error(`${where}: n_vertices: expected ${found}, got ${section.n_vertices}`);
+    }
+  }
+
+  async readSymbols(section, data, where, pause) {
+    const { level, first_channel: first, n_channels: n } = section;
+    if (this.rowsLevel !== level) {
+      this.rows = null; // before the next are made
+      this.rows = this.pyramid.vertices[level].rows();
+      this.rowsLevel = level;
+    }
+    const { rows } = this;
+    const decoder = await Decoder.open(data, rows.neighbours, n, 4, where);
+    const symbols = new Uint8Array(n * rows.n);
+    const beyondFirst = [];
+    for (let channel = 0; channel < n; channel++) {
+      const found = symbols.subarray(channel * rows.n, (channel + 1) * rows.n);
+      beyondFirst.push(decoder.channel(rows.classes, found));
+      await pause();
+    }
+    decoder.finish();
+    this.put(level, first, n, { symbols, beyond: decoder.beyond ?? null, beyondFirst });
+    this.nKnown[level] = first + n;
+  }
+
+  put(level, first, n, { symbols, beyond, beyondFirst }) {
+    const isCoarsest = level + 1 === this.steps.length;
+    putValues({
+      here: this.pyramid.vertices[level],
+      coarser: isCoarsest ? null : this.pyramid.vertices[level + 1],
+      values: this.valuesOf(level),
+      coarserValues: isCoarsest ? null : this.valuesOf(level + 1),
+      nChannels: this.nChannels, first, n, symbols, beyond, beyondFirst,
+      step: this.steps[level], low: this.low, high: this.high,
+    });
+  }
+
+  // What is known so far. `isLast`: the arrays are handed out themselves, and this is at its end.
+  values(isLast) {
+    const { pyramid, nChannels } = this;
+    for (let level = this.steps.length - 1; level >= 0; level--) {
+      const n = nChannels - this.nKnown[level];
+      if (n > 0) this.put(level, this.nKnown[level], n, { symbols: null });
+    }
+    const finest = Math.max(0, pyramid.levels.findIndex((bricks) => bricks.n > 0));
+    const first = this.firstRows[finest];
+    const known = this.all.subarray(first * nChannels);
+    return {
+      n_channels: nChannels,
+      levels: pyramid.levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks.slice() })),
+      values: isLast && first === 0 ? this.all : known.slice(),
+      firstRows: this.firstRows.map((row) => Math.max(0, row - first)),
+    };
+  }
+}
+
+export class PartsReader {
+  // `manifest`: that of the page, which Python has checked. Throws an Error if the scene takes more memory than it may.
+  constructor(manifest) {
+    this.manifest = manifest;
+    const structures = manifest.parts.flatMap((part) => part.sections).filter((s) => s.kind === "structure");
+    const nBytes = structures.reduce((sum, s) => sum + neededBytes(s, manifest), 0);
+    if (nBytes > MOST_BYTES) {
+      throw new Error(`the scene takes ${Math.ceil(nBytes / 1e6)} MB of memory: expected at most 3200 MB`);
+    }
+    this.grids = {};
+    for (const grid of ["densities", "features"]) {
+      this.grids[grid] = new PyramidReader(grid, manifest, structures.filter((s) => s.grid === grid));
+    }
+    this.nRead = 0;
+  }
+
+  // Reads the next part, Uint8Array. Rejects with an Error if it breaks the format; what is known is then that of the
+  // parts before it no longer, and the reader is at its end. `onProgress` is told the bytes of each section, `pause` is
+  // awaited between channels.
+  async read(data, onProgress = () => {}, pause = async () => {}) {
+    const part = this.manifest.parts[this.nRead];
+    let at = 0;
+    for (const section of part.sections) {
+      const bytes = data.subarray(at, at + section.bytes);
+      at += section.bytes;
+      const where = `${part.file}: ${section.grid}, level ${section.level}, ${section.kind}`;
+      const grid = this.grids[section.grid];
+      if (section.kind === "structure") await grid.readStructure(section, bytes, where);
+      else await grid.readSymbols(section, bytes, where, pause);
+      onProgress(section.bytes);
+    }
+    this.nRead++;
+  }
+
+  // The scene's densities and features as loader.js describes them.
+  values(isLast) {
+    const { densities, features } = this.grids;
+    return { densities: densities.values(isLast), features: features.values(isLast) };
+  }
+}
+
+// Memory that a level takes, at most: bytes a brick and a vertex are those of the arrays of this module and of
+// pyramid.js, the rows of one level and symbols of a section of all channels among them.
+function neededBytes(structure, manifest) {
+  const nChannels = structure.grid === "features" ? manifest.n_channels : 1;
+  return 2000 * structure.n_bricks + (40 + 2 * nChannels) * structure.n_vertices;
+}

@@ -1,0 +1,132 @@
+// Shaders put together for a scene, compiled when they are first needed.
+import { WIDTH_BITS } from "./textures.js";
+import { featureWords } from "./grid.js";
+import { headCode } from "./head.js";
+import { shaders } from "./shaders.js";
+
+export const LAYERS = ["colour", "depth", "normals", "opacity", "middle"];
+const KEPT = 64; // samples of a ray that are kept for its fetches
+
+const VERTEX = `#version 300 es
+void main() {
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0, 1);
+}
+`;
+
+// Texts that stand for names in the shaders.
+function featureTexts(nChannels) {
+  const words = featureWords(nChannels), n = Math.ceil(nChannels / 4);
+  const numbers = Array.from({ length: n }, (_, i) => i);
+  let add;
+  if (words < 4) {
+    add = "uvec4 t0 = featureTexel(row);\n";
+    add += numbers.map((i) => `f${i} += share * unpacked(t0.${"xy"[i]});`).join("\n");
+  } else {
+    const nTexels = Math.ceil(words / 4 + (words % 4 ? 0.5 : 0));
+    add = `int at = row * ${words};\n`;
+    for (let i = 0; i < nTexels; i++) add += `uvec4 t${i} = featureTexel((at >> 2) + ${i});\n`;
+    const word = (i) => `t${i >> 2}.${"xyzw"[i & 3]}`;
+    const lines = (from) => numbers.map((i) => `f${i} += share * unpacked(${word(i + from)});`).join("\n");
+    add += words % 4 ? `if ((at & 2) == 0) {\n${lines(0)}\n} else {\n${lines(2)}\n}` : lines(0);
+  }
+  const nWords = 2 * n, nOut = foundTextures(nChannels);
+  const outputs = Array.from({ length: nOut }, (_, i) => `layout(location = ${i}) out uvec4 found${i};\n`);
+  const word = (i) => (i < nWords ? `packSnorm2x16(f${i >> 1}.${i & 1 ? "zw" : "xy"} / 128.0)` : "0u");
+  const write = Array.from({ length: nOut }, (_, i) => `found${i} = uvec4(${[0, 1, 2, 3].map((c) => word(4 * i + c)).join(", ")});`);
+  return {
+    FEATURES: `vec4 ${numbers.map((i) => `f${i}`).join(", ")};`,
+    ADD_ROW: add,
+    CLEAR_FEATURES: numbers.map((i) => `f${i} = `).join("") + "vec4(0);",
+    FOUND_OUTPUTS: `${outputs.join("")}layout(location = ${nOut}) out uvec4 foundOpacity;`,
+    WRITE_FOUND: write.join("\n"),
+    FOUND_INPUTS: Array.from({ length: nOut }, (_, i) => `uniform highp usampler2D uFound${i};`).join("\n"),
+    N_FEATURES: n,
+    READ_FEATURES: Array.from({ length: nOut }, (_, i) => {
+      const lines = [`uvec4 u${i} = texelFetch(uFound${i}, at, 0);`, `f[${2 * i}] = unpackedPair(u${i}.x, u${i}.y);`];
+      return [...lines, ...(2 * i + 1 < n ? [`f[${2 * i + 1}] = unpackedPair(u${i}.z, u${i}.w);`] : [])].join("\n");
+    }).join("\n"),
+  };
+}
+
+// Textures that the march writes for the head, of eight features each, beside one of opacity.
+export const foundTextures = (nChannels) => Math.ceil(nChannels / 8);
+
+const BEGIN = "#version 300 es\n";
+const PRECISION = "precision highp float;\nprecision highp int;\n";
+
+function filled(text, texts) {
+  return text.replace(new RegExp(`\\b(${Object.keys(texts).join("|")})\\b`, "g"), (name) => texts[name]);
+}
+
+// The fragment shader of a layer; of the colour, what the head is to know. `mostSteps`: base steps that a ray can have.
+export function marchSource(scene, { layer, counting, mostSteps }) {
+  const { manifest } = scene, nChannels = scene.features.n_channels;
+  const defines = {
+    LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, WIDTH_BITS,
+    ...(layer === "normals" ? { NORMALS: 1 } : {}), ...(counting ? { COUNTING: 1 } : {}),
+  };
+  const features = layer === "colour" ? ["features"] : [];
+  const parts = ["rays", "textures", manifest.contracted ? "contracted" : "box", "march", ...features, "fetches", "pixel"];
+  const text = parts.map((name) => shaders[`${name}.glsl`]).join("\n");
+  const lines = Object.entries(defines).map(([name, value]) => `#define ${name} ${value}\n`);
+  return BEGIN + lines.join("") + PRECISION + filled(text, featureTexts(nChannels));
+}
+
+// The fragment shader of the head: { source, weights }.
+export function headSource(scene) {
+  const { code, weights } = headCode(scene.head);
+  const text = filled(shaders["head.glsl"], { ...featureTexts(scene.features.n_channels), HEAD_CODE: code });
+  return { source: BEGIN + PRECISION + shaders["rays.glsl"] + text, weights };
+}
+
+export const compositeSource = () => BEGIN + PRECISION + shaders["composite.glsl"];
+
+// A linked program with the places of its uniforms; throws an Error with the driver's words.
+export class Program {
+  constructor(gl, fragment) {
+    this.gl = gl;
+    this.program = gl.createProgram();
+    const shaders = [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragment]].map(([kind, text]) => {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      gl.attachShader(this.program, shader);
+      return shader;
+    });
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS) && !gl.isContextLost()) {
+      const said = [gl.getProgramInfoLog(this.program), ...shaders.map((shader) => gl.getShaderInfoLog(shader))];
+      throw new Error(`shader: ${said.filter(Boolean).join(" ").slice(0, 500)}`);
+    }
+    for (const shader of shaders) gl.deleteShader(shader);
+    this.uniforms = new Map();
+    const count = gl.getProgramParameter(this.program, gl.ACTIVE_UNIFORMS) ?? 0;
+    for (let i = 0; i < count; i++) {
+      const { name, type } = gl.getActiveUniform(this.program, i);
+      this.uniforms.set(name.replace("[0]", ""), { place: gl.getUniformLocation(this.program, name), type });
+    }
+  }
+
+  // `values`: numbers, arrays, booleans, or textures { texture, target } by the uniforms' names; those that the program
+  // does not have are left out.
+  use(values) {
+    const { gl } = this;
+    gl.useProgram(this.program);
+    let unit = 0;
+    for (const [name, { place, type }] of this.uniforms) {
+      const value = values[name];
+      if (value === undefined) continue;
+      if (value.texture) {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(value.target, value.texture);
+        gl.uniform1i(place, unit++);
+      } else if (type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(place, false, value);
+      else if (type === gl.INT || type === gl.BOOL) gl.uniform1iv(place, [value].flat().map(Number));
+      else gl[`uniform${{ [gl.FLOAT]: 1, [gl.FLOAT_VEC2]: 2, [gl.FLOAT_VEC3]: 3, [gl.FLOAT_VEC4]: 4 }[type]}fv`](place, [value].flat());
+    }
+  }
+
+  dispose() {
+    this.gl.deleteProgram(this.program);
+  }
+}

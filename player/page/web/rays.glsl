@@ -1,0 +1,15 @@
+// The rays of pixels: see camera.js.
+
+uniform vec3 uCentre, uAcross, uDown;
+uniform vec2 uPixel, uRows, uTile;
+
+// The direction of the ray through a place in the tile that is drawn, and how far it is turned from uCentre.
+vec3 turnedBy;
+vec3 directionOf(vec2 place) {
+  place += uTile;
+  vec2 pixel = vec2(place.x, uRows.x + uRows.y * place.y) - uPixel;
+  vec3 beside = pixel.x * uAcross + pixel.y * uDown;
+  float more = 2.0 * dot(uCentre, beside) + dot(beside, beside), norm = sqrt(1.0 + more);
+  turnedBy = (beside - uCentre * (more / (norm + 1.0))) / norm;
+  return uCentre + turnedBy;
+}

@@ -1,0 +1,229 @@
+// What is on the screen: the pose of the camera, how it moves, and which picture is drawn when.
+//
+// The camera follows a goal, which controls change; a flight leads it there on a way of its own. While it moves, pictures
+// are as small as 30 a second need. When it stands still there is a picture that takes some tenths of a second, then the
+// whole one, and then more of these, each a part of a pixel aside, which the renderer adds up. Then nothing is drawn until
+// something changes. Never is a picture begun before the last one is finished.
+
+import { aimed, between, difference, orbited, pointAt, poseOf, restOf, viewOf } from "./pose.js";
+import { Pace } from "./pace.js";
+
+const STILL_SECONDS = 0.15; // without a move, after which the camera stands still
+const EASE_SECONDS = 0.07; // in which the camera goes most of the way to its goal
+const FLIGHT_SECONDS = 1.2;
+const TURN_SPEED = 0.12; // radians a second
+const REST_SECONDS = 6; // untouched, after which a scene that is to turn turns again
+const N_WHOLE = 8; // whole pictures that are added up
+const FEW_SECONDS = 1; // pictures that take longer are not added up
+
+// The n-th number of a sequence that fills 0..1 evenly (van der Corput's, for a base).
+function spread(n, base) {
+  let value = 0;
+  for (let part = 1 / base; n > 0; n = Math.floor(n / base), part /= base) value += (n % base) * part;
+  return value;
+}
+
+export class Viewer {
+  // `cameras`: the training views; `options`: those of the page's address; `calm`: whether the visitor wants no motion;
+  // `background`: the scene's own.
+  constructor(canvas, renderer, cameras, options, calm, background) {
+    this.canvas = canvas;
+    this.renderer = renderer;
+    this.calm = calm;
+    const { frame, pose } = restOf(cameras);
+    this.frame = frame;
+    this.rest = pose;
+    this.views = cameras.map((camera) => poseOf(frame, camera, pose.target));
+    this.pose = this.goal = this.views[options.view] ?? pose;
+    this.flight = null; // { from, begin } where one is under way
+    this.step = () => false; // what moves the goal as time goes by: (seconds) => whether it did
+    this.onturn = this.onview = () => {};
+    this.again = options.turn === true && !calm;
+    this.turning = !calm && (options.turn ?? options.view === undefined);
+    this.quality = options.quality ?? "high";
+    this.background = options.background ?? background;
+    this.layer = "colour";
+    this.pace = new Pace();
+    this.lost = false;
+    this.covered = this.pose === pose; // whether the poster, which shows this pose, stays until the scene is all there
+    this.touchedAt = this.before = performance.now();
+    this.asked = 0; // the request for the next tick
+    this.fence = null; // { sync, begin, moving } of the picture that is being drawn
+    new ResizeObserver(() => this.refresh()).observe(canvas);
+    this.refresh();
+  }
+
+  // Something else than the camera has changed: draw anew.
+  refresh() {
+    this.stale = true;
+    this.n_still = 0; // pictures drawn since the camera stands still
+    this.movedAt = performance.now();
+    this.wake();
+  }
+
+  wake() {
+    this.asked ||= requestAnimationFrame((now) => {
+      this.asked = 0;
+      this.tick(now);
+    });
+  }
+
+  set(changes) {
+    Object.assign(this, changes);
+    this.refresh();
+  }
+
+  // From now on the scene is shown in place of the poster: it is all there, or somebody turns it.
+  uncover() {
+    this.covered = false;
+    this.refresh();
+  }
+
+  // Change the goal by a function of poses.
+  move(change) {
+    this.touch();
+    this.goal = change(this.goal);
+    this.flight = null;
+    this.onview(-1);
+    this.wake();
+  }
+
+  // A visitor has done something: the slow turn ends.
+  touch() {
+    this.touchedAt = performance.now();
+    if (this.covered) this.uncover();
+    if (this.turning) this.turn(false);
+  }
+
+  turn(on) {
+    this.turning = on;
+    this.onturn(on);
+    this.wake();
+  }
+
+  fly(goal) {
+    this.touch();
+    this.goal = goal;
+    this.flight = this.calm ? null : { from: this.pose, begin: performance.now() };
+    this.wake();
+  }
+
+  flyToView(index) {
+    if (!this.views[index]) return;
+    this.fly(this.views[index]);
+    this.onview(index);
+  }
+
+  flyHome() {
+    this.fly(this.rest);
+    this.onview(-1);
+  }
+
+  // Turn around what is seen at a place of the canvas, pixels of the page, from now on.
+  async turnAround(x, y) {
+    const { clientWidth, clientHeight } = this.canvas;
+    const view = this.view(clientWidth, clientHeight);
+    this.touch();
+    const t = await this.renderer.depthAt({ ...view, quality: this.quality }, x, y);
+    if (t !== null) this.fly(aimed(this.frame, this.pose, pointAt(view, x, y, t)));
+  }
+
+  // The picture in the window, { width, height, rgba }, whole.
+  picture() {
+    const { layer, quality, background } = this;
+    return this.renderer.render({ ...this.view(...this.size()), layer, quality, background });
+  }
+
+  // Pixels of the screen that the canvas covers.
+  size() {
+    const scale = window.devicePixelRatio || 1, { clientWidth, clientHeight } = this.canvas;
+    return [Math.max(1, Math.round(clientWidth * scale)), Math.max(1, Math.round(clientHeight * scale))];
+  }
+
+  view(width, height) {
+    return viewOf(this.frame, this.pose, width, height);
+  }
+
+  tick(now) {
+    const seconds = Math.min(Math.max((now - this.before) / 1000, 0), 0.1);
+    this.before = now;
+    if (this.lost || this.covered) return;
+    if (this.fence && !this.finished()) return this.wake();
+    const moves = this.advance(now, seconds);
+    if (moves) {
+      this.movedAt = now;
+      this.n_still = 0;
+    }
+    if (moves || this.stale) this.draw(this.pace.moving(...this.size()), { quality: "fast", moving: moves });
+    else if (!this.covered && now - this.movedAt >= STILL_SECONDS * 1000) this.sharpen();
+    if (this.fence || this.n_still <= N_WHOLE || this.turning || this.again) this.wake();
+  }
+
+  // Bring the pose nearer to its goal; whether it moved.
+  advance(now, seconds) {
+    if (this.turning && this.pace.stutters) this.turn(false);
+    if (this.again && !this.turning && now - this.touchedAt > REST_SECONDS * 1000 && !this.pace.stutters) this.turn(true);
+    if (this.step(seconds)) this.touchedAt = now;
+    if (this.turning && this.canvas.dataset.shown) this.goal = orbited(this.goal, TURN_SPEED * seconds, 0);
+    const before = this.pose;
+    if (this.flight) {
+      const share = Math.min((now - this.flight.begin) / 1000 / FLIGHT_SECONDS, 1);
+      this.pose = between(this.flight.from, this.goal, share * share * (3 - 2 * share));
+      if (share >= 1) this.flight = null;
+    } else {
+      this.pose = between(before, this.goal, this.calm ? 1 : 1 - Math.exp(-seconds / EASE_SECONDS));
+    }
+    if (!this.flight && difference(this.pose, this.goal) < 2e-4) this.pose = this.goal;
+    return this.pose !== before && difference(this.pose, before) > 0;
+  }
+
+  // Draw the next picture of a camera that stands still.
+  sharpen() {
+    const { quality, pace } = this, size = this.size(), sharp = pace.sharp(...size);
+    if (this.n_still === 0 && sharp[0] === size[0]) this.n_still = 1;
+    const n = this.n_still - 1; // whole pictures that are there
+    if (n > 0 && this.seconds > FEW_SECONDS) this.n_still = N_WHOLE + 1;
+    if (this.n_still > N_WHOLE) {
+      this.canvas.dataset.done = "";
+      return;
+    }
+    this.n_still += 1;
+    const jitter = n > 0 ? [spread(n, 2) - 0.5, spread(n, 3) - 0.5] : [0, 0];
+    if (n < 0) this.draw(sharp, { quality });
+    else this.draw(n ? this.drawn : pace.whole(...size), { quality, jitter, accumulate: true });
+  }
+
+  draw([width, height], { quality, jitter = [0, 0], accumulate = false, moving = false }) {
+    if (String(this.drawn) !== `${width},${height}`) this.renderer.resize(width, height);
+    this.drawn = [width, height];
+    this.stale = false;
+    delete this.canvas.dataset.done;
+    const { layer, background } = this, begin = performance.now();
+    this.renderer.draw({ ...this.view(width, height), quality, background, layer, jitter, accumulate });
+    const gl = this.canvas.getContext("webgl2");
+    this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), begin, moving };
+    gl.flush();
+  }
+
+  // Whether the last picture is finished; learns from the time that it took.
+  finished() {
+    const gl = this.canvas.getContext("webgl2"), { sync, begin, moving } = this.fence;
+    if (gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+    gl.deleteSync(sync);
+    this.fence = null;
+    this.seconds = (performance.now() - begin) / 1000;
+    const pixels = this.drawn[0] * this.drawn[1];
+    if (moving) this.pace.measured(pixels, this.seconds);
+    else this.pace.stood(pixels, this.seconds);
+    // data-shown: the size of what is on the screen; data-done: no more comes until something changes
+    if (moving || this.n_still > 0) this.canvas.dataset.shown = this.drawn.join("x");
+    return true;
+  }
+
+  // The graphics card has dropped everything, and whether it is back.
+  loseContext(lost) {
+    this.lost = lost;
+    this.fence = null;
+    if (!lost) this.refresh();
+  }
+}

@@ -1,0 +1,98 @@
+"""A page that decodes a scene and says what it found, opened from a disk in a browser without a network."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import Browser
+
+from player.asset.asset import Asset
+from player.asset.pyramid import PyramidValues
+from player.page.page import data_elements, page_script, web_files
+
+MAIN = """
+import { loadScene } from "./loader.js";
+
+async function digest(array) {
+  const found = await (globalThis.subtle ?? crypto.subtle).digest("SHA-256", array.slice());
+  return Array.from(new Uint8Array(found), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+async function described({ n_channels, levels, values, firstRows }) {
+  const found = [];
+  for (const { coords, cells } of levels) found.push([await digest(coords), await digest(cells)]);
+  const kind = values.constructor.name;
+  return { n_channels, levels: found, values: await digest(values), kind, firstRows };
+}
+
+globalThis.found = (async () => {
+  const scenes = [], progress = [];
+  let error = null, cameras = null, head = null;
+  try {
+    for await (const scene of loadScene(({ done, total }) => progress.push(done / total))) {
+      const [densities, features] = [await described(scene.densities), await described(scene.features)];
+      ({ cameras, head } = scene);
+      scenes.push({ n_parts: scene.n_parts, problem: scene.problem, densities, features });
+    }
+  } catch (thrown) {
+    error = thrown.message;
+  }
+  return { scenes, progress, error, cameras, head };
+})();
+"""
+
+
+def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "") -> bytes:
+    """A page with the data `files` that decodes them; `before` runs first, in the page and in its worker."""
+    modules = {**web_files(), "main.js": MAIN}
+    text = before + page_script(modules)
+    script = f'<script type="module" id="script">{text}</script>\n'
+    return f"<!doctype html>{policy}{script}".encode() + data_elements(files)
+
+
+def decoded(browser: Browser, path: Path) -> dict[str, Any]:
+    """What the page at `path` found; it asks for nothing, and says nothing in the console."""
+    context = browser.new_context(offline=True)
+    page = context.new_page()
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(path.as_uri())
+    found = page.evaluate("() => globalThis.found")
+    context.close()
+    assert not said
+    assert [url for url in asked if not url.startswith("blob:")] == [path.as_uri()]
+    return found
+
+
+def described(stored: PyramidValues) -> dict[str, Any]:
+    """What the page should find, by the player's own reader."""
+
+    def digest(array: np.ndarray) -> str:
+        return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+
+    levels = [[digest(b.coords.astype("<u2")), digest(b.masks.astype("<u8"))] for b in stored.pyramid.levels]
+    kind = {"uint8": "Uint8Array", "int8": "Int8Array"}[stored.values[0].dtype.name]
+    values = digest(np.concatenate(stored.values))
+    first_rows = stored.first_rows.tolist()
+    return {
+        "n_channels": stored.n_channels, "levels": levels, "values": values, "kind": kind,
+        "firstRows": first_rows,
+    }  # fmt: skip
+
+
+def expected(asset: Asset) -> dict[str, Any]:
+    """The densities and features that a page of the asset should find."""
+    return {grid: described(getattr(asset.arrays, grid)) for grid in ("densities", "features")}
+
+
+def without_problem(scene: dict[str, Any]) -> dict[str, Any]:
+    """The densities and features that a page found."""
+    return json.loads(json.dumps({grid: scene[grid] for grid in ("densities", "features")}))

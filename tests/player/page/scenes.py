@@ -1,0 +1,130 @@
+"""Small assets that the page draws, each with something of its own, and cameras around them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from exporters.head.onnx_head import head_onnx
+from exporters.head.ranges import activation_ranges
+from player.asset.asset import Asset, GridArrays, write_asset
+from player.asset.bricks import pack_vertices
+from player.asset.manifest import Manifest
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.asset.single_level import VertexBricks, from_vertices
+from player.cameras.camera import Camera
+from tests.exporters.head.test_onnx_head import inputs, random_head
+from tests.player.conftest import cameras_bytes, head_bytes, look_at, write_shells
+from tests.player.march.pyramid_scene import filled, random_scene, sparse_scene
+
+WIDTH, HEIGHT = 60, 44
+
+
+def head_of(n_channels: int, in_8_bits: bool) -> bytes:
+    """A head of random weights whose widths are no multiples of four."""
+    weights = random_head(n_channels, 18, n_sh_features=3)
+    (first, bias), *more = weights.spatial
+    weights = replace(weights, spatial=((first / np.float32(40), bias), *more))  # of codes up to 127
+    features, dirs = inputs(500, n_channels)
+    return head_onnx(weights, activation_ranges(weights, features * 40, dirs) if in_8_bits else None)
+
+
+def wider(values: PyramidValues, n_channels: int) -> PyramidValues:
+    """The same pyramid with so many channels, mixed from those that it has."""
+    mixed = np.random.default_rng(n_channels).normal(0, 0.5, (values.n_channels, n_channels))
+    return filled(values.pyramid, [some @ mixed for some in values.values], (-127, 127), np.int8)
+
+
+def write(folder: Path, manifest: Manifest, arrays: GridArrays, head: bytes) -> Asset:
+    write_asset(folder, manifest, arrays, head, b"ply\n", cameras_bytes())
+    return Asset.open(folder)
+
+
+def shells(folder: Path) -> Asset:
+    """Two spherical shells, in a world that is not the model's frame."""
+    return Asset.open(write_shells(folder))
+
+
+def pyramid_asset(
+    folder: Path, level_steps: tuple[int, ...], contracted: bool, n_channels: int, sparse: bool = False
+) -> Asset:
+    """Random pyramids of as many levels as `level_steps` has, with a head of random weights in 8 bits."""
+    if sparse:
+        scene = sparse_scene(level_steps, 3, contracted)
+    else:
+        scene = random_scene(70, 45, level_steps, 2, contracted)
+    edge = 2.0 if contracted else 1.0
+    n_levels = len(level_steps)
+    manifest = Manifest(
+        generator="tests", resolution=scene.densities.pyramid.resolution,
+        feature_resolution=scene.features.pyramid.resolution, step=scene.step, level_steps=level_steps,
+        density_range=scene.density_range, density_steps=(1,) * n_levels, feature_steps=(1,) * n_levels,
+        n_channels=n_channels, aabb=((-edge,) * 3, (edge,) * 3), contracted=contracted,
+        near=0.05 if contracted else 0.0, view_size=(48, 40), n_fetches=4, background=(0.2, 0.5, 0.9),
+    )  # fmt: skip
+    features = scene.features if n_channels == 3 else wider(scene.features, n_channels)
+    return write(folder, manifest, GridArrays(scene.densities, features), head_of(n_channels, True))
+
+
+def dense(resolution: int, n_channels: int, top: int, kind: type[np.generic], seed: int) -> PyramidValues:
+    """Every vertex of one level stored, with noise."""
+    coords, masks, order = pack_vertices(np.argwhere(np.ones((resolution + 1,) * 3, bool)))
+    random = np.random.default_rng(seed)
+    values = random.uniform(0 if kind == np.uint8 else -top, top, (len(order), n_channels)).astype(kind)
+    return from_vertices(VertexBricks(coords, masks, values if kind == np.int8 else values[:, 0]), resolution)
+
+
+def fog(folder: Path, thickness: float = 2.0) -> Asset:
+    """A box that is full: hundreds of thin samples on a ray, or a few where it is flat."""
+    box = ((-1.0, -1.0, -thickness / 2), (1.0, 1.0, thickness / 2))
+    low = -3.0 - 2 * np.log(thickness / 2)
+    manifest = Manifest(
+        generator="tests", resolution=24, feature_resolution=15, step=0.004, density_range=(low, low + 4.0),
+        n_channels=8, view_size=(48, 40), aabb=box, n_fetches=5,
+    )  # fmt: skip
+    features = dense(15, 8, 120, np.int8, 1)
+    arrays = GridArrays(dense(24, 1, 255, np.uint8, 0), features)
+    return write(folder, manifest, arrays, head_of(8, False))
+
+
+def empty(folder: Path) -> Asset:
+    """Nothing to see: no density anywhere."""
+    none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
+    densities = PyramidValues(Pyramid(24, (none,)), (np.zeros((0, 1), np.uint8),))
+    manifest = Manifest(
+        generator="tests", resolution=24, feature_resolution=8, step=0.05, density_range=(-3.0, 1.0),
+        n_channels=4, view_size=(48, 40),
+    )  # fmt: skip
+    return write(folder, manifest, GridArrays(densities, dense(8, 4, 120, np.int8, 1)), head_bytes())
+
+
+def camera(name: str, c2w: np.ndarray, focal: float = 55.0, cx: float | None = None) -> Camera:
+    return Camera(name, c2w, WIDTH, HEIGHT, focal, focal, WIDTH / 2 if cx is None else cx, HEIGHT / 2)
+
+
+def cameras(asset: Asset) -> dict[str, Camera]:
+    """Cameras outside, inside, far away and along an axis exactly, around the model's box, in the world."""
+    low, high = np.array(asset.manifest.aabb)
+    middle, size = (low + high) / 2, float(np.max(high - low))
+    along = np.eye(4)
+    along[:3, 3] = middle + np.array([0, 0, 1.5 * size])
+    away = 20.0 if asset.manifest.contracted else 374.0  # float32 directions have that much sense there
+    far = look_at(tuple(middle + size * away * np.array([0.8, 0.5, 0.3])), tuple(middle))
+    found = {
+        "outside": camera(
+            "outside", look_at(tuple(middle + size * np.array([0.9, -0.7, 0.6])), tuple(middle))
+        ),
+        "inside": camera(
+            "inside", look_at(tuple(middle + size * np.array([0.05, 0.02, 0.01])), tuple(low)), 30.0
+        ),
+        "far": camera("far", far, away * 45.0),
+        "axis": camera("axis", along, 60.0, WIDTH / 2 + 0.5),
+    }
+    turn = asset.world_from_model / np.array([asset.scale] * 3 + [1.0])
+    for name, some in found.items():
+        c2w = turn @ some.c2w
+        c2w[:3, 3] = asset.world_from_model[:3, :3] @ some.c2w[:3, 3] + asset.world_from_model[:3, 3]
+        found[name] = replace(some, c2w=c2w)
+    return found

@@ -1,0 +1,299 @@
+"""The page as it is put together: what is in it survives, what runs in it is named, and it plays."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, Route
+
+from exporters.export import export_asset
+from exporters.options import ExportOptions
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.errors import ConfigError, FormatError
+from player.page import page
+from player.page.modules import joined
+from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
+from player.page.rest import rest_camera
+from player.page.scene_files import scene_files
+from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
+from tests.player.conftest import look_at
+
+SECONDS = 120
+MOST_VIEWER = 60_000
+"""Bytes that all but data and poster may take in a page."""
+
+
+class Opened(NamedTuple):
+    page: Page
+    said: list[str]
+    """What the console said, and errors that nobody caught."""
+    asked: list[str]
+    """Addresses that were asked for."""
+
+
+@contextmanager
+def opened(
+    browser: Browser, address: str, answers: dict[str, tuple[bytes, str]] | None = None
+) -> Iterator[Opened]:
+    """A page without a network, except for `answers`: content and its type by address."""
+    context = browser.new_context(offline=answers is None, viewport={"width": 160, "height": 120})
+    found = Opened(context.new_page(), [], [])
+    found.page.set_default_timeout(SECONDS * 1000)
+    found.page.on("console", lambda message: found.said.append(message.text))
+    found.page.on("pageerror", lambda error: found.said.append(str(error)))
+    found.page.on("request", lambda request: found.asked.append(request.url))
+
+    def answer(route: Route) -> None:
+        assert answers is not None
+        known = answers.get(route.request.url)
+        if known is None:
+            route.abort()
+        else:
+            route.fulfill(body=known[0], content_type=known[1])
+
+    if answers is not None:
+        context.route("**/*", answer)
+    found.page.goto(address)
+    yield found
+    context.close()
+
+
+# --- bytes as text ---
+
+
+def test_text_is_plain_and_comes_back() -> None:
+    assert len(ALPHABET) == 116 and not set(ALPHABET) & set(b"\0\n\r<&'\"")
+    random = np.random.default_rng(0)
+    for length in (0, 1, 5, 6, 7, 4096):
+        for data in (bytes(length), b"\xff" * length, random.bytes(length)):
+            text = text_of_bytes(data)
+            assert len(text) == -(-length // 6) * 7 and set(text) <= set(ALPHABET)
+            assert bytes_of_text(text)[:length] == data
+    number = sum(byte << 8 * i for i, byte in enumerate(b"\x01\x80\xfe\xff\r\n"))
+    digits = [ALPHABET.index(letter) for letter in text_of_bytes(b"\x01\x80\xfe\xff\r\n")]
+    assert sum(digit * 116**i for i, digit in enumerate(digits)) == number
+    with pytest.raises(ValueError, match="alphabet"):
+        bytes_of_text(b"<" * 7)
+
+
+READ = """
+import { bytesOf } from "./text_bytes.js";
+globalThis.read = (length) => {
+  const bytes = bytesOf(document.getElementById("data").textContent, length);
+  return bytes && btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+};
+"""
+
+
+@pytest.mark.parametrize("charset", ["", "; charset=utf-8", "; charset=windows-1252", "; charset=shift_jis"])
+def test_every_byte_survives_in_a_browser(chromium: Browser, charset: str) -> None:
+    """All pairs of bytes, at all places of a group, whatever charset a server claims."""
+    pairs = np.stack(np.meshgrid(np.arange(256), np.arange(256)), axis=-1).astype(np.uint8).tobytes()
+    data = b"".join(bytes(n) + pairs for n in range(6)) + b"</script><!--\r\n\r\0"
+    script = page_script({**web_files(), "main.js": READ}, "main.js", "main.js")
+    html = f'<!doctype html><script type="module">{script}</script><script type="text/plain" id="data">'
+    address = "http://scene.test/"
+    answers = {address: (html.encode() + text_of_bytes(data) + b"</script>", f"text/html{charset}")}
+    with opened(chromium, address, answers) as found:
+        assert base64.b64decode(found.page.evaluate("n => read(n)", len(data))) == data
+        assert found.page.evaluate("n => read(n)", len(data) + 6) is None
+        assert found.said == []
+
+
+# --- modules ---
+
+
+def test_modules_that_break_the_rules() -> None:
+    main = {"worker.js": ""}
+    with pytest.raises(FormatError, match=r"circle, got main\.js -> a\.js -> main\.js"):
+        joined(
+            {**main, "main.js": 'import { a } from "./a.js";\n', "a.js": 'import { b } from "./main.js";\n'}
+        )
+    with pytest.raises(FormatError, match=r"main.js: imports: expected a module, got other.js"):
+        joined({**main, "main.js": 'import { a } from "./other.js";\n'})
+    for line in ("export default 1;", "import './a.js';", "export { a };", "export let a = 1;"):
+        with pytest.raises(FormatError, match="another form of import or export"):
+            joined({**main, "main.js": line})
+
+
+def test_the_package_has_every_module_that_is_imported() -> None:
+    files = web_files()
+    assert {"main.js", "worker.js", "boot.js", "style.css", "index.html", "shaders.js"} <= set(files)
+    assert page_script(files).isascii()
+
+
+# --- the page ---
+
+
+def test_a_page_is_plain_and_names_what_runs(asset: Asset, shells_folder: Path) -> None:
+    made = page_of_one_file(asset, title='</title><script>alert("x")</script>')
+    (html,) = made.files.values()
+    text = html.decode("ascii")
+    before, _, behind = text.partition("</title>")
+    assert before.endswith("<title>&lt;/title&gt;&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;")
+    assert "alert(" not in behind
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
+    rules = dict(rule.strip().partition(" ")[::2] for rule in policy.split(";"))
+    assert rules["default-src"] == rules["connect-src"] == "'none'" and "unsafe" not in policy
+    named = set(rules["script-src"].split()) | set(rules["style-src"].split())
+    scripts = re.findall(r'<script type="module">(.*?)</script>', text, re.DOTALL)
+    styles = re.findall(r"<style>(.*?)</style>", text, re.DOTALL)
+    whole = page_script(web_files())
+    digests = [hashlib.sha256(some.encode()).digest() for some in (*scripts, *styles, whole)]
+    assert named == {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
+    assert len(scripts) == len(styles) == 1
+    assert not re.search(r"""(src|href)=["'](?!data:)|https?://|@import|url\(|\son\w+=|\sstyle=""", text)
+    assert made.viewer_bytes < MOST_VIEWER
+    data = sum(map(len, scene_files(asset).values()))
+    assert len(html) < 1.35 * (data + made.viewer_bytes + 50_000)
+
+
+def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
+    """Without what no page needs: the mesh, reports and the settings of the bake."""
+    files = scene_files(asset)
+    assert files["part_0.bin"] == asset.read("part_0.bin")
+    assert not {"mesh.ply", "head.onnx"} & set(files)
+    assert b"psnr" not in files["manifest.json"] and b"psnr" in (asset.folder / "manifest.json").read_bytes()
+    facts = export_asset(asset.folder, tmp_path / "scene.html")
+    assert facts["bytes"] == (tmp_path / "scene.html").stat().st_size
+    assert (tmp_path / "scene.html").read_bytes() == page(Asset.open(asset.folder))
+
+
+def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
+        export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_asset_that_lacks_a_part_is_refused(broken_folder: Path, tmp_path: Path) -> None:
+    """The player shows what is there; a page has to hold all of it."""
+    (broken_folder / "part_0.bin").unlink()
+    with pytest.raises(FormatError, match=r"part_0\.bin"):
+        export_asset(broken_folder, tmp_path / "scene.html")
+
+
+PLAYS = """async () => {
+  const early = typeof window.vfr;
+  await vfr.ready;
+  const c2w = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 9, 0, 0, 0, 1];
+  const view = { c2w, fx: 40, fy: 40, cx: 20, cy: 15, width: 40, height: 30, background: [0, 0, 1] };
+  const { width, height, rgba } = await vfr.render(view);
+  const [corner, middle] = [0, 620].map((pixel) => [...rgba.slice(4 * pixel, 4 * pixel + 4)]);
+  return { early, width, height, corner, middle };
+}"""
+
+
+def check_plays(found: Opened) -> None:
+    found.page.wait_for_selector("#canvas[data-shown]")
+    played = found.page.evaluate(PLAYS)
+    assert (played["early"], played["width"], played["height"]) == ("object", 40, 30)
+    assert played["corner"] == [0, 0, 255, 255] and played["middle"] != played["corner"]
+    assert [line for line in found.said if "GPU stall due to ReadPixels" not in line] == []
+
+
+def test_a_page_plays_from_a_disk(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
+    path = tmp_path / "scene.html"
+    path.write_bytes(page(asset))
+    with opened(chromium, path.as_uri()) as found:
+        assert found.page.evaluate("() => typeof vfr.ready.then") == "function"
+        assert found.page.title() == asset.folder.name
+        check_plays(found)
+        assert [url for url in found.asked if not url.startswith(("blob:", "data:"))] == [path.as_uri()]
+
+
+def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
+    kinds = {".js": "text/javascript", ".html": "text/html", ".css": "text/css", ".jpg": "image/jpeg"}
+    address = "http://localhost/scene/"
+    files = {"": page_of_many_files(asset).files["index.html"], **page_of_many_files(asset).files}
+    answers = {
+        address + name: (
+            data,
+            kinds.get(Path(name or ".html").suffix or name or ".html", "application/octet-stream"),
+        )
+        for name, data in files.items()
+    }
+    with opened(chromium, address, answers) as found:
+        check_plays(found)
+        assert set(found.asked) <= set(answers)
+        assert {address + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= set(found.asked)
+
+
+def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
+    whole, path = page(asset), tmp_path / "cut.html"
+    for share in (0.9, 0.6):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        with opened(chromium, path.as_uri()) as found:
+            found.page.wait_for_function("() => document.body.innerText.includes('cannot be shown here')")
+            assert "cut short" in found.page.inner_text("body")
+            assert found.page.evaluate("() => document.getElementById('poster').naturalWidth") > 0
+            told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
+            assert "cut short" in told
+
+
+# --- what it begins with ---
+
+
+def cameras(angles: list[float], elevation: float = 0.4) -> list[Camera]:
+    found = []
+    for i, angle in enumerate(np.deg2rad(angles).tolist()):
+        eye = np.array([np.cos(angle), np.sin(angle), np.tan(elevation)]) * 3 + [1, 2, 3]
+        pose = look_at(tuple(eye.tolist()), (1.0, 2.0, 3.0))
+        found.append(Camera(f"{i}", pose, 60, 40, 50.0, 52.0, 31.0, 19.0))
+    return found
+
+
+def test_it_begins_in_the_middle_of_the_cameras() -> None:
+    rest = rest_camera(cameras([10, 20, 60, 70]))
+    wanted = look_at(
+        tuple(
+            (np.array([np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), np.tan(0.4)]) * 3 + [1, 2, 3]).tolist()
+        ),
+        (1.0, 2.0, 3.0),
+    )
+    assert np.allclose(rest.c2w, wanted, atol=2e-3)  # up leans a little to the cameras' own
+    assert (rest.width, rest.fx, rest.cx, rest.cy) == (60, 50.0, 30.0, 20.0)
+    all_around = cameras([30, 120, 210, 300])
+    assert np.allclose(rest_camera(all_around).c2w, all_around[0].c2w, atol=1e-4)
+
+
+REST = """
+import { restOf, viewOf } from "./pose.js";
+globalThis.rest = (cameras, width, height) => {
+  const { frame, pose } = restOf(cameras);
+  return viewOf(frame, pose, width, height);
+};
+"""
+
+
+def test_the_poster_shows_what_the_viewer_begins_with(chromium: Browser, tmp_path: Path) -> None:
+    script = page_script({**web_files(), "main.js": REST}, "main.js", "main.js")
+    path = tmp_path / "rest.html"
+    path.write_text(f'<!doctype html><script type="module">{script}</script>')
+    with opened(chromium, path.as_uri()) as found:
+        for some in (cameras([10, 20, 60, 70]), cameras([0, 90, 180, 270]), cameras([200], 1.3)):
+            rest = rest_camera(some)
+            given: list[dict[str, Any]] = [
+                {**{k: getattr(c, k) for k in ("name", "width", "height", "fx", "fy", "cx", "cy")},
+                 "c2w": c.c2w.reshape(-1).tolist()}
+                for c in some
+            ]  # fmt: skip
+            view = found.page.evaluate("([c, w, h]) => rest(c, w, h)", [given, 60, 40])
+            assert np.allclose(np.reshape(view["c2w"], (4, 4)), rest.c2w, atol=1e-6)
+            assert np.allclose(
+                [view[k] for k in ("fx", "fy", "cx", "cy")], [rest.fx, rest.fy, rest.cx, rest.cy]
+            )
+
+
+def test_an_installed_package_has_the_files_of_the_page() -> None:
+    """Read as text: Python 3.10 has no TOML parser."""
+    text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
+    assert '"player.page" = ["web/*"]' in text

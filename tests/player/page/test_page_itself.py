@@ -1,0 +1,182 @@
+"""The page as it is handed out, opened from a disk: what the viewer shows is what the player renders."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.views import asset_cameras
+from player.files.images import to_8_bit
+from player.page.notebook import inline
+from player.page.page import page as page_of
+from player.page.rest import rest_camera
+from player.render import Renderer
+from tests.player.page.viewer_page import SECONDS, wait_for
+
+SIZE = {"width": 300, "height": 245}
+
+
+@pytest.fixture(scope="module")
+def file(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "shells.html"
+    path.write_bytes(page_of(asset, "Two shells"))
+    return path
+
+
+@contextmanager
+def opened(browser: Browser, file: Path, hash_: str = "", **options: Any) -> Iterator[Page]:
+    """The page without a network, when the scene is on the screen; it asks for nothing and says nothing."""
+    context = browser.new_context(viewport=SIZE, offline=True, **options)  # type: ignore[arg-type]
+    page = context.new_page()
+    page.set_default_timeout(SECONDS * 1000)
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(file.as_uri() + hash_)
+    page.wait_for_selector("#canvas[data-shown]")
+    yield page
+    context.close()
+    assert not said
+    assert not [url for url in asked if not url.startswith(("blob:", "data:", file.as_uri()))]
+
+
+def whole(page: Page) -> np.ndarray:
+    """[h, w, 3] what the canvas shows when all pictures are added up."""
+    width, height = page.evaluate("() => [canvas.clientWidth, canvas.clientHeight]")
+    page.wait_for_selector(f"#canvas[data-shown='{width}x{height}'][data-done]")
+    data = page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height})
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+
+def fitted(camera: Camera, width: int, height: int) -> Camera:
+    """The camera in a window of this size, into which all of its picture fits."""
+    scale = min(width / camera.width, height / camera.height)
+    return Camera(
+        camera.name, camera.c2w, width, height, camera.fx * scale, camera.fy * scale,
+        width / 2 + (camera.cx - camera.width / 2) * scale,
+        height / 2 + (camera.cy - camera.height / 2) * scale,
+    )  # fmt: skip
+
+
+def rendered(asset: Asset, camera: Camera, shape: tuple[int, ...], background: Any = None) -> np.ndarray:
+    """[h, w, 3] mean of nine pictures of the player, each a third of a pixel aside."""
+    camera = fitted(camera, shape[1], shape[0])
+    big = camera.resized(3 * camera.width, 3 * camera.height)
+    with Renderer(asset) as renderer:
+        rgb = renderer.render(big, background=background).rgb
+    return to_8_bit(rgb.reshape(shape[0], 3, shape[1], 3, 3).mean(axis=(1, 3))).astype(int)
+
+
+def near(one: np.ndarray, two: np.ndarray) -> bool:
+    """Whether two pictures are the same but for how their pixels were averaged."""
+    return 10 * math.log10(255**2 / max(np.square(one - two).mean(), 1e-9)) > 32
+
+
+def test_it_begins_with_the_poster_and_shows_what_the_player_renders(
+    chromium: Browser, file: Path, asset: Asset
+) -> None:
+    rest = rest_camera(asset_cameras(asset))
+    with opened(chromium, file, "#turn=off") as page:
+        picture = whole(page)
+        assert near(picture, rendered(asset, rest, picture.shape))
+        assert page.title() == "Two shells" and page.locator("h1").text_content() == "Two shells"
+        assert page.locator("#poster").get_attribute("alt") == "Preview of Two shells"
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Picture as PNG").click()
+        with Image.open(Path(download.value.path())) as saved:
+            assert saved.size == picture.shape[1::-1]
+            assert near(np.asarray(saved.convert("RGB")).astype(int), picture)
+
+
+def test_a_training_view_of_the_address_and_a_background(chromium: Browser, file: Path, asset: Asset) -> None:
+    with opened(chromium, file, "#view=3&noui&background=0,0,255") as page:
+        picture = whole(page)
+        assert picture.shape[:2] == (SIZE["height"], SIZE["width"])
+        assert near(picture, rendered(asset, asset_cameras(asset)[3], picture.shape, (0.0, 0.0, 1.0)))
+
+
+def test_a_drag_layers_and_a_lost_context(chromium: Browser, file: Path) -> None:
+    with opened(chromium, file, "#turn=off") as page:
+        colour = whole(page)
+        pictures = [colour]
+        for layer in ("Depth", "Normals", "Opacity"):
+            page.locator("#layer").select_option(label=layer)
+            wait_for(page, lambda: not (whole(page) == pictures[-1]).all())
+            pictures.append(whole(page))
+        assert np.ptp(pictures[3], axis=-1).max() <= 2 and pictures[3].max() > 200
+        page.locator("#layer").select_option(label="Colour")
+        wait_for(page, lambda: near(whole(page), colour))
+        page.mouse.move(150, 100)
+        page.mouse.down()
+        page.mouse.move(220, 110, steps=6)
+        page.mouse.up()
+        wait_for(page, lambda: not near(whole(page), colour))
+        turned = whole(page)
+        page.evaluate(
+            """() => {
+              const gl = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+              gl.loseContext();
+              setTimeout(() => gl.restoreContext(), 300);
+            }"""
+        )
+        page.wait_for_function("() => document.getElementById('status').textContent !== ''")
+        page.wait_for_function("() => document.getElementById('status').textContent === ''")
+        page.evaluate("() => delete canvas.dataset.done")
+        assert near(whole(page), turned)
+
+
+def test_a_double_click_looks_at_what_was_hit(chromium: Browser, file: Path, asset: Asset) -> None:
+    with opened(chromium, file, "#turn=off", reduced_motion="reduce") as page:
+        picture = whole(page)
+        rest = fitted(rest_camera(asset_cameras(asset)), picture.shape[1], picture.shape[0])
+        x, y = 110, 70
+        assert not (picture[y, x] == 255).all(), "there is something"
+        page.mouse.dblclick(x, y)
+        wait_for(page, lambda: not near(whole(page), picture))
+        aimed = whole(page)
+        rays_o, rays_d = rest.rays()
+        back = -rays_d[y * rest.width + x]
+        right = np.cross([0.0, 0, 1], back)
+        right /= np.linalg.norm(right)
+        c2w = np.eye(4)
+        c2w[:3, :4] = np.stack([right, np.cross(back, right), back, rays_o[0]], axis=-1)
+        looking = Camera("", c2w, rest.width, rest.height, rest.fx, rest.fy, rest.width / 2, rest.height / 2)
+        assert near(aimed, rendered(asset, looking, picture.shape)), (
+            "it looks at that point from where it was"
+        )
+
+
+def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
+    """In a frame that can reach nothing of the notebook."""
+    shown = inline(asset, height=300)
+    notebook = tmp_path / "notebook.html"
+    notebook.write_text(f"<!doctype html><title>Notebook</title><h1>Cell</h1>{shown._repr_html_()}")
+    context = chromium.new_context(viewport={"width": 400, "height": 400}, offline=True)
+    page = context.new_page()
+    page.set_default_timeout(SECONDS * 1000)
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.goto(notebook.as_uri())
+    frame = page.frames[1]
+    frame.wait_for_selector("#canvas[data-shown]")
+    assert page.locator("iframe").bounding_box()["height"] == 300  # type: ignore[index]
+    assert frame.evaluate(
+        "() => { try { return parent.document.title; } catch (error) { return error.name; } }"
+    ) == ("SecurityError")
+    assert frame.evaluate("() => vfr.ready.then(() => vfr.info.n_channels)") == asset.manifest.n_channels
+    assert frame.evaluate("() => vfr.info.quality") in ("high", "fast")
+    context.close()
+    assert not said

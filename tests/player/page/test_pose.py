@@ -1,0 +1,291 @@
+"""The camera's mathematics of the page, by values: against Python's cameras, and closed forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+
+from player.cameras.camera import Camera, focus_point, orbit, world_up
+from player.cameras.views import read_views
+from player.page.rest import rest_camera
+from tests.player.conftest import look_at
+from tests.player.page.viewer_page import opened, page_files, stub_loader
+
+Call = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Browser) -> Iterator[Page]:
+    with opened(chromium, page_files(stub_loader([], fails="none")), wait=False) as found:
+        yield found.page
+
+
+@pytest.fixture(scope="module")
+def call(page: Page) -> Call:
+    """A function of the page's modules by name, called with what JSON can hold."""
+
+    def call(name: str, *arguments: Any, module: str = "pose.js") -> Any:
+        return page.evaluate(
+            "async ([module, name, given]) => (await import('./' + module))[name](...given)",
+            [module, name, arguments],
+        )
+
+    return call
+
+
+def cameras(eyes: np.ndarray, target: tuple[float, float, float]) -> list[Camera]:
+    """Level cameras of 64 x 48 pixels at [n, 3] places, which look at a point."""
+    return [
+        Camera(f"./r_{i}", look_at(tuple(eye), target), 64, 48, 60.0, 61.0, 33.0, 23.0)
+        for i, eye in enumerate(eyes.tolist())
+    ]
+
+
+def as_json(views: list[Camera]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": v.name, "width": v.width, "height": v.height,
+            "fx": v.fx, "fy": v.fy, "cx": v.cx, "cy": v.cy, "c2w": v.c2w.ravel().tolist(),
+        }
+        for v in views
+    ]  # fmt: skip
+
+
+def ring(n: int, first: float, last: float, height: float, radius: float = 4.0) -> np.ndarray:
+    """[n, 3] places on a part of a circle around (1, 2, 3), from angle to angle in degrees."""
+    angles = np.deg2rad(np.linspace(first, last, n))
+    return np.stack([1 + radius * np.cos(angles), 2 + radius * np.sin(angles), np.full(n, 3 + height)], -1)
+
+
+RINGS = {
+    "all around": ring(12, 0, 330, 2.0),
+    "an arc in front": ring(9, 40, 120, 0.5),
+    "across the seam of angles": ring(7, 150, 230, 1.0),
+    "one camera": ring(1, 30, 30, 1.0),
+    "from right above": np.array([[1.0, 2.001, 9.0]]),
+}
+
+
+@pytest.mark.parametrize("eyes", RINGS.values(), ids=RINGS)
+def test_up_and_focus_are_those_of_the_player(call: Call, eyes: np.ndarray) -> None:
+    views = cameras(eyes, (1, 2, 3))
+    np.testing.assert_allclose(call("worldUp", as_json(views)), world_up(views), atol=1e-9)
+    np.testing.assert_allclose(call("focusPoint", as_json(views)), focus_point(views), atol=1e-6)
+
+
+@pytest.mark.parametrize("eyes", RINGS.values(), ids=RINGS)
+def test_the_first_view_is_level_and_in_the_middle(call: Call, eyes: np.ndarray) -> None:
+    views = cameras(eyes, (1, 2, 3))
+    rest = call("restOf", as_json(views))
+    view = call("viewOf", rest["frame"], rest["pose"], 64, 48)
+    c2w, focus, up = np.reshape(view["c2w"], (4, 4)), focus_point(views), world_up(views)
+    assert abs(c2w[:3, 0] @ up) < 1e-9 and c2w[:3, 1] @ up >= 0, "up is up"
+    radius = np.median(np.linalg.norm(eyes - focus, axis=-1))
+    np.testing.assert_allclose(c2w[:3, 3] - radius * c2w[:3, 2], focus, atol=1e-9)
+    beside = orbit(views, 1)[0].c2w
+    assert c2w[:3, 2] @ up == pytest.approx(beside[:3, 2] @ up, abs=1e-9), "the elevation of Python's orbit"
+    if len(eyes) == 12:
+        np.testing.assert_allclose(c2w, beside, atol=1e-9)
+    elif len(eyes) > 1:
+        middle = eyes[len(eyes) // 2]
+        np.testing.assert_allclose(c2w[:3, 3], middle, atol=0.05)
+
+
+def test_the_first_view_of_an_object_and_of_a_capture(call: Call, lego_400: Path, fox: Path) -> None:
+    """The poster's own; for the capture it is among the cameras, in front of what they look at."""
+    for path in (lego_400 / "transforms_train.json", fox / "transforms.json"):
+        views = read_views(path, (400, 400))
+        found = call("restOf", as_json(views))
+        camera = rest_camera(views)
+        view = call("viewOf", found["frame"], found["pose"], camera.width, camera.height)
+        np.testing.assert_allclose(np.reshape(view["c2w"], (4, 4)), camera.c2w, atol=1e-6)
+        for key in ("fx", "fy", "cx", "cy"):
+            assert view[key] == pytest.approx(getattr(camera, key))
+        places = np.stack([view.c2w[:3, 3] for view in views])
+        apart = np.linalg.norm(places - camera.c2w[:3, 3], axis=-1) / found["frame"]["radius"]
+        assert apart.min() < 0.25 and abs(camera.c2w[:3, 0] @ world_up(views)) < 1e-6
+        looked = np.stack([-view.c2w[:3, 2] for view in views])
+        if path.parent == fox:
+            assert (looked @ -camera.c2w[:3, 2]).min() > 0.5, "all of them stand on one side"
+        else:
+            assert np.linalg.norm(found["pose"]["target"]) < 0.01 and camera.c2w[2, 3] > 1
+
+
+def test_poses_hold_training_views_exactly(call: Call) -> None:
+    """Crooked ones and those that look straight down as well."""
+    random = np.random.default_rng(3)
+    views = cameras(RINGS["all around"], (1, 2, 3))
+    for view in views[::2]:
+        angle = random.uniform(-3, 3)
+        turn = np.eye(4)
+        turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        view.c2w[:] = view.c2w @ turn
+    down = np.eye(4)
+    down[:3, 3] = 1, 2, 7
+    views += [Camera("./down", down, 64, 48, 60.0, 61.0, 33.0, 23.0)]
+    rest = call("restOf", as_json(views))
+    focus = rest["pose"]["target"]
+    for camera, given in zip(views, as_json(views), strict=True):
+        pose = call("poseOf", rest["frame"], given, focus)
+        view = call("viewOf", rest["frame"], pose, 64, 48)
+        np.testing.assert_allclose(np.reshape(view["c2w"], (4, 4)), camera.c2w, atol=1e-9)
+        for key in ("fx", "fy", "cx", "cy"):
+            assert view[key] == pytest.approx(getattr(camera, key), rel=1e-12)
+        wide = call(
+            "viewOf", rest["frame"], pose, 200, 96
+        )  # twice as high, and wider: the same picture in the middle
+        assert wide["fx"] == pytest.approx(120) and wide["cx"] == pytest.approx(102)
+        assert wide["cy"] == pytest.approx(46)
+
+
+@pytest.fixture(scope="module")
+def rest(call: Call) -> dict[str, Any]:
+    return call("restOf", as_json(cameras(RINGS["an arc in front"], (1, 2, 3))))
+
+
+def matrix(call: Call, rest: dict[str, Any], pose: dict[str, Any]) -> np.ndarray:
+    return np.reshape(call("cameraOf", rest["frame"], pose), (4, 4))
+
+
+def test_an_orbit_keeps_target_distance_and_level(call: Call, rest: dict[str, Any]) -> None:
+    pose = rest["pose"]
+    turned = call("orbited", pose, 0.5, 0.2)
+    before, after = matrix(call, rest, pose), matrix(call, rest, turned)
+    assert turned["target"] == pose["target"] and turned["distance"] == pose["distance"]
+    target = np.array(pose["target"])
+    np.testing.assert_allclose(after[:3, 3] - pose["distance"] * after[:3, 2], target, atol=1e-12)
+    up = np.array(rest["frame"]["axes"][2])
+    assert abs(after[:3, 0] @ up) < 1e-12
+    angle = math.asin(after[:3, 2] @ up) - math.asin(before[:3, 2] @ up)
+    assert angle == pytest.approx(0.2)
+    assert call("orbited", pose, 0, 50)["elevation"] < math.pi / 2, "never over the top"
+    assert call("orbited", pose, 0, -50)["elevation"] > -math.pi / 2
+    crooked = {**pose, "roll": 1.0}
+    rolls = [call("orbited", crooked, angle, 0)["roll"] for angle in (0, 0.5, 3)]
+    assert rolls[0] == 1 and 1 > rolls[1] > rolls[2] > 0 and rolls[2] < 0.01, "it comes level as it turns"
+
+
+def test_looking_around_keeps_the_place(call: Call, rest: dict[str, Any]) -> None:
+    before = matrix(call, rest, rest["pose"])
+    after = matrix(call, rest, call("looked", rest["frame"], rest["pose"], 0.3, 0.1))
+    np.testing.assert_allclose(after[:3, 3], before[:3, 3], atol=1e-12)
+    assert after[:3, 2] @ before[:3, 0] > 0.2, "to the left: the back turns to the right"
+    assert after[:3, 2] @ before[:3, 1] < -0.05, "upwards: the back turns down"
+
+
+def test_moves_go_along_the_cameras_axes(call: Call, rest: dict[str, Any]) -> None:
+    before = matrix(call, rest, rest["pose"])
+    after = matrix(call, rest, call("moved", rest["frame"], rest["pose"], 1, 2, 3))
+    np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(after[:3, 3] - before[:3, 3], before[:3, :3] @ [1, 2, -3], atol=1e-12)
+
+
+def test_zoom_has_ends(call: Call, rest: dict[str, Any]) -> None:
+    radius = rest["frame"]["radius"]
+    near, nearest, far = (
+        call("zoomed", rest["frame"], rest["pose"], factor)["distance"] for factor in (0.5, 1e-9, 1e9)
+    )
+    assert near == pytest.approx(rest["pose"]["distance"] / 2)
+    assert 0 < nearest < radius / 100 and radius * 100 < far < math.inf
+
+
+def test_a_point_of_a_view_and_the_aim_at_it(call: Call, rest: dict[str, Any]) -> None:
+    view = call("viewOf", rest["frame"], rest["pose"], 64, 48)
+    camera = Camera(
+        "", np.reshape(view["c2w"], (4, 4)), 64, 48, view["fx"], view["fy"], view["cx"], view["cy"]
+    )
+    rays_o, rays_d = camera.rays()
+    point = call("pointAt", view, 10.5, 20.5, 2.5)
+    np.testing.assert_allclose(point, rays_o[0] + 2.5 * rays_d[20 * 64 + 10], atol=1e-5)
+    aimed = call("aimed", rest["frame"], rest["pose"], point)
+    after = matrix(call, rest, aimed)
+    assert aimed["target"] == point and aimed["distance"] == pytest.approx(2.5)
+    np.testing.assert_allclose(after[:3, 3], camera.c2w[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(-after[:3, 2], rays_d[20 * 64 + 10], atol=1e-6)
+
+
+def test_a_flight_begins_and_ends_where_it_should_and_goes_the_shorter_way(
+    call: Call, rest: dict[str, Any]
+) -> None:
+    one = {**rest["pose"], "azimuth": 3.0, "distance": 1.0}
+    two = {
+        **rest["pose"],
+        "azimuth": -3.0,
+        "distance": 4.0,
+        "target": [5, 6, 7],
+        "elevation": 0.7,
+        "roll": 0.4,
+    }
+    for share, end in ((0, one), (1, two)):
+        found = call("between", one, two, share)
+        assert call("difference", found, end) < 1e-9
+    half = call("between", one, two, 0.5)
+    assert abs(half["azimuth"]) == pytest.approx(math.pi) and half["distance"] == pytest.approx(2)
+    assert call("difference", one, two) > 1
+    assert call("difference", one, {**one, "azimuth": 3 - 2 * math.pi}) < 1e-9
+
+
+# --- sizes and options ---
+
+
+def test_sizes_fit_a_window(call: Call) -> None:
+    assert call("fitted", 800, 600, 120_000, module="pace.js") == [400, 300]
+    assert call("fitted", 800, 600, 1e9, module="pace.js") == [800, 600]
+    assert call("fitted", 1, 1, 0, module="pace.js") == [1, 1]
+
+
+PACED = """([rate, n, width, height]) => import("./pace.js").then(({ Pace }) => {
+  const pace = new Pace(), sizes = [];
+  for (let i = 0; i < n; i++) {
+    const [w, h] = pace.moving(width, height), exact = 0.003 + w * h / rate;
+    pace.measured(w * h, Math.ceil(exact * 60) / 60);  // a screen of 60 pictures a second
+    sizes.push([w * h, exact]);
+  }
+  return [sizes, pace.sharp(width, height), pace.whole(width, height), pace.stutters];
+})"""
+
+
+def test_pictures_are_as_large_as_thirty_a_second_allow(page: Page) -> None:
+    for rate in (3e5, 1e6, 1e7, 1e10):
+        sizes, sharp, whole, stutters = page.evaluate(PACED, [rate, 60, 1600, 1200])
+        for pixels, seconds in sizes[40:]:
+            assert seconds <= 1 / 30 + 1e-9 or pixels < 1.1 * 96 * 72
+        assert sizes[-1][0] >= min(0.3 * rate / 30, 1600 * 1200), "and not smaller than needed"
+        assert not stutters
+        assert sizes[-1][0] <= np.prod(sharp) <= np.prod(whole) <= 1600 * 1200
+        assert rate < 1e6 or whole == [1600, 1200]
+    assert page.evaluate(PACED, [2e4, 30, 1600, 1200])[3], "a device that is far too slow"
+
+
+HASHES: dict[str, dict[str, Any]] = {
+    "": {},
+    "#view=12": {"view": 12},
+    "#view=-1&view=x": {},
+    "#quality=exact": {"quality": "exact"},
+    "#quality=best": {},
+    "#noui&turn": {"noui": True, "turn": True},
+    "#turn=off&noui=0": {"turn": False, "noui": False},
+    "#background=white": {"background": [1, 1, 1]},
+    "#background=transparent": {"background": "transparent"},
+    "#background=255,0,51": {"background": [1, 0, 0.2]},
+    "#background=256,0,0": {},
+    "#background=constructor": {},
+    "#view=3&quality=fast&noui&turn&background=black": {
+        "view": 3, "quality": "fast", "noui": True, "turn": True, "background": [0, 0, 0],
+    },
+    "#<script>&%&%zz=&&": {},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HASHES)
+def test_options_of_an_address(call: Call, text: str) -> None:
+    found = {
+        key: value for key, value in call("optionsOf", text, module="hash.js").items() if value is not None
+    }
+    assert found == HASHES[text]

@@ -1,0 +1,161 @@
+"""What the page draws, in a browser, against the numpy player's pictures of the same cameras."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+from scipy import ndimage
+
+from player.asset.asset import Asset
+from player.asset.grid import MAX_DISTANCE, SparseGrid
+from player.cameras.camera import Camera
+from player.page.gpu_memory import gpu_bytes
+from player.render import Renderer
+from tests.player.page import scenes
+from tests.player.page.render_page import RenderPage
+
+LEAST_DB = 50.0
+"""Two pictures of 8 bits differ so much if a hundredth of their levels differ by one."""
+MOST_OFF = 1e-3
+"""Share of the pixels that may be off by more than 3 levels: rays along an edge that another rounding takes
+past it."""
+
+ASSETS: dict[str, Callable[[Path], Asset]] = {
+    "one level, 4 channels": lambda folder: scenes.shells(folder),
+    "fog, 8 channels": lambda folder: scenes.fog(folder),
+    "flat fog, 8 channels": lambda folder: scenes.fog(folder, 0.01),
+    "4 levels, 9 channels": lambda folder: scenes.pyramid_asset(folder, (1, 1, 2, 4), False, 9),
+    "sparse, 3 levels, 3 channels": lambda folder: scenes.pyramid_asset(
+        folder, (1, 2, 2), False, 3, sparse=True
+    ),
+    "contracted, 3 levels, 24 channels": lambda folder: scenes.pyramid_asset(folder, (1, 1, 4), True, 24),
+    "contracted, sparse, 16 channels": lambda folder: scenes.pyramid_asset(
+        folder, (1, 2), True, 16, sparse=True
+    ),
+    "empty, 4 channels": lambda folder: scenes.empty(folder),
+}
+
+
+class Scene:
+    """An asset, its open page and the player that it is compared with."""
+
+    def __init__(self, asset: Asset, page: RenderPage) -> None:
+        self.asset, self.page = asset, page
+        self.player = Renderer(asset, 1, "numpy")
+        self.cameras = scenes.cameras(asset)
+
+    def check(self, camera: Camera, n_fetches: int | None = None, background: Any = None) -> np.ndarray:
+        settings: dict[str, Any] = {"quality": "exact"}
+        if n_fetches is not None:
+            settings["n_fetches"] = n_fetches
+        if background is not None:
+            settings["background"] = background
+        found = self.page.picture(camera, **settings)
+        wanted = self.player.render(camera, n_fetches, background).to_uint8()
+        off = np.abs(found[..., : wanted.shape[-1]].astype(int) - wanted)
+        error = np.mean(off.astype(float) ** 2)
+        where = f"{camera.name}, k = {n_fetches}"
+        assert error == 0 or 10 * np.log10(255**2 / error) >= LEAST_DB, f"{where}: {off.max()} levels off"
+        assert (off.max(axis=-1) > 3).mean() <= MOST_OFF, where
+        return found
+
+
+@pytest.fixture(scope="module", params=ASSETS)
+def scene(
+    request: pytest.FixtureRequest, chromium: Browser, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Scene]:
+    folder = tmp_path_factory.mktemp("page")
+    asset = ASSETS[request.param](folder / "asset")
+    page = RenderPage(chromium, asset, folder / "scene.html")
+    found = Scene(asset, page)
+    yield found
+    found.player.close()
+    page.close()
+    assert page.said == [] and page.asked == []
+
+
+@pytest.mark.parametrize("name", ["outside", "inside", "far", "axis"])
+def test_exact_pictures_are_the_players(scene: Scene, name: str) -> None:
+    found = scene.check(scene.cameras[name])
+    if scene.asset.arrays.densities.pyramid.levels[0].masks.any() and name in ("outside", "inside"):
+        assert np.ptp(found[..., :3].reshape(-1, 3), axis=0).max() > 20, "there is something to see"
+
+
+@pytest.mark.parametrize("n_fetches", [1, 5, 0])
+def test_any_number_of_fetches(scene: Scene, n_fetches: int) -> None:
+    scene.check(scene.cameras["outside"], n_fetches)
+
+
+@pytest.mark.parametrize("background", ["transparent", (0.0, 1.0, 0.25)])
+def test_any_background(scene: Scene, background: Any) -> None:
+    scene.check(scene.cameras["outside"], None, background)
+
+
+def test_layers_are_the_players(scene: Scene) -> None:
+    """Opacity; depth, by where half of it is reached; normals, where there is one clearly."""
+    camera = scene.cameras["outside"]
+    frame = scene.player.render(camera)
+    opacity = scene.page.picture(camera, layer="opacity")[..., 0]
+    assert np.abs(opacity - frame.opacity * 255.0).max() < 1.5 if opacity.size else False
+    normals = scene.page.picture(camera, layer="normals")[..., :3] / 127.5 - 1
+    met = (frame.opacity > 0.6) & (np.linalg.norm(frame.normals, axis=-1) > 0.5)
+    if met.any():
+        off = np.abs(normals - frame.normals)[met].max(axis=-1)
+        assert np.quantile(off, 0.98) < 0.03
+    depth = scene.page.picture(camera, layer="depth")[..., :3]
+    assert not depth[frame.opacity < 0.4].any()
+
+
+def test_the_arrays_are_the_players(scene: Scene) -> None:
+    """Distances and slots, the bricks that hold features, and the memory that is foretold."""
+    found, grid = scene.page.page.evaluate("() => arrays()"), scene.asset.grid
+    check_table(scene.page.array(found["table"], np.int32), grid)
+    assert (scene.page.array(found["owners"], np.int32) == grid.rows.bricks).all()
+    codes = np.zeros((found["nSlots"], 9, 9, 9), np.uint8)
+    texels = scene.page.array(found["density"], np.uint8).reshape(-1, 9, 9, 2, 8)
+    codes[..., :4], codes[..., 4:8], codes[..., 8] = texels[..., 0, :4], texels[..., 1, :4], texels[..., 1, 4]
+    assert (codes.reshape(-1, 729) == grid.codes).all()
+    live = (texels[:, :8, :8, 0, 5] | texels[:, :8, :8, 1, 5] << 4).reshape(-1)
+    assert (live == grid.live).all()
+    columns = scene.page.array(found["columns"], np.uint32).reshape(-1, 9, 9, 2)
+    rows = grid.rows.rows.reshape(-1, 9, 9, 9)[: len(columns)]
+    stored = columns[..., 1, None] >> np.arange(9, dtype=np.uint32) & 1
+    number = columns[..., 0, None] + np.cumsum(stored, axis=-1) - stored
+    number[..., 8] = columns[..., 0] + (columns[..., 1] >> 9)
+    assert ((stored == 1) == (rows >= 0)).all() and (number[rows >= 0] == rows[rows >= 0]).all()
+    assert scene.page.page.evaluate("() => vfr.info.gpuBytes") == gpu_bytes(scene.asset)
+
+
+def check_table(found: np.ndarray, grid: SparseGrid) -> None:
+    """Entries are those of the player's table; where there is none, no cell is live, as far as it says."""
+    n = grid.n_per_axis
+    assert (found[found >= 0] == grid.table[found >= 0]).all()
+    middles = np.stack(np.meshgrid(*[np.arange(8 * n)] * 3, indexing="ij")).reshape(3, -1) + np.float32(0.5)
+    live = grid.find(middles.astype(np.float32)).live & (middles < grid.resolution).all(axis=0)
+    occupied: np.ndarray = np.any(live.reshape(n, 8, n, 8, n, 8), axis=(1, 3, 5))
+    assert not occupied[(found < 0).reshape(n, n, n)].any()
+    away: Any = ndimage.distance_transform_cdt(found.reshape(n, n, n) < 0, "chessboard")
+    if (found >= 0).any():
+        assert (np.minimum(away, MAX_DISTANCE).reshape(-1)[found < 0] == -found[found < 0]).all()
+    else:
+        assert (found == -MAX_DISTANCE).all()
+    shown = (grid.table >= 0).reshape(n, n, n)
+    assert (grid.level_steps > 1).any() or not ((found >= 0).reshape(n, n, n) & ~occupied)[shown].any()
+
+
+def test_shaders_are_valid_glsl(scene: Scene, tmp_path: Path) -> None:
+    """By the reference compiler, which complains where a driver lets things pass."""
+    program = shutil.which("glslangValidator")
+    assert program, "expected glslangValidator, got none: make other-programs installs it"
+    for number, source in enumerate(scene.page.page.evaluate("() => sources()")):
+        path = tmp_path / f"{number}.frag"
+        path.write_text(source)
+        done = subprocess.run([program, str(path)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
