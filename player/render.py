@@ -138,6 +138,11 @@ class Renderer:
         """End the threads; tasks that have not begun are dropped."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
+    def show(self, asset: Asset) -> None:
+        """Go on with `asset`, the same one with more of its parts. Pictures that have begun keep to what they
+        began with, in whichever thread."""
+        self._grid, self.asset = asset.grid, asset
+
     def render(
         self,
         camera: Camera,
@@ -161,7 +166,8 @@ class Renderer:
         k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
         if k < 0:
             raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
-        k = min(k, self._grid.most_samples)
+        grid = self._grid
+        k = min(k, grid.most_samples)
         check_size(camera.width, camera.height)
         if background is None:
             red, green, blue = self.asset.manifest.background
@@ -175,7 +181,7 @@ class Renderer:
         features = np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None
         normals = np.zeros((n_pixels, 3), np.float32) if layers else None
         frame = Frame(rgb, opacity, depth, counts, background, features)
-        view = _View.of(self._grid, camera.transformed(self._model_from_world))
+        view = _View.of(grid, camera.transformed(self._model_from_world))
         size = min(TASK_BLOCKS[self.march], max(len(view.blocks) // (TASKS_A_THREAD * self.n_threads), 16))
         tasks = [view.blocks[i : i + size] for i in range(0, len(view.blocks), size)]
         futures = [self._pool.submit(self._task, frame, normals, view, blocks, k) for blocks in tasks]
@@ -201,23 +207,25 @@ class Renderer:
         normals = np.zeros((view.camera.height * view.camera.width, 3), np.float32)
         for blocks in tasks:
             index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-            normals[index] = self._normals(rays_o, rays_d, bounds)
+            normals[index] = self._normals(view.grid, rays_o, rays_d, bounds)
         return normals.reshape(view.camera.height, view.camera.width, 3)
 
-    def _normals(self, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds) -> np.ndarray:
+    def _normals(
+        self, grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds
+    ) -> np.ndarray:
         rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
-        return composited_normals(self._grid, rays_o, rays_d, bounds) @ rotation.T
+        return composited_normals(grid, rays_o, rays_d, bounds) @ rotation.T
 
     def _task(
         self, frame: Frame, normals: np.ndarray | None, view: _View, blocks: np.ndarray, k: int
     ) -> None:
         """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
         index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-        result: MarchResult = self._module.march(self._grid, rays_o, rays_d, k, bounds)
+        result: MarchResult = self._module.march(view.grid, rays_o, rays_d, k, bounds)
         if frame.features is not None:
             frame.features[index[result.hits]] = result.features
         if normals is not None:
-            normals[index] = self._normals(rays_o, rays_d, bounds)
+            normals[index] = self._normals(view.grid, rays_o, rays_d, bounds)
         rgb = self._head(result.features, rays_d[result.hits])
         self._write_pixels(
             Planes(frame.rgb, frame.opacity, frame.depth, frame.n_density_samples),
@@ -233,6 +241,7 @@ class Renderer:
 class _View(NamedTuple):
     """What a camera, in the model frame, may see of the grid."""
 
+    grid: SparseGrid
     camera: Camera
     start: float
     """Way along each ray, model units, that is known to be empty: 0 unless the camera is far away."""
@@ -247,7 +256,9 @@ class _View(NamedTuple):
         if grid.contracted:  # all of space: every pixel may meet something, from the camera on
             shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
             every = np.arange(shape[0] * shape[1])
-            return cls(camera, 0.0, every, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32))
+            return cls(
+                grid, camera, 0.0, every, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
+            )
         near, far = block_bounds(grid, camera)
         seen = far >= near
         size = grid.resolution / grid.cells_per_unit.astype(np.float64)
@@ -256,7 +267,7 @@ class _View(NamedTuple):
         start = distance - radius if distance > FAR_AWAY * radius else 0.0
         if start:  # the bounds are as coarse there as the origins
             near, far = np.where(seen, np.float32(0), near), np.where(seen, np.float32(np.inf), far)
-        return cls(camera, start, np.flatnonzero(seen), near, far)
+        return cls(grid, camera, start, np.flatnonzero(seen), near, far)
 
     def rays(
         self, blocks: np.ndarray, directions: Callable[..., np.ndarray] | None = None

@@ -42,13 +42,14 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    from player.asset.asset import Asset
     from player.render import import_ahead
     from player.viewer.server import ServeSettings, serve
 
     settings = settings_of(ServeSettings, arguments)
     import_ahead()
     folders = (arguments.asset, *arguments.others)
-    assets = [_open(folder, arguments) for folder in folders]
+    assets = [Asset.growing(folder, max_memory=arguments.max_memory) for folder in folders]
     with serve(assets, settings, _say) as address:
         print(f"{arguments.asset}: look at it at {address}", flush=True)
         _advise(arguments.asset, address)
@@ -70,6 +71,7 @@ def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
 
 def _advise(asset: Path, address: str) -> None:
     """Say how the viewer is left, and what to do where no browser can open here."""
+    _say(f"for many visitors, each with the GPU of their own device: {address}/page")
     _say("the viewer runs until Ctrl-C")
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")

@@ -86,12 +86,7 @@ def march(
     bounds: Bounds | None = None,
 ) -> MarchResult:
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
-    if grid.contracted:
-        steps, packets = _enter_space(grid, rays_o, rays_d)
-        capacity = steps.n_steps
-    else:
-        steps, packets = _enter_box(grid, rays_o, rays_d, bounds)
-        capacity = grid.most_samples
+    lookup, steps, packets, capacity = enter(grid, rays_o, rays_d, bounds)
     n_rays, width = len(rays_o), -(-grid.n_channels // CHANNELS) * CHANNELS
     k = min(n_fetches, capacity)  # no ray has more samples
     work = Work(
@@ -114,10 +109,7 @@ def march(
     )
     vertices = grid.rows
     n_hits = _march_rays(
-        Lookup(
-            grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
-            int(grid.level_steps[0] == 1), grid.density_low, grid.density_slope,
-        ),
+        lookup,
         Stored(
             vertices.bricks, vertices.rows, grid.features, vertices.resolution, vertices.n_per_axis,
             grid.feature_scale,
@@ -127,6 +119,29 @@ def march(
     check_scratch(packets, work, found)
     opacity, depth, counts, hits, features = found
     return MarchResult(opacity, depth, counts, hits[:n_hits], features[:n_hits, : grid.n_channels])
+
+
+class Entered(NamedTuple):
+    """n rays where they begin, as `march_packet` takes them."""
+
+    lookup: Lookup
+    steps: BoxSteps | SpaceSteps
+    packets: np.ndarray
+    """[n_packets, BOX_ROWS or SPACE_ROWS, LANES] float32; the last packet may have lanes without a ray."""
+    most_samples: int
+    """No ray has more samples."""
+
+
+def enter(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds | None = None) -> Entered:
+    """Rays where they enter a grid of either kind; the arguments are those of `march`."""
+    lookup = Lookup(
+        grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
+        int(grid.level_steps[0] == 1), grid.density_low, grid.density_slope,
+    )  # fmt: skip
+    if grid.contracted:
+        steps, packets = _enter_space(grid, rays_o, rays_d)
+        return Entered(lookup, steps, packets, steps.n_steps)
+    return Entered(lookup, *_enter_box(grid, rays_o, rays_d, bounds), grid.most_samples)
 
 
 def _enter_box(

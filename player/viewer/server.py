@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,8 @@ from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
 from player.render import Background, March, Renderer
 from player.terminal import printable
+from player.viewer.growing import Growing, tell_what_is_missing
+from player.viewer.pages import NO_PAGES, Pages
 from player.viewer.window import Window
 
 PORT = 8080
@@ -51,14 +55,16 @@ class ServeSettings:
 
 @contextmanager
 def serve(
-    assets: Asset | Sequence[Asset],
+    assets: Asset | Iterator[Asset] | Sequence[Asset | Iterator[Asset]],
     settings: ServeSettings = ServeSettings(),
     say: Callable[[str], object] = lambda text: None,
 ) -> Iterator[str]:
     """Serve the viewer as long as a `with` block runs, which is given its address.
 
     Args:
-        assets: one or more open assets, to switch between; the cameras are those of the first.
+        assets: one or more assets, to switch between; the cameras are those of the first. Each is open, or
+            what `Asset.growing` returns: it is shown as soon as its first part is read, and sharper with
+            each of the others.
         settings: where it is served, and how pictures are rendered.
         say: called with each line that a person should know before long work begins.
 
@@ -66,14 +72,18 @@ def serve(
         MissingExtraError: viser is not installed, or is one whose connections cannot be checked; or numba
             where it is asked for and does not run.
         ConfigError: the address cannot be had.
+        VfrError: of an asset that grows, not even the first part can be read.
 
     >>> import player
     >>> with player.serve(player.Asset.open("out/"), player.ServeSettings(march="numpy")) as address:
     ...     address.rpartition(":")[0]  # a program that serves for long waits here, as `input()` does
     'http://127.0.0.1'
     """
-    assets = [assets] if isinstance(assets, Asset) else assets
-    _need_viser(assets[0])
+    given = [assets] if isinstance(assets, Asset | Iterator) else assets
+    firsts = [asset if isinstance(asset, Asset) else next(asset) for asset in given]
+    for first in firsts:
+        tell_what_is_missing(first, say)
+    _need_viser(firsts[0])
     port = free_port(settings.host, settings.port)
     if settings.march != "numpy":
         from player.proof import prove
@@ -83,23 +93,39 @@ def serve(
         # what viser says where a client goes while something is sent to it
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         renderers = [
-            stack.enter_context(Renderer(asset, settings.threads, settings.march)) for asset in assets
+            stack.enter_context(Renderer(first, settings.threads, settings.march)) for first in firsts
         ]
-        title = f"{printable(assets[0].folder.resolve().name)} - vfr-play"
-        server = guarded_server(settings.host, port, title)
+        pages = Pages([partial(_page, first.folder) for first in firsts])
+        title = f"{printable(firsts[0].folder.resolve().name)} - vfr-play"
+        server = guarded_server(settings.host, port, title, pages)
         windows: dict[int, Window] = {}
+        growing = None
         try:
             windows = open_windows(server, renderers, settings.samples, settings.background)
+
+            def changed() -> None:
+                for window in list(windows.values()):
+                    window.touch()
+
+            later = [
+                (renderer, asset)
+                for renderer, asset in zip(renderers, given, strict=True)
+                if not isinstance(asset, Asset)
+            ]
+            growing = Growing(later, changed, say)
             yield f"http://{_shown(settings.host)}:{server.get_port()}"
         finally:
+            if growing is not None:
+                growing.stop()
             for window in list(windows.values()):
                 window.close()
+            pages.close()
             with redirect_stdout(io.StringIO()):
                 server.stop()
 
 
-def guarded_server(host: str, port: int, title: str = "") -> Any:
-    """viser's server, with `player.viewer.guard` before every connection.
+def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGES) -> Any:
+    """viser's server, with `player.viewer.guard` before every connection, and pages beside it.
 
     Raises MissingExtraError for a viser that cannot be guarded.
     """
@@ -110,13 +136,23 @@ def guarded_server(host: str, port: int, title: str = "") -> Any:
     server = None
     try:
         # its banner: ours is the one line that scripts read
-        with every_connection_checked(Guard(host, viser.__version__)), redirect_stdout(io.StringIO()):
+        with (
+            every_connection_checked(Guard(host, viser.__version__, pages)),
+            redirect_stdout(io.StringIO()),
+        ):
             server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     except MissingExtraError:
         if server is not None:
             server.stop()
         raise
     return server
+
+
+def _page(folder: Path) -> bytes:
+    """The page of an asset with all of its parts, whichever of them the viewer has read by now."""
+    from player.page.page import page
+
+    return page(Asset.open(folder))
 
 
 def open_windows(
