@@ -68,11 +68,11 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     seconds = {
         "train": run("vfr-train", train_main, "demo", model, "--minutes", str(minutes),
                      "--json", f"{output}/train.json"),
-        "bake": run("vfr-bake", bake_main, model, asset, "--refine-steps", "300",
-                    "--json", f"{output}/bake.json"),
+        "bake": run("vfr-bake", bake_main, model, asset, "--json", f"{output}/bake.json"),
         "play": run("vfr-play", play, asset, "--cameras", f"{output}/cameras_test.json", "--output", frames,
                     "--json", f"{output}/play.json"),
-        "export": run("vfr-export", export, asset, f"{output}/mesh.glb"),
+        "export": run("vfr-export", export, asset, f"{output}/mesh.glb")
+        + run("vfr-export", export, asset, f"{output}/scene.html"),
     }  # fmt: skip
     figures = {name: json.loads((output / f"{name}.json").read_text()) for name in ("train", "bake", "play")}
     background = np.array(Asset.open(asset).manifest.background)
@@ -119,7 +119,8 @@ def _summary(
         f"speed      {1000 / play['ms_median']:.1f} frames/s at {play['width']}x{play['height']}, "
         f"{play['threads']} threads, {play['march']} march\n"
         f"time       {seconds['all']:.0f} s: train {seconds['train']:.0f}, bake {seconds['bake']:.0f}, "
-        f"play {seconds['play']:.0f}, export {seconds['export']:.0f}"
+        f"play {seconds['play']:.0f}, export {seconds['export']:.0f}\n"
+        f"\nopen {output / 'scene.html'}"
     )
 
 

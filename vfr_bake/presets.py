@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Preset = Literal["fidelity", "balanced", "fast"]
+Preset = Literal["fidelity", "balanced", "fast", "phone"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,8 @@ class BakeChoice:
     """Largest number of feature lookups per ray, k; 0 for every sample."""
     sample_loss_db: float
     """Fewer lookups are taken where they lose no more than this, dB."""
+    code_loss_db: float
+    """Stored values are chosen that lose no more than this by themselves, dB: the more, the fewer bytes."""
     density_step: int
     """Density codes, of 256, from one that is stored to the next."""
     code_levels: int
@@ -59,20 +61,26 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=1.95, contracted_resolution=1152, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
-        density_step=2, code_levels=127, head_width=0, head_layers=3, head_bands=4, head_bits=8,
-        refine_steps=600, minutes=5, mesh_resolution=128, target_loss_db=0.05,
+        code_loss_db=0.01, density_step=2, code_levels=127, head_width=0, head_layers=3,
+        head_bands=4, head_bits=8, refine_steps=600, minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=1088, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
-        density_step=6, code_levels=50, head_width=64, head_layers=3, head_bands=4, head_bits=8,
-        refine_steps=4000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        code_loss_db=0.04, density_step=4, code_levels=50, head_width=64, head_layers=3,
+        head_bands=4, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
-        n_channels=12, channel_loss_db=0.5, n_fetches=4, sample_loss_db=0.15,
-        density_step=8, code_levels=50, head_width=32, head_layers=1, head_bands=3, head_bits=8,
-        refine_steps=5000, minutes=8, mesh_resolution=112, target_loss_db=1.0,
+        n_channels=12, channel_loss_db=0.5, n_fetches=12, sample_loss_db=0.15,
+        code_loss_db=0.15, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        head_bands=3, head_bits=8, refine_steps=5000, minutes=8, mesh_resolution=112, target_loss_db=1.0,
+    ),
+    "phone": BakeChoice(
+        cells_per_pixel=1.3, contracted_resolution=896, feature_share=0.58, culled_loss_db=0.1,
+        n_channels=12, channel_loss_db=0.5, n_fetches=8, sample_loss_db=0.3,
+        code_loss_db=0.3, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        head_bands=3, head_bits=8, refine_steps=5000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
     ),
 }  # fmt: skip
 
@@ -89,6 +97,7 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "target_loss_db": 0.5,
     },
     "fast": {"refine_steps": 2500},
+    "phone": {"refine_steps": 2500, "feature_share": 1.0, "n_channels": 16},
 }
 """What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
 which take their time; its features are most of what a grid of so few cells loses."""

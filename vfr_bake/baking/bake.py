@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from exporters.formats.ply import small_ply_bytes
-from exporters.head.onnx_head import head_onnx
+from exporters.head.onnx_head import HeadWeights, Range, head_onnx
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
@@ -28,6 +28,7 @@ from player.files.files import check_target
 from player.head.head import Head
 from vfr_bake import __version__
 from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
+from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
     Layout,
@@ -42,9 +43,9 @@ from vfr_bake.baking.grids import (
 from vfr_bake.baking.head import fold_head, runner, small_head
 from vfr_bake.baking.held_out import BETWEEN, HeldOut, views_between
 from vfr_bake.baking.limits import (
-    channels_that_fit,
+    MANIFEST_BYTES,
+    cells_that_fit,
     check_budget,
-    coded_bytes,
     file_sizes,
     frame_ms,
     keep_to_time,
@@ -52,6 +53,7 @@ from vfr_bake.baking.limits import (
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import REFINED_BY, make_plan
+from vfr_bake.baking.rate import FIRST_PRICE, PRICES_TRIED, RAISED, Prices, Spent, importance, turning_point
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.witness_loss import Loss
@@ -138,10 +140,18 @@ class _Bake:
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
-        arrays = layout.arrays(stored.density, stored.features)
+        most_db, played = self.choice.culled_loss_db, runner(stored.head, tuning.ranges)
+        detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
+        with self._part("detail"):
+            needed = self._needed(detail, layout, stored, teacher)
+        self.left_out |= detail.left_out
+        with self._part("codes"):
+            arrays = self._spend(stored.head, needed, teacher, tuning.ranges, len(head))
+            level_steps = detail.level_steps(needed.layout.played(arrays))
+        del teacher, needed
         figures: dict[str, Any] = {
-            "n_vertices": len(layout.densities),
-            "n_feature_vertices": len(layout.features),
+            "n_vertices": int(arrays.densities.first_rows[-1]),
+            "n_feature_vertices": int(arrays.features.first_rows[-1]),
             "stages": self.held_out.table(),
         }
         missed: list[str] = []
@@ -158,7 +168,7 @@ class _Bake:
             return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
 
         with self._part("writing and checking"):
-            manifest = self._manifest(layout, arrays, figures)
+            manifest = self._manifest(layout, arrays, figures, level_steps)
             cameras = write_cameras(self.model.cameras)
             write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
         last = self.held_out.stages[-1]
@@ -166,7 +176,7 @@ class _Bake:
         figures |= {"loss_db_spread": last.loss.spread}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
         n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
-        return BakeResult(len(layout.densities), n_bytes, seconds, last.loss, figures, missed)
+        return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, missed)
 
     def _cells(self) -> tuple[Layout, int]:
         """Where densities and features are stored, and the number of training rays for which that leaves
@@ -179,13 +189,18 @@ class _Bake:
             )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        fitted = fit_cells(visible, plan.resolutions, plan.most_cells)
+        most, room = plan.most_cells, f"{self.config.max_memory:g} GB of memory"
+        if self.config.max_mb is not None:
+            in_bytes = cells_that_fit(self.config.max_mb, self._other_bytes(self.config.max_mb))
+            if in_bytes < most:
+                most, room = in_bytes, f"{self.config.max_mb:g} MB"
+        fitted = fit_cells(visible, plan.resolutions, most)
         unbounded, resolutions = model.field.config.unbounded, fitted.resolutions
         if resolutions != plan.resolutions:
             self.left_out["resolution"] = (
                 f"{resolutions.densities} cells along an axis for densities, {resolutions.features} for "
                 f"features, in place of {plan.resolutions.densities} and {plan.resolutions.features}: more "
-                f"do not fit into {self.config.max_memory:g} GB of memory; part of the loss after 'grid'"
+                f"do not fit into {room}; part of the loss after 'grid'"
             )
             step = lattice_step(resolutions.densities) if unbounded else step
         near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
@@ -217,10 +232,8 @@ class _Bake:
             features = evaluate_features(model, layout, projection.matrix, self._progress("features"))
             step = code_step(features, choice.code_levels)
             features /= np.float32(step)
-            n_fit = self._channels_that_fit(layout, density, features)
-            features = np.ascontiguousarray(features[:, :n_fit])
             first = model.field.head.first_weights().astype(np.float64)
-            head = fold_head(model.field.head, first @ projection.back[:, :n_fit] * step)
+            head = fold_head(model.field.head, first @ projection.back * step)
             grid = layout.grid(density, features)
             played = held_out.march(replace(grid, features=features), 0)
             own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
@@ -233,6 +246,12 @@ class _Bake:
             "than that after 'grid', before refinement"
         )
         return Stored(head, features, density), teacher
+
+    def _needed(self, detail: Detail, layout: Layout, stored: Stored, teacher: TeacherRays) -> Needed:
+        """No more detail of the refined values than the pictures need. Changes the features of `stored`."""
+        cameras = [] if self.config.no_cull else self.model.model_cameras()
+        cameras += views_between(self.model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
+        return detail.needed(layout, stored.density, stored.features, cameras, teacher)
 
     def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
@@ -248,19 +267,54 @@ class _Bake:
                 return projection
         return every
 
-    def _channels_that_fit(self, layout: Layout, density: np.ndarray, features: np.ndarray) -> int:
-        """How many of the channels, the most important of which come first, fit into the budget."""
-        if self.config.max_mb is None:
-            return features.shape[1]
-        arrays = layout.arrays(density, features)
-        densities = coded_bytes(arrays.densities, "densities", layout.density_step)
-        coded = coded_bytes(arrays.features, "features", 1)
-        mesh = mesh_bytes(round(self.config.max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
+    def _spend(
+        self,
+        weights: HeadWeights,
+        needed: Needed,
+        teacher: TeacherRays,
+        ranges: tuple[Range, ...] | None,
+        head_bytes: int,
+    ) -> GridArrays:
+        """What is stored of the refined values: as little as the witnesses allow, and as fits."""
+        held_out, config, layout = self.held_out, self.config, needed.layout
+        head, progress = runner(weights, ranges), self._progress("codes")
+        stored = Stored(weights, needed.features, needed.density)
+        grid = layout.grid(stored.density, stored.features)
+        matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
+        refined = held_out.look("refined", grid, head, self.n_fetches)
+        del grid
+        prices = Prices(needed, matters)
+        others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
+        tried: list[float] = []
+
+        def at(price: float) -> Spent:
+            tried.append(price)
+            progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
+            return prices.at(price)
+
+        def loses_little(price: float) -> bool:
+            grid = layout.played(at(price).arrays)
+            after = held_out.look("codes", grid, head, self.n_fetches)
+            if config.max_loss_db is not None:
+                return after.loss.db <= config.max_loss_db
+            return held_out.lost(refined.shown, after.shown).most <= self.choice.code_loss_db
+
+        def is_too_large(price: float) -> bool:
+            n_bytes = others + at(price).n_bytes
+            return n_bytes + mesh_bytes(round(n_bytes), None) > 1e6 * (config.max_mb or np.inf)
+
+        price, _ = turning_point(loses_little, FIRST_PRICE * held_out.model_error)
+        if config.max_mb is not None and is_too_large(price):
+            _, price = turning_point(is_too_large, RAISED * price)
+        return prices.at(price).arrays
+
+    def _other_bytes(self, max_mb: float) -> int:
+        """What the files of an asset of `max_mb` megabytes take beside the stored values and the
+        manifest."""
+        mesh = mesh_bytes(round(max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
-        rest = densities.structure + sum(densities.channels) + coded.structure
-        rest += mesh + len(write_cameras(self.model.cameras)) + head
-        return channels_that_fit(self.config.max_mb, rest, coded.channels)
+        return mesh + len(write_cameras(self.model.cameras)) + head
 
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
@@ -273,7 +327,7 @@ class _Bake:
             any_ranges = [(0.0, 1.0)] * (1 + len(weights.directional)) if self.choice.head_bits == 8 else None
             return head_onnx(weights, any_ranges)
 
-        manifest = self._manifest(layout, arrays, {})
+        manifest = self._manifest(layout, arrays, {}, (1,))
 
         def measure(width: int, n_fetches: int) -> float:
             with TemporaryDirectory() as folder:
@@ -283,7 +337,9 @@ class _Bake:
         fixed = self.config.head_width is not None, self.config.k != "auto"
         return keep_to_time(self.choice, target_ms, measure, *fixed)
 
-    def _manifest(self, layout: Layout, arrays: GridArrays, figures: dict[str, Any]) -> Manifest:
+    def _manifest(
+        self, layout: Layout, arrays: GridArrays, figures: dict[str, Any], level_steps: tuple[int, ...]
+    ) -> Manifest:
         model = self.model
         camera = model.cameras[0]
         return Manifest(
@@ -295,7 +351,7 @@ class _Bake:
             contracted=layout.contracted,
             near=layout.near,
             density_range=layout.density_range,
-            level_steps=(1,) * len(arrays.densities.values),
+            level_steps=level_steps,
             density_steps=(layout.density_step,) * len(arrays.densities.values),
             feature_steps=(1,) * len(arrays.features.values),
             n_channels=arrays.features.n_channels,

@@ -347,10 +347,11 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     random = np.random.default_rng(0)
     share = _share_of_pixels(model, resolution)
     for index, camera in enumerate(cameras):
-        rays_o, rays_d = camera.rays()
-        some = random.choice(len(rays_o), max(round(share * len(rays_o)), 1), replace=False)
+        n_pixels = camera.width * camera.height
+        some = random.choice(n_pixels, max(round(share * n_pixels), 1), replace=False)
+        rays_o, rays_d = camera.rays_through(some)
         for first in range(0, len(some), CONTRACTED_RAYS_AT_ONCE):
-            rows = some[first : first + CONTRACTED_RAYS_AT_ONCE]
+            rows = slice(first, first + CONTRACTED_RAYS_AT_ONCE)
             _mark(model, rays_o[rows], rays_d[rows], weight_floor, visible)
         progress(index + 1, len(cameras))
     if not visible.any():

@@ -48,7 +48,7 @@ def values_beneath(pyramid: Pyramid, finest: np.ndarray, grid: Grid, step: int =
     low, high = LIMITS[grid]
     values = [np.clip(finest, low, high)]
     for fine, coarse in pairwise(pyramid.vertices):
-        values.append(_coarser(fine, coarse, values[-1]))
+        values.append(_sampled(fine, coarse, values[-1]))
     if step > 1:
         steps = (step,) * len(values)
         symbols = symbols_of(pyramid.vertices, values, steps, LIMITS[grid])
@@ -63,8 +63,9 @@ def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
     return stored if coarser else values_beneath(pyramid_beneath(stored.pyramid), finest, grid)
 
 
-def _coarser(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
-    """The values [n_coarse, n_channels] of the next coarser level."""
+def _sampled(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
+    """The values [n_coarse, n_channels] of the next coarser level: those of the finer vertices at the same
+    places; where none is there, the mean of those around."""
     places = coarse.index * 2
     rows = fine.rows(places)
     out = values[rows]

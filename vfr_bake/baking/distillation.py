@@ -151,13 +151,14 @@ def render_teacher(
     random = np.random.default_rng(seed)
     parts = []
     for done, camera in enumerate(cameras):
-        rays_o, rays_d = camera.rays()
-        some = random.choice(len(rays_o), min(len(rays_o), max(n_rays // len(cameras), 1)), replace=False)
-        features, opacity, _ = model.sampler.composited_features(model.field, rays_o[some], rays_d[some])
+        n_pixels = camera.width * camera.height
+        some = random.choice(n_pixels, min(n_pixels, max(n_rays // len(cameras), 1)), replace=False)
+        rays_o, rays_d = camera.rays_through(some)
+        features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
         met = np.flatnonzero(opacity > 0)
-        some, features, opacity = some[met], features[met], opacity[met]
-        colours = head_colours(model.field, features, rays_d[some]) * opacity[:, None]
-        parts.append((rays_o[some], rays_d[some], features, colours, opacity))
+        rays_o, rays_d, features, opacity = rays_o[met], rays_d[met], features[met], opacity[met]
+        colours = head_colours(model.field, features, rays_d) * opacity[:, None]
+        parts.append((rays_o, rays_d, features, colours, opacity))
         progress(done + 1, len(cameras))
     return TeacherRays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
+from vfr_bake.kernels.stored_features import table
 from vfr_bake.training.model_file import Model
 
 SLAB = 64
@@ -75,6 +77,13 @@ class Vertices:
         return from_vertices(VertexBricks(self.coords, self.masks, codes), self.resolution)
 
 
+class Pyramids(NamedTuple):
+    """The cells of an asset on all levels."""
+
+    densities: Pyramid
+    features: Pyramid
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Which vertices are stored, and how their densities are coded."""
@@ -98,42 +107,43 @@ class Layout:
         return (-edge,) * 3, (edge,) * 3
 
     @cached_property
-    def _pyramids(self) -> tuple[Pyramid, Pyramid]:
+    def pyramids(self) -> Pyramids:
         """Densities and features with coarser levels."""
-        return pyramid_beneath(self.densities.pyramid), pyramid_beneath(self.features.pyramid)
+        return Pyramids(pyramid_beneath(self.densities.pyramid), pyramid_beneath(self.features.pyramid))
 
     def _densities(self, codes: np.ndarray) -> PyramidValues:
         """The pyramid of density codes [n] that need not be whole."""
         whole = np.clip(np.rint(codes), 0, 255).astype(np.uint8)[:, None]
-        return values_beneath(self._pyramids[0], whole, "densities", self.density_step)
-
-    def arrays(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
-        """The asset's arrays, from codes that need not be whole: one for each vertex of the densities,
-        [n, n_channels] for each of the features."""
-        codes = encode_features(features)
-        return GridArrays(self._densities(density), values_beneath(self._pyramids[1], codes, "features"))
+        return values_beneath(self.pyramids.densities, whole, "densities", self.density_step)
 
     def finest(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
-        """The finest level of `arrays`, which has all that is shown."""
-        (codes, *_), pyramid = self._densities(density).values, self._pyramids[0]
-        return GridArrays(
-            PyramidValues(Pyramid(pyramid.resolution, pyramid.levels[:1]), (codes,)),
-            self.features.values(encode_features(features)),
-        )
+        """The asset's finest level, from codes that need not be whole: one for each vertex of the densities,
+        [n, n_channels] for each of the features."""
+        return GridArrays(_finest(self._densities(density)), self.features.values(encode_features(features)))
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
         """The grid that a player makes of `finest`."""
-        a = self.finest(density, features)
+        return self.played(self.finest(density, features))
+
+    def played(self, arrays: GridArrays) -> SparseGrid:
+        """The grid that a player makes of `arrays`, with single steps through all levels."""
         return build_grid(
-            a.densities,
-            a.features,
+            arrays.densities,
+            arrays.features,
             np.array(self.aabb),
             self.step,
-            (1,),
+            (1,) * len(arrays.densities.values),
             self.density_range,
             self.contracted,
             self.near,
         )
+
+
+def _finest(stored: PyramidValues) -> PyramidValues:
+    """The finest level alone."""
+    one = Pyramid(stored.pyramid.resolution, stored.pyramid.levels[:1])
+    vars(one)["vertices"] = stored.pyramid.vertices[:1]  # they need not be found again
+    return PyramidValues(one, stored.values[:1])
 
 
 def make_layout(
@@ -170,7 +180,7 @@ def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.n
 def evaluate_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
     """The field's features times `matrix` [n_stored, n_channels]: [n_features, n_stored] float32."""
     vertices, back = layout.features, matrix.T.astype(np.float32)
-    features = np.empty((len(vertices), len(matrix)), np.float32)
+    features = table(len(vertices), len(matrix))
     for rows, points in _chunks(vertices, layout.contracted):
         np.matmul(model.field.features(points), back, out=features[rows])
         progress(rows.stop, len(vertices))

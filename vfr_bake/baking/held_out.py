@@ -53,6 +53,9 @@ N_DIRECTIONS = 6
 """Other directions from which a colour is looked at, to see whether it depends on them."""
 SEED = 2
 """Seed of the views that are kept for measuring; training uses others."""
+FAR_OFF = 0.1
+"""By how much a pixel that stands out differs, in one of three channels of 0 to 1, as specks do in
+`vfr_bake.bench.specks`."""
 DEFAULT_PSNR = 30.0
 """PSNR that is assumed for a model whose training has measured nothing."""
 
@@ -122,6 +125,12 @@ class Shown(NamedTuple):
     """Mean square error to the model's pictures on the views between; not rounded to 8 bits."""
     errors: np.ndarray | None
     """[n_witnesses] float64: mean square error of each witness to its photograph; None without witnesses."""
+    rgb: np.ndarray
+    """[n, 3] float32: the pictures' colours, 0 to 1."""
+
+    def far_off(self, other: Shown) -> float:
+        """The share of the pixels that differ from `other`'s by more than FAR_OFF in a channel."""
+        return float(np.mean(np.abs(self.rgb - other.rgb).max(axis=1) > FAR_OFF))
 
 
 @dataclass(frozen=True)
@@ -151,9 +160,8 @@ class HeldOut:
         random = np.random.default_rng(SEED)
         rays = []
         for camera in views_between(model, n_views, SEED):
-            rays_o, rays_d = camera.rays()
-            some = random.choice(len(rays_o), min(n_of_view, len(rays_o)), replace=False)
-            rays.append((rays_o[some], rays_d[some]))
+            n_pixels = camera.width * camera.height
+            rays.append(camera.rays_through(random.choice(n_pixels, min(n_of_view, n_pixels), replace=False)))
         self._n_between = sum(len(rays_o) for rays_o, _ in rays)
         if witnesses is not None:
             rays.append(model.witness_rays())
@@ -173,6 +181,11 @@ class HeldOut:
         self._own = self._compared(self.wanted)
         self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
         self.stages: list[Stage] = []
+
+    @property
+    def model_error(self) -> float:
+        """Mean square error of the model's pictures to those that it learned from."""
+        return 10 ** (-self._model_psnr / 10)
 
     def measured_on(self) -> str:
         """What losses are measured on, or estimated from, in a sentence."""
@@ -237,7 +250,8 @@ class HeldOut:
         """How far the pictures [n, 3] of all rays are off."""
         between, of_witnesses = slice(self._n_between), slice(self._n_between, None)
         error = float(np.mean((rgb[between].astype(np.float64) - self.wanted[between]) ** 2))
-        return Shown(error, None if self._witnesses is None else self._witnesses.errors(rgb[of_witnesses]))
+        errors = None if self._witnesses is None else self._witnesses.errors(rgb[of_witnesses])
+        return Shown(error, errors, rgb)
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the player composes on the rays."""

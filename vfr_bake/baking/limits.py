@@ -9,27 +9,24 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.asset import Asset, GridArrays
 from player.asset.manifest import FileEntry, Manifest
-from player.asset.parts import LIMITS
-from player.asset.pyramid import PyramidValues, symbols_of
-from player.asset.sections import Grid
-from player.asset.structure import encode_structure
-from player.asset.symbols import encode_level, level_rows
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.render import Renderer
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
 
-SMALL_FILES = 200_000
-"""Bytes kept for a small head and the manifest where the asset has to fit into a budget."""
-REFINED_GROWTH = 1.1
-"""How many times larger features are packed after refinement: their codes are rougher than the field's."""
+MANIFEST_BYTES = 20_000
+"""Bytes kept for the manifest where the asset has to fit into a budget."""
+CELL_BYTES = 0.1
+"""Bytes that a stored cell of the features takes at least, with its densities: where there are fewer for
+each, coarser grids show more."""
+FEWEST_CELLS = 4096
+"""Cells that an asset has in any case: with fewer it shows nothing."""
 SIZE = 800
 """Pixels along each side of the frame that is measured."""
 N_FRAMES = 3
@@ -45,44 +42,14 @@ Measure = Callable[[int, int], float]
 """Milliseconds of a frame by (width of the head, 0 for the model's own; lookups a ray, 0 for all)."""
 
 
-class CodedBytes(NamedTuple):
-    """Bytes of a pyramid as it is written."""
+def cells_that_fit(max_mb: float, others: int) -> int:
+    """How many cells of the features may be stored in `max_mb` megabytes, of which MANIFEST_BYTES and
+    `others` bytes are taken.
 
-    structure: int
-    channels: list[int]
-    """Those of the symbols of each channel."""
-
-
-def coded_bytes(stored: PyramidValues, grid: Grid, step: int) -> CodedBytes:
-    """What a pyramid, of which a `step` apart are the values that are stored, takes in a file."""
-    vertices, n_levels = stored.pyramid.vertices, len(stored.values)
-    symbols = symbols_of(vertices, stored.values, (step,) * n_levels, LIMITS[grid])
-    rows = [level_rows(level) for level in vertices]
-    structure = sum(len(encode_structure(stored.pyramid, level)) for level in range(n_levels))
-    channels = [
-        sum(len(encode_level(some[:, c : c + 1], at)) for some, at in zip(symbols, rows, strict=True))
-        for c in range(stored.n_channels)
-    ]
-    return CodedBytes(structure, channels)
-
-
-def channels_that_fit(max_mb: float, rest: int, sizes: list[int]) -> int:
-    """How many channels, the most important first, fit into `max_mb` megabytes.
-
-    `sizes` are the packed bytes of each channel before refinement, `rest` the bytes of everything else but
-    the small files. Raises TrainingError where not even one does.
-
-    >>> channels_that_fit(1.0, 300_000, [200_000] * 5)
-    2
+    >>> cells_that_fit(3.0, 300_000)
+    26800000
     """
-    totals = rest + SMALL_FILES + REFINED_GROWTH * np.cumsum(sizes)
-    n_fit = int(np.searchsorted(totals, max_mb * 1e6, "right"))
-    if n_fit == 0:
-        raise TrainingError(
-            f"bake: size: expected at most {max_mb:g} MB, got {totals[0] / 1e6:.2f} MB with one channel: "
-            "nothing was written: allow more, or lower --resolution or --mesh-resolution"
-        )
-    return n_fit
+    return max(int((max_mb * 1e6 - others - MANIFEST_BYTES) / CELL_BYTES), FEWEST_CELLS)
 
 
 def file_sizes(folder: Path) -> dict[str, int]:

@@ -24,7 +24,7 @@ from vfr_bake.baking.cells import (
 )
 from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import BETWEEN
-from vfr_bake.baking.refinement import BATCH
+from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
@@ -35,6 +35,9 @@ N_RAYS = 2_000_000
 UNBOUNDED_RAYS = 500_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
 FEWEST_RAYS = 100_000
+RAYS_OF_CELL = 0.8
+"""Training rays for each stored cell of the features' grid: as many as teach all of lego's. A third of them
+meets something."""
 RAY_BYTES = {False: 300, True: 1_900}
 """Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
 20 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all rays
@@ -51,14 +54,17 @@ VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
 fast as the millions of a bake."""
-STEP_COST, VERTEX_COST, SEEN_COST = {False: 1.2, True: 0.2}, 0.16, {False: 0.12, True: 1.0}
-"""Time of a training ray in a step of refinement, by whether the scene is unbounded (whose model takes its
-time for a ray), of a vertex, and of a ray that marks the cells it sees, by the same; the unit is the time
-that the teacher takes for a ray. Those of an object follow from the parts of lego's bake."""
+STEP_COST, HEAD_COST = {False: 1.75, True: 0.65}, {False: 0.95, True: 0.28}
+"""Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
+unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
+and the following are those of lego, of fox at half size and of the built-in scene."""
+VERTEX_COST, SEEN_COST = {False: 0.32, True: 0.1}, {False: 0.42, True: 1.0}
+"""Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
 OWN_HEAD = 4
 """How many times as long a step takes with the model's own head."""
-MESH_COST = {False: 800_000, True: 200_000}
-"""Time of the mesh and of playing the written files, which hardly depends on the scene, in the same unit."""
+REST_COST = {False: 2_700_000, True: 1_200_000}
+"""Time of all else, which hardly depends on the scene, in the same unit: what is measured, the mesh, the
+files."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +92,10 @@ class Plan:
         return int((self.room - FEWEST_RAYS * self.ray_bytes) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
-        """Training rays for which there is room beside so many cells."""
+        """Training rays for so many cells, as many as they need and for which there is room beside them."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
-        return int(np.clip(left, FEWEST_RAYS, UNBOUNDED_RAYS if self.unbounded else N_RAYS))
+        most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
+        return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, most))
 
     @property
     def n_bytes(self) -> int:
@@ -159,17 +166,20 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     n_rays = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1) * len(views)
     render_teacher(model, views, n_rays, 0, lambda done, of: None)  # compiles
     begin = time.perf_counter()
-    render_teacher(model, views, n_rays, 1, lambda done, of: None)
+    shown = render_teacher(model, views, n_rays, 1, lambda done, of: None)
     ray_seconds = (time.perf_counter() - begin) / n_rays
     fine, coarse = plan.resolutions
-    work = plan.n_rays(plan.n_cells) + VERTEX_COST * plan.n_cells * (1 + (fine / coarse) ** 3)
+    n_all = plan.n_rays(plan.n_cells)
+    work = n_all + VERTEX_COST[unbounded] * plan.n_cells * (1 + (fine / coarse) ** 3)
     if unbounded:
         work += SEEN_COST[True] * rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
         steps = max(model.occupancy.step * coarse / 2, 1.0)
         work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
-    steps = (3 if choice.head_width else 2 * OWN_HEAD) * choice.refine_steps
-    before, refinement = ray_seconds * work, ray_seconds * steps * BATCH * STEP_COST[unbounded]
+    n_steps = refined_steps(config, choice, n_all * len(shown.opacity) / n_rays)
+    refined = n_steps * BATCH * STEP_COST[unbounded]
+    refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
+    before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)
     if config.refine_steps is None:
         refinement = min(refinement, max(60 * REFINED_BY * choice.minutes - before, 0.0))
-    return before + refinement + ray_seconds * MESH_COST[unbounded]
+    return before + refinement + ray_seconds * REST_COST[unbounded]

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from exporters.head.onnx_head import HeadWeights, Range
 from exporters.head.ranges import activation_ranges
+from player.asset.density import decode_constants
 from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from vfr_bake.baking.cells import Progress
@@ -33,6 +34,7 @@ from vfr_bake.baking.limits import LOOKUPS
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
 from vfr_bake.presets import BakeChoice
+from vfr_bake.training.muon import Muon
 
 N_CALIBRATION = 20_000
 """Rays that the calibration of the head's activations takes: they decide the ranges."""
@@ -42,30 +44,43 @@ more."""
 UNIT = 4.0
 """Mean sizes of a channel's composites that make a unit of it; so large a unit makes the first weights of the
 size that the learning rate fits."""
-HEAD_RATE, NEW_HEAD_RATE = 5e-4, 8e-3
-"""Adam's learning rates of a head that the full model had, and of a small head that is not trained yet; they
-fall to zero along a cosine."""
-CODE_RATE, DENSITY_RATE = 0.25, 1.0
+HEAD_RATE, NEW_HEAD_RATE = 5e-4, 6e-3
+"""Learning rates of a head that the full model had, and of a small head that is not trained yet; they fall to
+zero along a cosine."""
+CODE_RATE, DENSITY_RATE = 0.375, 1.5
 """Adagrad's learning rates of feature codes up to 127 and of density codes; they fall along the same
 cosine."""
 DAMPING = 8.0
 """Adagrad's squared gradients of all vertices begin at so many times the mean that the first batch leaves at
 the vertices that it meets. A vertex that few rays meet would else move as far as the others, to suit those
 rays alone."""
-NEW_HEAD_STEPS = 4
-"""How many times the steps of another round the small head is trained alone: its steps take a quarter of the
-time."""
-AT_K = {False: 0.1, True: 0.5}
-"""Factor of the head's learning rate in the round at k lookups, by whether the head is a small one: the
-model's own has less to be trained."""
+PASSES = 10
+"""How often a round of refinement looks at each training ray, unless that takes more steps than the preset
+has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
+HEAD_STEPS, LAST_STEPS = 2000, 1000
+"""Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
+the lookups and bits with which it is played: at most as many as refinement may have. They take a fifth of the
+time of its steps."""
+AT_K = 0.25
+"""Factor of the head's learning rate in the last round, where little is left to be learned."""
+N_LAST = 200_000
+"""Rays from which the head is trained in the last round."""
+SHARES = {"small head": 0.2, "refinement": 0.85, "head at k": 1.0, "refinement at k": 1.0}
+"""Share of the time that is left which a round may take."""
 DIRECTION_SHARE = 0.1
 """A small head leaves the direction out where that loses no more than this share of the loss that the preset
 aims at."""
 ROUNDING_LEFT = 0.5
 """Share of what a head loses by 8 bits that is left after it was tuned with them (docs/bake.md)."""
 WORTH_A_ROUND = 0.03
-"""Loss in dB by fewer lookups and a head in 8 bits for which a round of refinement at these lookups is
-made."""
+"""Loss in dB by fewer lookups and a head in 8 bits for which the head is trained with them."""
+WORTH_FEATURES = 0.15
+"""The same for which the features are trained with them, too: where rays have a hundred samples with weight,
+as in the fog of a model that has hardly learned, the few that are looked up show something else."""
+MOST_FAR_OFF = 1e-4
+"""Share of the pixels that may be far off because of fewer lookups. A lookup that lies between two surfaces
+makes a pixel stand out that costs next to nothing on average: lego's fast asset has 870 such pixels in a
+million with 4 lookups a ray and 40 with 8, which take 3% more time."""
 N_WARM, N_TIMED = 10, 40
 """Steps of a round that are not timed, because something may be compiled for the first time, and steps that
 are."""
@@ -80,6 +95,17 @@ class Stored:
     """[n_features, n_channels] float32 within -127..127."""
     density: np.ndarray
     """[n_densities] float32 within 0..255."""
+
+
+def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
+    """The steps of refinement from `n_rays` training rays that meet something, unless they were asked for."""
+    most = choice.refine_steps
+    return most if config.refine_steps is not None else min(int(PASSES * n_rays / BATCH) + 1, most)
+
+
+def head_steps(choice: BakeChoice) -> int:
+    """The steps in which the head is trained alone, before refinement and after it."""
+    return sum(min(n, choice.refine_steps) for n in (HEAD_STEPS if choice.head_width else 0, LAST_STEPS))
 
 
 class Tuning:
@@ -105,7 +131,6 @@ class Tuning:
         self._config, self._choice = config, choice
         self._held_out, self._progress = held_out, progress
         self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
-        self._rounds_left = 3 if choice.head_width else 2
 
     def run(self, stored: Stored, layout: Layout, teacher: TeacherRays) -> Stored:
         """Head and stored values adapted to each other: at every sample, then at the k lookups that are
@@ -121,13 +146,13 @@ class Tuning:
         rays = collect_training_rays(teacher, grid, 0, densities)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
-            with self._steps("small head", NEW_HEAD_STEPS * choice.refine_steps) as steps:
+            with self._steps("small head", min(HEAD_STEPS, choice.refine_steps)) as steps:
                 stored = replace(stored, head=train_head(stored, rays, steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-        with self._steps("refinement", choice.refine_steps) as steps:
-            tuned = refine(stored, rays, steps, head_rate, code_rate, grid)
+        with self._steps("refinement", refined_steps(self._config, choice, len(rays))) as steps:
+            tuned = refine(stored, rays, steps, layout.density_range, head_rate, code_rate)
         del rays, densities  # they hold on to rows of a grid, for two of which there may be no room
         played, grid = grid.features, layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
@@ -139,25 +164,45 @@ class Tuning:
             grid = layout.grid(stored.density, stored.features)
         every = self._held_out.look("all", grid, runner(stored.head), 0)
         before = self._choose_lookups_and_bits(stored, grid, teacher)
-        lost = self._held_out.lost(every.shown, before.shown)
-        if self.n_fetches and lost.most > WORTH_A_ROUND:
-            rays = collect_training_rays(teacher, grid, self.n_fetches)
-            rates = head_rate * AT_K[choice.head_width > 0], code_rate / 2  # little is left to be trained
-            with self._steps("refinement at k", choice.refine_steps) as steps:
-                tuned = refine(stored, rays, steps, *rates, ranges=self.ranges)
-            played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
-            head = runner(tuned.head, self.ranges)
-            after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
-            if self._gained("refinement at k", before, after):
-                return tuned
-            stored.features[:] = played
+        lost = self._held_out.lost(every.shown, before.shown).most
+        if self.n_fetches and lost > WORTH_FEATURES:
+            return self._refined_at_k(stored, grid, teacher, before, AT_K * head_rate, code_rate)
+        if lost > WORTH_A_ROUND:
+            rays = collect_training_rays(teacher.some(N_LAST), grid, self.n_fetches)
+            with self._steps("head at k", min(LAST_STEPS, choice.refine_steps)) as steps:
+                head = train_head(stored, rays, steps, AT_K * head_rate, self.ranges)
+            after = self._held_out.measure("head at k", grid, runner(head, self.ranges), self.n_fetches)
+            if self._gained("head at k", before, after):
+                return replace(stored, head=head)
+        return stored
+
+    def _refined_at_k(
+        self,
+        stored: Stored,
+        grid: SparseGrid,
+        teacher: TeacherRays,
+        before: Stage,
+        head_rate: float,
+        code_rate: float,
+    ) -> Stored:
+        """Head and features adapted to the lookups and bits that are played, if that gains anything. Changes
+        the features of `stored` in place."""
+        rays = collect_training_rays(teacher, grid, self.n_fetches)
+        asked = refined_steps(self._config, self._choice, len(rays))
+        with self._steps("refinement at k", asked) as steps:
+            tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)
+        played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
+        head = runner(tuned.head, self.ranges)
+        after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
+        if self._gained("refinement at k", before, after):
+            return tuned
+        stored.features[:] = played
         return stored
 
     @contextmanager
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:
-        """The steps of the next round, which takes its share of the time that is left."""
-        seconds = (self._until - time.monotonic()) / self._rounds_left
-        self._rounds_left -= 1
+        """The steps of a round, which takes its share of the time that is left."""
+        seconds = SHARES[name] * (self._until - time.monotonic())
         yield (steps := Steps(asked, self._progress(name), seconds))
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (
@@ -200,17 +245,19 @@ class Tuning:
         return after
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
-        """Set `n_fetches` to what was asked for, or the fewest that lose no more than the preset allows; what
-        each number loses is kept in `lookups`. Returns what the asset loses with them."""
+        """Set `n_fetches` to what was asked for, or the fewest that lose no more than the preset allows and
+        let no more pixels stand out than MOST_FAR_OFF; what each number loses is kept in `lookups`. Returns
+        what the asset loses with them."""
         most = self._choice.n_fetches
         run = runner(head)
         if self._config.k == "auto":
             every = self._held_out.look("all", grid, run, 0).shown
             for k in (*(k for k in LOOKUPS if k < most), most):
                 self.n_fetches = k
-                lost = self._held_out.lost(every, self._held_out.look(str(k), grid, run, k).shown)
+                shown = self._held_out.look(str(k), grid, run, k).shown
+                lost = self._held_out.lost(every, shown)
                 self.lookups[str(k)] = lost.db
-                if lost.most <= self._choice.sample_loss_db:
+                if lost.most <= self._choice.sample_loss_db and shown.far_off(every) <= MOST_FAR_OFF:
                     break
         if not self.n_fetches:
             return self._held_out.look("all", grid, run, 0)
@@ -251,21 +298,22 @@ class Steps:
         return float(0.5 * (1 + np.cos(np.pi * step / self.n)))
 
 
-def train_head(stored: Stored, rays: TrainingRays, steps: Steps, rate: float) -> HeadWeights:
+def train_head(
+    stored: Stored, rays: TrainingRays, steps: Steps, rate: float, ranges: tuple[Range, ...] | None = None
+) -> HeadWeights:
     """The head after `steps` on the squared error of the colours over random backgrounds, with everything
-    else as it is stored: what the rays compose is found once."""
+    else as it is stored: what the rays compose is found once. With `ranges` it is trained as it is played in
+    8 bits (`vfr_bake.baking.head`)."""
     random = np.random.default_rng(0)
     torch.manual_seed(0)
-    head = FoldedHead(stored.head, UNIT * rays.typical(stored.features))
-    adam = torch.optim.Adam(head.parameters(), lr=rate, fused=True)
+    head = FoldedHead(stored.head, UNIT * rays.typical(stored.features), ranges)
+    muon = Muon(head.parameters())
     composed = rays.composed(stored.features)
     for step in steps:
-        adam.param_groups[0]["lr"] = rate * steps.falling(step)
         some = random.integers(0, len(rays), HEAD_BATCH)
         shown, opacity = torch.from_numpy(composed[some]), torch.from_numpy(rays.opacity[some])
-        adam.zero_grad(set_to_none=True)
         _loss(head, shown, opacity, rays, some).backward()
-        adam.step()
+        muon.step(rate * steps.falling(step))
     return head.weights()
 
 
@@ -273,51 +321,48 @@ def refine(
     stored: Stored,
     rays: TrainingRays,
     steps: Steps,
+    density_range: tuple[float, float] | None,
     head_rate: float = HEAD_RATE,
     code_rate: float = CODE_RATE,
-    grid: SparseGrid | None = None,
     ranges: tuple[Range, ...] | None = None,
 ) -> Stored:
-    """Head and codes after `steps` on the squared error of the colours over random backgrounds.
+    """Head, features and densities after `steps` on the squared error of the colours over random backgrounds.
 
     Codes are rounded wherever they are composed, and returned unrounded. The features of `stored` are changed
-    in place: there may be no room for them twice. With a `grid`, whose lookups and densities `rays` must hold
-    at every sample, the densities are trained too, and the weights of the rays follow them. With `ranges` the
-    head is trained as it is played in 8 bits (`vfr_bake.baking.head`).
+    in place: there may be no room for them twice. With a `density_range`, that of `Layout`, the `rays` hold
+    every sample and the densities around it, and their weights follow the densities. Without one the
+    densities stay as they are. With `ranges` the head is trained as it is played in 8 bits.
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
     head = FoldedHead(stored.head, UNIT * rays.typical(stored.features), ranges)
     features, density = stored.features, stored.density.copy()
     squares, density_squares = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
+    low, slope = decode_constants(density_range or (0.0, 0.0))
     n_parts = get_num_threads()
-    adam = torch.optim.Adam(head.parameters(), lr=head_rate, fused=True)
+    muon = Muon(head.parameters())
     for step in steps:
         falling = steps.falling(step)
         moving = falling if step else 0.0  # stored values wait for the squared gradients of the first rays
-        adam.param_groups[0]["lr"] = head_rate * falling
         some = random.integers(0, len(rays), BATCH)
-        fetches, grid_opacity = rays.fetches(some), rays.opacity[some]
-        if grid is not None:
+        fetches, shown_opacity = rays.fetches(some), rays.opacity[some]
+        if density_range is not None:
             weigh(
-                fetches.starts, *fetches.densities, density, grid.density_low, grid.density_slope,
-                fetches.lengths, MAX_TAU, fetches.weights, grid_opacity,
+                fetches.starts, *fetches.densities, density, low, slope, fetches.lengths, MAX_TAU,
+                fetches.weights, shown_opacity,
             )  # fmt: skip
         composed = torch.from_numpy(fetches.compose(features)).requires_grad_()
-        opacity = torch.from_numpy(grid_opacity).requires_grad_(grid is not None)
-        adam.zero_grad(set_to_none=True)
+        opacity = torch.from_numpy(shown_opacity).requires_grad_()
         _loss(head, composed, opacity, rays, some).backward()
-        adam.step()
-        assert composed.grad is not None
+        muon.step(head_rate * falling)
+        assert composed.grad is not None and opacity.grad is not None
         composed_gradient = composed.grad.numpy()
         where = (fetches.starts, *fetches.features)
-        if grid is not None:
-            assert opacity.grad is not None
+        if density_range is not None:
             fetch_gradient = np.empty(len(fetches.weights), np.float32)
             slants(
-                *where, *fetches.densities, fetches.weights, grid_opacity, features, composed_gradient,
-                opacity.grad.numpy(), grid.density_low, grid.density_slope, fetches.lengths, density,
-                fetch_gradient,
+                *where, *fetches.densities, fetches.weights, shown_opacity, features, composed_gradient,
+                opacity.grad.numpy(), low, slope, fetches.lengths, density, fetch_gradient,
             )  # fmt: skip
             rate = np.float32(DENSITY_RATE * moving)
             descend_density(*fetches.densities, fetch_gradient, rate, n_parts, density, density_squares)

@@ -53,6 +53,21 @@ def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_
     assert 8 <= Asset.open(tmp_path / "asset").manifest.resolution < 48
 
 
+def test_a_grid_becomes_coarser_where_the_bytes_do_not_hold_it(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vfr_bake.baking.limits.CELL_BYTES", 10.0)
+    settings = BakeConfig(resolution=96, feature_resolution=96, max_mb=0.4, refine_steps=0, check_views=1)
+    result = bake(model, tmp_path / "asset", settings, quiet)
+    assert result.n_bytes <= 400_000
+    assert "do not fit into 0.4 MB" in result.figures["left_out"]["resolution"]
+    asset = Asset.open(tmp_path / "asset", verify=True)
+    assert 16 <= asset.manifest.resolution < 96
+    camera = model.cameras[0]
+    full = render_image(model.field, model.sampler, model.model_cameras()[0], model.background)
+    assert psnr(render(asset, camera).rgb, full) > 20, "it shows the scene"
+
+
 def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
     """All cameras within a thousandth of the box, looking where they looked: the grid is as fine as it may
     be, and what they see from there is what is stored."""

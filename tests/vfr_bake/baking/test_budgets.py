@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from exporters.formats.ply import read_ply
@@ -15,7 +16,7 @@ from player.errors import TrainingError
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.limits import file_sizes, keep_to_time
-from vfr_bake.baking.plan import N_RAYS, expected_seconds, make_plan
+from vfr_bake.baking.plan import FEWEST_RAYS, N_RAYS, RAYS_OF_CELL, expected_seconds, make_plan
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
@@ -81,11 +82,17 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
 
 
 def test_less_memory_means_fewer_rays(model: Model) -> None:
-    plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in (0.9, 1.2, 4.0)]
-    rays = [plan.n_rays(plan.n_cells) for plan in plans]
+    sizes, n_cells = (1.6, 1.8, 4.0), N_RAYS / RAYS_OF_CELL
+    plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in sizes]
+    rays = [plan.n_rays(n_cells) for plan in plans]
     assert rays[0] < rays[1] < rays[2] == N_RAYS
-    assert plans[1].n_rays(plans[1].most_cells) < rays[1]  # the more cells, the fewer rays
-    assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, (0.9, 1.2, 4.0), strict=True))
+    assert plans[1].n_rays(plans[1].most_cells) < rays[1]  # the more cells, the less room
+    assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, sizes, strict=True))
+
+
+def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:
+    plan = make_plan(model, BakeConfig(resolution=48))
+    assert [plan.n_rays(n) for n in (1e3, 5e5, 3e6)] == [FEWEST_RAYS, 5e5 * RAYS_OF_CELL, N_RAYS]
 
 
 @pytest.mark.parametrize("steps", [0, 5000])
@@ -100,10 +107,11 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
         left, now = list(answers), 0.0
         seeds = set()
 
-        def answer(model: Model, views: object, n_rays: int, seed: int, progress: object) -> None:
+        def answer(model: Model, views: object, n_rays: int, seed: int, progress: object) -> SimpleNamespace:
             nonlocal now
             now += left.pop(0)
             seeds.add(seed)
+            return SimpleNamespace(opacity=np.ones(n_rays // 3))
 
         with monkeypatch.context() as patch:
             patch.setattr("vfr_bake.baking.plan.time", SimpleNamespace(perf_counter=lambda: now))

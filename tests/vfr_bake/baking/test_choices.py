@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from player.asset.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene, trained
+from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import bake
+from vfr_bake.baking.held_out import Shown
+from vfr_bake.baking.witness_loss import Loss
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
+from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
 
 MAX_MB = 1.0
@@ -55,3 +62,34 @@ def test_fog_takes_more_lookups_than_a_surface(chosen: dict[str, dict]) -> None:
     channels = {kind: report["manifest"].n_channels for kind, report in chosen.items()}
     assert lookups["fog"] > lookups["matte"]
     assert len(set(zip(lookups.values(), channels.values(), strict=True))) == 3
+
+
+@pytest.mark.parametrize(("n_specks", "k"), [(1, 2), (3, 8)])
+def test_lookups_are_enough_for_pixels_not_to_stand_out(
+    n_specks: int, k: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """20,000 pixels, of which n_specks are far off with fewer than 8 lookups; the mean sees none of them."""
+
+    class Seen:
+        def look(self, name: str, grid: Any, head: Any, n_fetches: int) -> Any:
+            rgb = np.zeros((20_000, 3), np.float32)
+            rgb[: 0 if n_fetches in (0, 8) else n_specks, 1] = 0.2
+            return SimpleNamespace(shown=Shown(0.0, None, rgb))
+
+        def lost(self, before: Shown, after: Shown) -> Loss:
+            return Loss(0.0, 0.0)
+
+        def measure(self, name: str, grid: Any, head: Any, n_fetches: int) -> int:
+            return n_fetches
+
+    monkeypatch.setattr(refinement, "runner", lambda head: head)
+    monkeypatch.setattr(refinement, "LOOKUPS", (2, 4, 8, 12))
+    tuning = refinement.Tuning(
+        BakeConfig(preset="fast"),
+        PRESETS["fast"],
+        Seen(),
+        lambda name: quiet,
+        1.0,  # type: ignore[arg-type]
+    )
+    assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
+    assert set(tuning.lookups.values()) == {0.0}

@@ -12,14 +12,13 @@ import torch
 from exporters.export import export_asset
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
-from player.asset.grid import vertex_rows
 from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
 from player.march.contraction import contract
 from player.render import render
 from tests.vfr_bake.baking.scenes import trained
-from vfr_bake.baking.bake import bake
+from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import lattice_step, weighty_cells
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import unit_points
@@ -156,13 +155,17 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("k", [0, 4])
-def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: Path, k: int) -> None:
-    grid = Asset.open(folder).grid
+def test_a_training_ray_composes_what_the_player_composes(model: Model, k: int) -> None:
+    """In the grid of one level that refinement learns from."""
+    work = _Bake(model, SETTINGS, quiet)
+    layout, n_rays = work._cells()
+    stored, _ = work._store(layout, n_rays)
+    grid = layout.grid(stored.density, stored.features)
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march_compiled.march(grid, rays_o, rays_d, k)
     nothing = np.zeros((len(rays_o), 3), np.float32)
     teacher_rays = TeacherRays(rays_o, rays_d, nothing, nothing, nothing[:, 0])
-    densities = vertex_rows(Asset.open(folder).arrays.densities.pyramid)
+    densities = layout.densities.rows()
     training_rays: TrainingRays = collect_training_rays(teacher_rays, grid, k, densities)
     assert len(training_rays) == len(played.hits) > 1000
     composed = training_rays.composed(grid.features.astype(np.float32))
@@ -170,16 +173,13 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, folder: 
     np.testing.assert_allclose(training_rays.opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
     if k == 0:  # the ways of the samples are what makes their weights
         fetches = training_rays.fetches(np.arange(len(training_rays)))
-        code = (fetches.densities.shares * _codes(folder)[fetches.densities.rows]).sum(axis=1)
+        codes = layout.finest(stored.density, stored.features).densities.values[0][:, 0].astype(np.float32)
+        code = (fetches.densities.shares * codes[fetches.densities.rows]).sum(axis=1)
         optical = np.exp(grid.density_low + grid.density_slope * code) * training_rays.lengths
         first = training_rays.starts[:-1]
         np.testing.assert_allclose(
             -np.expm1(-optical[first]), training_rays.weights[first], rtol=1e-3, atol=1e-6
         )
-
-
-def _codes(folder: Path) -> np.ndarray:
-    return Asset.open(folder).arrays.densities.values[0][:, 0].astype(np.float32)
 
 
 def test_vertices_outside_contracted_space_take_its_border() -> None:
@@ -203,7 +203,9 @@ def test_exports_hold_the_inner_region_in_world_units(model: Model, folder: Path
     assert again["faces"] > 50
     assert (np.abs(np.array(again["bounds"]) - centre) <= asset.scale * 1.001).all()
     densities = np.load(tmp_path / "a.npz")
-    assert len(densities["density"]) < len(asset.arrays.densities.values[0]), "the surroundings are left out"
+    finest = asset.grid.live.reshape(-1, 64), asset.grid.slot_levels
+    cells = float((np.unpackbits(finest[0], axis=1).sum(axis=1) * 8.0 ** finest[1]).sum())
+    assert len(densities["density"]) < 0.9 * cells, "the surroundings are left out"
 
 
 def _options(**settings: object) -> object:

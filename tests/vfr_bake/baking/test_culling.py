@@ -58,6 +58,13 @@ def test_a_low_floor_marks_more(model: Model) -> None:
     assert np.array_equal(together[..., 1], alone[..., 0])
 
 
+def volume(folder: Path) -> float:
+    """How many cells of the finest level the live ones of all levels are."""
+    grid = Asset.open(folder).grid
+    live = np.unpackbits(grid.live).reshape(-1, 512).sum(axis=1)
+    return float((live * 8.0**grid.slot_levels).sum())
+
+
 def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
     small: dict[str, Any] = {
         "resolution": 48,
@@ -68,7 +75,7 @@ def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
     }
     culled = bake(model, tmp_path / "a", BakeConfig(weight_floor=0.02, **small), quiet)
     everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
-    assert everything.n_vertices > 1.15 * culled.n_vertices
+    assert volume(tmp_path / "b") > 1.15 * volume(tmp_path / "a")
     assert "cells" in culled.figures["left_out"] and "cells" not in everything.figures["left_out"]
 
 
@@ -146,7 +153,7 @@ def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path
     }
     result = bake(thin, tmp_path / "asset", BakeConfig(preset="fidelity", refine_steps=0, **small), quiet)
     assert result.figures["psnr_to_full_model"] > 35
-    assert len(Asset.open(tmp_path / "asset").arrays.densities.values[0]) == 33**3
+    assert volume(tmp_path / "asset") > 0.99 * 32**3, "all but corners that no ray meets"
     assert result.figures["mesh_faces"] == 0, "an even fog has no surface"
 
 

@@ -12,7 +12,7 @@ import torch
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
-from vfr_bake.baking.refinement import Steps, Stored, refine
+from vfr_bake.baking.refinement import HEAD_RATE, Steps, Stored, train_head
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.networks import Head
 
@@ -65,7 +65,8 @@ def test_refinement_gets_back_what_8_bits_lose() -> None:
         return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
 
     stored = Stored(weights, codes, np.zeros(len(codes), np.float32))
-    tuned = refine(stored, training_rays, Steps(400, lambda done, of: None), code_rate=0, ranges=ranges)
+    steps = Steps(400, lambda done, of: None)
+    tuned = replace(stored, head=train_head(stored, training_rays, steps, HEAD_RATE, ranges))
     assert error(tuned) < 0.8 * error(stored)
     untouched = replace(tuned, head=weights)
     assert error(untouched) == pytest.approx(error(stored), rel=1e-6)

@@ -24,6 +24,8 @@ SMALL = BakeConfig(
     preset="fast", resolution=64, mesh_resolution=16, refine_steps=40, check_views=1, n_channels=2, k=1
 )
 
+NOTHING = np.zeros((0, 3), np.float32)
+
 
 def quiet(*_: object) -> None:
     """No progress."""
@@ -124,5 +126,14 @@ def test_where_the_witnesses_see_no_difference_the_models_pictures_decide(
 ) -> None:
     held_out = object.__new__(HeldOut)
     monkeypatch.setattr(held_out, "lost", lambda before, after: lost)
-    before, after = Shown(2e-4, None), Shown(1e-4 if closer else 3e-4, None)
+    before, after = Shown(2e-4, None, NOTHING), Shown(1e-4 if closer else 3e-4, None, NOTHING)
     assert held_out.is_better(before, after) == better
+
+
+def test_pixels_are_far_off_in_one_channel() -> None:
+    seen = np.full((8, 3), 0.5, np.float32)
+    shown = seen.copy()
+    shown[0, 2], shown[1] = 0.61, 0.55
+    before, after = Shown(0.0, None, seen), Shown(0.0, None, shown)
+    assert after.far_off(before) == before.far_off(after) == 1 / 8
+    assert before.far_off(before) == 0

@@ -1,0 +1,1 @@
+"""How much detail of what is stored the pictures need."""

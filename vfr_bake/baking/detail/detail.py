@@ -1,0 +1,197 @@
+"""What of a finished grid is stored: no more detail than its pictures need.
+
+After refinement, cells are left out that hardly anything sees (`vfr_bake.baking.detail.seen`). Then the
+places are found, first of the densities, then of the features, that a coarser level shows as well
+(`vfr_bake.baking.detail.shown`). How far each goes, the photographs' pixels decide that nothing learned from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from player.asset.grid import SparseGrid
+from player.cameras.camera import Camera
+from vfr_bake.baking.cells import Progress
+from vfr_bake.baking.detail.errors import (
+    LevelsOfDensities,
+    LevelsOfFeatures,
+    density_errors,
+    feature_errors,
+    heavy_vertices,
+    levels_of_densities,
+    levels_of_features,
+)
+from vfr_bake.baking.detail.search import largest
+from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, live_of_blocks, take_rows, thinned
+from vfr_bake.baking.detail.shown import COARSEST_SHOWN, Choice, Wanted, mean_values, wanted_values
+from vfr_bake.baking.distillation import TeacherRays
+from vfr_bake.baking.grids import Layout, encode_features
+from vfr_bake.baking.held_out import Head, HeldOut, Shown
+from vfr_bake.baking.witness_loss import Loss
+
+N_SEEING = 4_000_000
+"""Rays whose weights tell which cells are seen, roughly, where the views have as many pixels."""
+N_COMPARED = 100_000
+"""Rays that tell what a coarser level shows differently."""
+LEAST_SHARE, MOST_SHARE = 1e-6, 0.05
+"""Shares of all weight between which the one is looked for that is given up with cells that are hardly
+seen."""
+SEEN_LOSS, DENSITY_LOSS, STEP_LOSS, FEATURE_LOSS = 0.25, 0.25, 0.5, 0.5
+"""Shares of the loss that is allowed which may be made by cells that are left out, by coarser densities, by
+longer steps in them, and by coarser features."""
+LONGEST_STEPS = (4, 2)
+"""Base steps that a sample in coarser densities may stand for, the first that loses little enough. On level l
+they are 2^l at most, as many as its cells are wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Needed:
+    """What is to be stored of refined values."""
+
+    layout: Layout
+    """The finest level, of which some bricks are not shown."""
+    density: np.ndarray
+    """[n_densities] float32 codes of all vertices of the finest level."""
+    features: np.ndarray
+    """[n_features, n_channels] float32, the same."""
+    wanted_densities: Wanted
+    wanted_features: Wanted
+    """What is shown, and what of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """The pictures that decide, and what they are made with."""
+
+    held_out: HeldOut
+    head: Head
+    n_fetches: int
+    """Feature fetches of a ray, 0 for all."""
+    most_db: float
+    """Loss in dB that is allowed."""
+    progress: Progress
+    left_out: dict[str, str] = field(default_factory=dict)
+    """What is not stored, and what that changed; set by `needed`."""
+
+    def needed(
+        self,
+        layout: Layout,
+        density: np.ndarray,
+        features: np.ndarray,
+        cameras: list[Camera],
+        teacher: TeacherRays,
+    ) -> Needed:
+        """What is to be stored.
+
+        Args:
+            layout: the finest level.
+            density: [n_densities] codes that need not be whole.
+            features: [n_features, n_channels] the same, changed in place.
+            cameras: views, model frame, that tell what is seen; without any, every cell is stored.
+            teacher: rays of such views.
+        """
+        if cameras:
+            grid = layout.grid(density, features)
+            weights = block_weights(grid, cameras, N_SEEING, self.progress)
+            layout, density, features = self._without_unseen(grid, weights, layout, density, features)
+        grid = layout.grid(density, features)
+        rays = teacher.some(N_COMPARED)
+        densities, grid = self._densities(layout, density, grid, rays)
+        return Needed(layout, density, features, densities, self._features(layout, features, grid, rays))
+
+    def level_steps(self, grid: SparseGrid) -> tuple[int, ...]:
+        """For each level of the densities of `grid`, which is that of what is stored, for how many base steps
+        a sample in it stands: the longest steps that lose little enough. Coarser bricks lie also where
+        nothing is shown, and a long step from there may end in finer ones."""
+        before = self._look(replace(grid, level_steps=np.ones(grid.n_levels, np.int32)))
+        for longest in LONGEST_STEPS:
+            steps = np.minimum(1 << np.arange(grid.n_levels), longest).astype(np.int32)
+            lost = self.held_out.lost(before, self._look(replace(grid, level_steps=steps)))
+            if lost.most <= STEP_LOSS * self.most_db:
+                return tuple(steps.tolist())
+        return (1,) * grid.n_levels
+
+    def _look(self, grid: SparseGrid) -> Shown:
+        return self.held_out.look("detail", grid, self.head, self.n_fetches).shown
+
+    def _without_unseen(
+        self,
+        grid: SparseGrid,
+        weights: np.ndarray,
+        layout: Layout,
+        density: np.ndarray,
+        features: np.ndarray,
+    ) -> tuple[Layout, np.ndarray, np.ndarray]:
+        """Layout, densities and features without cells in which the samples of all views together weigh next
+        to nothing."""
+        before = self._look(grid)
+
+        def lost(share: float) -> Loss:
+            live = live_of_blocks(heavy_blocks(weights, float(np.exp(share)))).astype("<u8")
+            seen = replace(grid, live=grid.live & live.view(np.uint8).reshape(-1))
+            return self.held_out.lost(before, self._look(seen))
+
+        found = largest(lost, np.log(LEAST_SHARE), np.log(MOST_SHARE), SEEN_LOSS * self.most_db)
+        if found is None:
+            return layout, density, features
+        share = float(np.exp(found.amount))
+        left = thinned(layout, heavy_blocks(weights, share))
+        n, n_left = len(layout.densities), len(left.layout.densities)
+        self.left_out["hardly seen"] = (
+            f"{1 - n_left / n:.0%} of the densities' vertices, and the features there: of all that the views "
+            f"see, {share:.2%} is there; {found.loss}"
+        )
+        return left.layout, density[left.densities], take_rows(features, left.features)
+
+    def _densities(
+        self, layout: Layout, density: np.ndarray, grid: SparseGrid, rays: TeacherRays
+    ) -> tuple[Wanted, SparseGrid]:
+        """What is wanted of the densities, and the grid that shows about that. Coarser levels have the means
+        of what is dense, not of its logarithm."""
+        pyramid = layout.pyramids.densities
+        low, high = layout.density_range
+        slope = (high - low) / 255
+        finest = np.clip(density, 0, 255).astype(np.float32)[:, None]
+        means = mean_values(pyramid, np.exp(slope * finest), np.ones(len(finest)))
+        values = [finest, *(np.log(mean) / slope for mean in means[1:])]
+        codes = [np.clip(np.rint(of_level), 0, 255).astype(np.uint8) for of_level in values]
+        levels = levels_of_densities(grid, pyramid, codes[: COARSEST_SHOWN + 1])
+        choice = Choice(pyramid, tuple(density_errors(levels, rays)))
+        dropped = self._shown(choice, levels, DENSITY_LOSS, "densities' detail")
+        shown = wanted_values(choice, values, choice.shown(dropped), sampled=True)
+        return shown, levels.at(choice.levels(dropped))
+
+    def _features(self, layout: Layout, features: np.ndarray, grid: SparseGrid, rays: TeacherRays) -> Wanted:
+        """The same of the features; a vertex counts in the means as much as it is seen."""
+        pyramid, codes = layout.pyramids.features, encode_features(features)
+        heavy = heavy_vertices(levels_of_features(grid, pyramid, [codes]), len(codes), rays)
+        values = mean_values(pyramid, features, heavy)
+        levels = levels_of_features(
+            grid, pyramid, [codes, *(encode_features(mean) for mean in values[1 : COARSEST_SHOWN + 1])]
+        )
+        choice = Choice(pyramid, tuple(feature_errors(levels, rays)))
+        dropped = self._shown(choice, levels, FEATURE_LOSS, "features' detail")
+        return wanted_values(choice, values, choice.shown(dropped), sampled=False)
+
+    def _shown(
+        self, choice: Choice, levels: LevelsOfDensities | LevelsOfFeatures, share: float, name: str
+    ) -> list[np.ndarray]:
+        """Which bricks of each level are dropped, for `share` of the loss that is allowed."""
+        if len(choice.errors) == 1:
+            return []
+        before = self._look(levels.at(0))
+
+        def lost(amount: float) -> Loss:
+            shown = choice.levels(choice.dropped(choice.worth(amount)))
+            return self.held_out.lost(before, self._look(levels.at(shown)))
+
+        found = largest(lost, 0.0, 1.0, share * self.most_db)
+        if found is None:
+            return choice.dropped(-np.inf)
+        dropped = choice.dropped(choice.worth(found.amount))
+        n = np.bincount(choice.levels(dropped), minlength=COARSEST_SHOWN + 1) / len(choice.pyramid.levels[0])
+        shares = ", ".join(f"{of_level:.0%} on level {level}" for level, of_level in enumerate(n))
+        self.left_out[name] = f"all that the places of bricks do not need, shown {shares}; {found.loss}"
+        return dropped

@@ -1,0 +1,172 @@
+"""Cells that hardly anything sees, which are left out of what is stored.
+
+Whether one sample weighs enough in one view, by which cells are first chosen, says little: what nobody has
+seen holds what training left there, and a single ray of thousands may touch it. Here the weights of all
+samples are summed over the rays of many views, in blocks of 2 x 2 x 2 cells. Blocks are left out that weigh
+least, as many as the pictures lose next to nothing without, by the photographs' pixels that nothing learned
+from.
+
+With the sums W_b of all blocks b, sorted, a share q of the weight is given up if the blocks left out are
+those of lowest W_b with sum_b W_b <= q sum W.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from player.asset.bricks import bricks_per_axis, dense_index, stored_bits
+from player.asset.grid import SparseGrid
+from player.asset.pyramid import Bricks, corners_of, packed_bits
+from player.cameras.camera import Camera
+from player.compiled.lanes import LANES
+from player.compiled.march import enter
+from player.compiled.packets import SUMS
+from vfr_bake.baking.cells import Progress
+from vfr_bake.baking.grids import Layout, Vertices
+from vfr_bake.kernels.sample_weights import BLOCKS, add_sample_weights
+
+N_RAYS = 4_000_000
+"""Rays whose weights are summed, roughly, where the views have as many pixels."""
+RAYS_AT_ONCE = 1 << 16
+BRICKS_AT_ONCE = 1 << 12
+ROWS_AT_ONCE = 1 << 18
+
+
+def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress: Progress) -> np.ndarray:
+    """[n_bricks, 4, 4, 4] float64: for each block of cells of the bricks of a grid of one level, the weights
+    of the samples of about `n_rays` rays, summed.
+
+    Args:
+        grid: as the player has it.
+        cameras: views, model frame; rays are spread evenly over all their pixels.
+        n_rays: how many rays; no pixel has more than one.
+        progress: called with the number of cameras.
+    """
+    totals = np.zeros(len(grid.slot_coords) * BLOCKS**3)
+    share = min(np.sqrt(n_rays / sum(camera.width * camera.height for camera in cameras)), 1.0)
+    for index, camera in enumerate(cameras):
+        size = (max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+        rays_o, rays_d = camera.resized(*size).rays()
+        for first in range(0, len(rays_o), RAYS_AT_ONCE):
+            rows = slice(first, first + RAYS_AT_ONCE)
+            lookup, steps, packets, most_samples = enter(grid, rays_o[rows], rays_d[rows])
+            samples = np.empty((2, most_samples, LANES), np.float32)
+            sums, places = np.empty((SUMS, LANES), np.float32), np.empty((3, LANES), np.float32)
+            weights = np.empty(LANES, np.float32)
+            add_sample_weights(lookup, steps, packets, samples, sums, places, weights, totals)
+        progress(index + 1, len(cameras))
+    return totals.reshape(-1, BLOCKS, BLOCKS, BLOCKS)
+
+
+def heavy_blocks(weights: np.ndarray, share: float) -> np.ndarray:
+    """Which blocks are kept if those that weigh least, `share` of all weight together, are left out: bool of
+    the shape of `weights`. What weighs nothing is always left out.
+
+    >>> heavy_blocks(np.array([0.0, 6.0, 1.0, 3.0]), 0.15).tolist()
+    [False, True, False, True]
+    """
+    order = np.argsort(weights, axis=None)
+    running = np.cumsum(weights.reshape(-1)[order])
+    kept = np.empty(weights.size, bool)
+    kept[order] = running > share * running[-1]
+    return kept.reshape(weights.shape) & (weights > 0)
+
+
+def live_of_blocks(blocks: np.ndarray) -> np.ndarray:
+    """[n_bricks, 8] uint64 masks of the cells in the blocks [n_bricks, 4, 4, 4] bool.
+
+    >>> masks = live_of_blocks(np.arange(64).reshape(1, 4, 4, 4) == 1)
+    >>> np.flatnonzero(stored_bits(masks)).tolist()
+    [2, 3, 10, 11, 66, 67, 74, 75]
+    """
+    for axis in (1, 2, 3):
+        blocks = blocks.repeat(2, axis=axis)
+    return packed_bits(blocks)
+
+
+class Kept(NamedTuple):
+    """Part of the vertices of a grid."""
+
+    vertices: Vertices
+    rows: np.ndarray
+    """[n] int32, ascending: which of all vertices they are."""
+
+
+def corners_within(vertices: Vertices, cells: Bricks) -> Kept:
+    """The corners of `cells`, which are some of the cells of which `vertices` are the corners."""
+    corners = corners_of(cells)
+    index = np.empty((int(stored_bits(corners.masks).sum()), 3), np.int16)
+    brick, bit = np.nonzero(stored_bits(corners.masks))
+    for axis, shift in enumerate((6, 3, 0)):
+        index[:, axis] = corners.coords[brick, axis] * 8 + ((bit >> shift) & 7)
+    rows = vertices.pyramid.vertices[0].rows(index)
+    return Kept(Vertices(corners.coords, corners.masks, index, vertices.resolution), rows)
+
+
+def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) -> Bricks:
+    """The cells of `others`, of a grid of `of_others` cells along each axis, that overlap one of `cells`, of
+    a grid of `resolution` over the same box, which is as fine or finer.
+
+    >>> cells = Bricks(np.zeros((1, 3), np.uint16), np.array([[1 << 2, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
+    >>> every = Bricks(np.zeros((1, 3), np.uint16), np.full((1, 8), ~np.uint64(0)))
+    >>> found = overlapping(cells, 8, every, 5)  # 2/8 to 3/8 of the edge: 1.25 to 1.875 of its cells
+    >>> np.flatnonzero(stored_bits(found.masks)).tolist()
+    [1]
+    """
+    table = dense_index(others.coords, bricks_per_axis(of_others))
+    marked = np.zeros(len(others) * 512, bool)
+    for first in range(0, len(cells), BRICKS_AT_ONCE):
+        rows = slice(first, first + BRICKS_AT_ONCE)
+        brick, bit = np.nonzero(stored_bits(cells.masks[rows]))
+        local = np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
+        index = cells.coords[rows].astype(np.int64)[brick] * 8 + local
+        ends = index * of_others // resolution, ((index + 1) * of_others - 1) // resolution
+        for corner in product((0, 1), repeat=3):
+            at = np.stack([ends[end][:, axis] for axis, end in enumerate(corner)], axis=-1)
+            where = table[tuple((at >> 3).T)].astype(np.int64)
+            x, y, z = (at & 7).T
+            marked[(where * 512 + x * 64 + y * 8 + z)[where >= 0]] = True
+    masks = others.masks & packed_bits(marked.reshape(-1, 8, 8, 8))
+    return Bricks(others.coords, masks).without_empty()
+
+
+class Thinned(NamedTuple):
+    """What is left of a layout, and which of its rows."""
+
+    layout: Layout
+    densities: np.ndarray
+    """[n_densities] int32, ascending: rows of the densities that are kept."""
+    features: np.ndarray
+    """[n_features] int32, ascending: the same of the features."""
+
+
+def thinned(layout: Layout, blocks: np.ndarray) -> Thinned:
+    """A layout without the densities outside the kept `blocks` [n_bricks, 4, 4, 4] bool, and without the
+    features where no density is left."""
+    (cells,) = layout.densities.pyramid.levels
+    cells = Bricks(cells.coords, cells.masks & live_of_blocks(blocks)).without_empty()
+    densities = corners_within(layout.densities, cells)
+    if layout.features is layout.densities:
+        features = densities
+    else:
+        (others,) = layout.features.pyramid.levels
+        fine, coarse = layout.densities.resolution, layout.features.resolution
+        features = corners_within(layout.features, overlapping(cells, fine, others, coarse))
+    left = replace(layout, densities=densities.vertices, features=features.vertices)
+    return Thinned(left, densities.rows, features.rows)
+
+
+def take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """`values[rows]` of ascending rows, in the place of `values`: there may be no room for them twice.
+
+    >>> take_rows(np.arange(8), np.array([1, 4, 7])).tolist()
+    [1, 4, 7]
+    """
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        some = rows[first : first + ROWS_AT_ONCE]
+        values[first : first + len(some)] = values[some]
+    return values[: len(rows)]
