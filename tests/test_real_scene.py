@@ -12,6 +12,8 @@ from PIL import Image
 
 from player.app.cli import main as play
 from player.asset.asset import Asset
+from player.cameras.views import asset_cameras
+from player.render import Renderer
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
 from vfr_bake.rendering.render import render_image
@@ -57,17 +59,29 @@ def test_the_asset_holds_all_of_space(out: Path) -> None:
     assert json.loads((out / "play.json").read_text())["march"] == "numba"
 
 
-def test_a_played_training_view_is_the_photograph_nearly_as_well_as_the_model_knows_it(
+def test_played_training_views_are_the_photographs_nearly_as_well_as_the_model_knows_them(
     out: Path, fox: Path
 ) -> None:
-    photograph = load_scene(fox, downscale=8).train.images[0][..., :3] / 255
-    frame = np.asarray(Image.open(out / "view.png").convert("RGB")) / 255
-    assert frame.shape == photograph.shape
-    model = load_model(out / "model.pt")
-    full = render_image(model.field, model.sampler, model.model_cameras()[0], model.background)
-    # The model knows the view to 20.8 dB after so few steps, and 0.3 dB are lost.
-    assert psnr(full, photograph) > 20
-    assert psnr(frame, photograph) > psnr(full, photograph) - 0.6
+    """Every fifth view: a single one loses 0.07 to 0.7 dB, by the last bits of training."""
+    model, train = load_model(out / "model.pt"), load_scene(fox, downscale=8).train
+    photographs = dict(zip([camera.name for camera in train.cameras], train.images, strict=True))
+    known, played = [], []
+    with Renderer(Asset.open(out / "asset")) as renderer:
+        views = {camera.name: camera for camera in asset_cameras(renderer.asset)}
+        for camera in model.model_cameras()[::5]:
+            photograph = photographs[camera.name][..., :3] / 255
+            full = render_image(model.field, model.sampler, camera, model.background)
+            known.append(psnr(full, photograph))
+            played.append(psnr(renderer.render(views[camera.name]).rgb, photograph))
+    assert min(known) > 18, "19.1 dB where it was measured, after so few steps"
+    assert np.mean(played) > np.mean(known) - 0.5, "0.31 dB are lost where it was measured"
+
+
+def test_the_command_writes_the_view_that_the_renderer_makes(out: Path) -> None:
+    frame = np.asarray(Image.open(out / "view.png").convert("RGB"))
+    with Renderer(Asset.open(out / "asset")) as renderer:
+        rendered = renderer.render(asset_cameras(renderer.asset)[0]).rgb
+    assert np.abs(frame - 255 * rendered).max() < 1
 
 
 def test_the_bake_says_what_it_lost(out: Path) -> None:
