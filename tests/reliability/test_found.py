@@ -29,7 +29,7 @@ from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.hostile_files import vouch
 from tests.version_3 import as_version_3
 from vfr_bake.config import FieldConfig, field_config_from
-from vfr_bake.data.pictures import read_picture
+from vfr_bake.data.files.pictures import read_picture
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import FORMAT, Model, load_model, save_model

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vfr_bake.data.pictures import opencv, shrunk
+from vfr_bake.data.files.pictures import opencv, shrunk
 
 MAX_SIDE = 1600
 """Pictures are reduced to this many pixels before features are looked for: beyond it, a photograph's finest

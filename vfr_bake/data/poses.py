@@ -16,8 +16,10 @@ from player.cameras.colmap import MAX_FILE_BYTES
 from player.errors import DataError, FormatError
 from player.files.files import new_folder, read_bytes
 from player.files.images import open_picture
-from vfr_bake.data import threads, video
+from vfr_bake.data import threads
 from vfr_bake.data.features import Features, find_features, pairs_to_match
+from vfr_bake.data.files import video
+from vfr_bake.data.files.pictures import read_picture
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
 from vfr_bake.data.mapping import (
     Pair,
@@ -27,7 +29,6 @@ from vfr_bake.data.mapping import (
     pycolmap_module,
     write_database,
 )
-from vfr_bake.data.pictures import read_picture
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")

@@ -15,7 +15,7 @@ from player.errors import DataError
 from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
 from vfr_bake.data.capture import Capture, PosedImages
-from vfr_bake.data.pictures import reduced
+from vfr_bake.data.files.pictures import reduced
 
 BORDER = 2
 """Pixels along a picture's edge that tell a plain background."""

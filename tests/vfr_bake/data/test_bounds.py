@@ -11,7 +11,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from vfr_bake.data.bounds import _dilated, scene_box
 from vfr_bake.data.demo import demo_cameras
-from vfr_bake.data.pictures import read_picture
+from vfr_bake.data.files.pictures import read_picture
 
 
 def sphere_masks(cameras: list[Camera], centre: np.ndarray, radius: float) -> np.ndarray:

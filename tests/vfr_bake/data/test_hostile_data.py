@@ -15,7 +15,7 @@ import pytest
 from player.cameras.views import read_views
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_scene
-from vfr_bake.data.pictures import read_picture
+from vfr_bake.data.files.pictures import read_picture
 
 
 def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:

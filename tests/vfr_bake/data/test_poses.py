@@ -14,8 +14,9 @@ import pytest
 from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError
-from vfr_bake.data import mapping, poses, video
+from vfr_bake.data import mapping, poses
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
+from vfr_bake.data.files import video
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
 
 N_CAN = 10

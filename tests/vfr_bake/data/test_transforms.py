@@ -18,7 +18,7 @@ from player.cameras.transforms import read_cameras
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras
-from vfr_bake.data.pictures import read_picture, undistort
+from vfr_bake.data.files.pictures import read_picture, undistort
 
 
 def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from player.errors import DataError
 from player.files.files import new_folder
-from vfr_bake.data.pictures import opencv, shrunk
+from vfr_bake.data.files.pictures import opencv, shrunk
 from vfr_bake.data.threads import Progress
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")

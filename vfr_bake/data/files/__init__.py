@@ -1,0 +1,1 @@
+"""Files of people, which are read within limits: pictures and videos."""
