@@ -113,6 +113,8 @@ def _with_cameras(data: str) -> str:
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count)
     print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
+    for name, reason in report.unplaced.items():
+        print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
     return str(report.folder)
 
 

@@ -8,7 +8,7 @@ takes the process down on some it does not know.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from contextlib import closing
@@ -126,15 +126,24 @@ def match_pictures(
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
     progress: Progress,
+    known: Callable[[int, int], np.ndarray | None] = lambda i, j: None,
+    keep: Callable[[int, int, np.ndarray], object] = lambda i, j, matches: None,
 ) -> list[Pair]:
-    """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry."""
+    """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry.
+
+    `known`: returns the matches [n, 2] of a pair that has been matched before, or None; `keep`: called with
+    those of every other pair.
+    """
     pycolmap = pycolmap_module()
     cameras = {sensor: colmap_camera(sensor) for sensor in set(sensors)}
     options = two_view_options()
 
     def geometry(pair: tuple[int, int]) -> Pair | None:
         i, j = pair
-        matches = match(features[i].descriptors, features[j].descriptors)
+        matches = known(i, j)
+        if matches is None:
+            matches = match(features[i].descriptors, features[j].descriptors)
+            keep(i, j, matches)
         if len(matches) < MIN_MATCHES:
             return None
         estimate = pycolmap.estimate_two_view_geometry(
@@ -145,8 +154,10 @@ def match_pictures(
     return [pair for pair in in_threads(geometry, pairs, progress) if pair is not None]
 
 
-def map_pictures(database: Path, pictures: Path, work: Path, n_pictures: int, progress: Progress) -> Any:
-    """The largest `pycolmap.Reconstruction` that the database's matches allow, or None.
+def map_pictures(
+    database: Path, pictures: Path, work: Path, n_pictures: int, progress: Progress
+) -> list[Any]:
+    """The `pycolmap.Reconstruction`s that the database's matches allow, that of the most pictures first.
 
     `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption
     reaches it through its token, between one picture and the next.
@@ -187,11 +198,11 @@ def map_pictures(database: Path, pictures: Path, work: Path, n_pictures: int, pr
         except BaseException:
             token.cancel()
             raise
-    model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    if model is not None:
-        _refine_principal_points(model)
+    found = sorted(models.values(), key=lambda model: -model.num_reg_images())
+    if found:
+        _refine_principal_points(found[0])
     progress(n_pictures, n_pictures)
-    return model
+    return found
 
 
 def _refine_principal_points(model: Any) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.misc.appdirs import AppDirs
 from PIL import Image
 
 from player.cameras.colmap import MAX_FILE_BYTES
@@ -21,6 +22,7 @@ from vfr_bake.data.features import Features, find_features, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.pictures import read_picture
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
+from vfr_bake.data.kept_matches import SIDE, KeptMatches, Look, stamp
 from vfr_bake.data.mapping import (
     Pair,
     Sensor,
@@ -67,6 +69,8 @@ class PoseReport:
     """Pixels: mean over the points of how far their projections are from where the pictures show them."""
     mean_track_length: float
     """Pictures a point is seen in, on average."""
+    unplaced: Mapping[str, str] = field(default_factory=dict)
+    """Why a picture found no place, by its name; empty where the cameras were there already."""
 
     def summary(self) -> str:
         """One sentence for whoever took the pictures.
@@ -127,20 +131,81 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
             f"got {len(pictures)}{_other_kinds(photos)}"
         )
     pycolmap_module()  # said at once if it is missing, not after minutes
-    sensors, features = _look_at(pictures, photos, lambda done, of: progress("features", done, of))
+    kept = KeptMatches.of(photos, cache_root())
+    stamps = [stamp(path) for path in pictures]
+    sensors, features = _look_at(pictures, photos, kept, stamps, lambda *n: progress("features", *n))
+
+    def known(i: int, j: int) -> np.ndarray | None:
+        return kept.matches(stamps[i], stamps[j], len(features[i].points), len(features[j].points))
+
     pairs = match_pictures(
-        sensors, features, pairs_to_match(features), lambda done, of: progress("matches", done, of)
+        sensors,
+        features,
+        pairs_to_match(features),
+        lambda *n: progress("matches", *n),
+        known,
+        lambda i, j, matches: kept.keep_matches(stamps[i], stamps[j], matches),
     )
-    result = _placed(pictures, sensors, features, pairs, progress)
-    n_registered = result.num_reg_images() if result is not None else 0
-    if result is None or n_registered < _n_needed(len(pictures)):
+    models = _placed(pictures, sensors, features, pairs, progress)
+    n_registered = models[0].num_reg_images() if models else 0
+    if n_registered < _n_needed(len(pictures)):
         raise DataError(
             f"{photos}: cameras: expected to find those of at least {_n_needed(len(pictures))} of "
-            f"{len(pictures)} pictures, got {n_registered}: {ADVICE}"
+            f"{len(pictures)} pictures, got {n_registered}{_in_groups(models)}: {ADVICE}"
         )
     with new_folder(model) as new:
-        result.write_binary(str(new))
-    return _read_report(model, photos, len(pictures))
+        models[0].write_binary(str(new))
+    kept.remove()
+    reasons = why_unplaced([path.name for path in pictures], features, pairs, models)
+    return replace(_read_report(model, photos, len(pictures)), unplaced=reasons)
+
+
+def cache_root() -> Path:
+    """The user's folder of what is kept of sets of pictures whose cameras are not known yet."""
+    return Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir) / "matches"
+
+
+def _in_groups(models: Sequence[Any]) -> str:
+    """How the pictures fall apart, where they do.
+
+    >>> _in_groups([])
+    ''
+    """
+    sizes = [str(model.num_reg_images()) for model in models]
+    if len(sizes) < 2:
+        return ""
+    return f" (they fall into groups of {', '.join(sizes)} that have nothing in common: two places?)"
+
+
+def why_unplaced(
+    names: Sequence[str], features: Sequence[Features], pairs: Sequence[Pair], models: Sequence[Any]
+) -> dict[str, str]:
+    """Why pictures are not in the first of the `models`, by their names."""
+    placed = _names_in(models[0])
+    partners: dict[str, set[str]] = {name: set() for name in names}
+    for pair in pairs:
+        partners[names[pair.i]].add(names[pair.j])
+        partners[names[pair.j]].add(names[pair.i])
+    reasons = {}
+    for name, found in zip(names, features, strict=True):
+        others = [len(group) for group in map(_names_in, models[1:]) if name in group]
+        if name in placed:
+            continue
+        if len(found.points) < MIN_FEATURES:
+            reasons[name] = f"blank, blurred or out of focus: {len(found.points)} features"
+        elif not partners[name]:
+            reasons[name] = "nothing in common with any other picture"
+        elif others:
+            reasons[name] = f"in a group of {others[0]} with too little in common with the others"
+        elif partners[name] & placed:
+            reasons[name] = f"too little in common with {min(partners[name] & placed)}"
+        else:
+            reasons[name] = f"something in common with {min(partners[name])} alone, which has no place either"
+    return reasons
+
+
+def _names_in(model: Any) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _placed(
@@ -149,11 +214,11 @@ def _placed(
     features: Sequence[Features],
     pairs: Sequence[Pair],
     progress: Progress,
-) -> Any:
-    """The `pycolmap.Reconstruction` of the pictures, or None; if that is folded, one that is not."""
+) -> list[Any]:
+    """The `pycolmap.Reconstruction`s of the pictures, the largest first; if that is folded, others."""
     names = [path.name for path in pictures]
 
-    def place(some: Sequence[Pair], stage: str) -> Any:
+    def place(some: Sequence[Pair], stage: str) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
@@ -161,19 +226,19 @@ def _placed(
                 database, pictures[0].parent, Path(name), len(names), lambda *n: progress(stage, *n)
             )
 
-    def n_torn(model: Any) -> int:
-        return len(torn_neighbours(model, names, pairs))
+    def n_torn(models: list[Any]) -> int:
+        return len(torn_neighbours(models[0], names, pairs))
 
-    def enough(model: Any) -> bool:
-        return model is not None and model.num_reg_images() >= _n_needed(len(names))
+    def enough(models: list[Any]) -> bool:
+        return bool(models) and models[0].num_reg_images() >= _n_needed(len(names))
 
-    model = place(pairs, "cameras")
-    if model is None or not n_torn(model):
-        return model
+    models = place(pairs, "cameras")
+    if not models or not n_torn(models):
+        return models
     walk = place(near_pairs(pairs), "walk")
-    if not enough(walk) or n_torn(walk) >= n_torn(model):
-        return model  # no walk
-    agreeing = agreeing_pairs(walk, names, features, pairs, lambda *n: progress("turns", *n))
+    if not enough(walk) or n_torn(walk) >= n_torn(models):
+        return models  # no walk
+    agreeing = agreeing_pairs(walk[0], names, features, pairs, lambda *n: progress("turns", *n))
     closed = place(agreeing, "cameras again")
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
@@ -206,17 +271,28 @@ def _other_kinds(folder: Path) -> str:
 
 
 def _look_at(
-    pictures: Sequence[Path], photos: Path, progress: threads.Progress
+    pictures: Sequence[Path],
+    photos: Path,
+    kept: KeptMatches,
+    stamps: Sequence[bytes],
+    progress: threads.Progress,
 ) -> tuple[list[Sensor], list[Features]]:
     """Sensor and features of every picture; raises DataError where they cannot be enough."""
 
-    def look(path: Path) -> tuple[Sensor, Features, np.ndarray]:
-        rgba = read_picture(path)
-        thumbnail = np.asarray(Image.fromarray(rgba).convert("L").resize((32, 32), Image.Resampling.BOX))
-        return _sensor(path, rgba.shape[1], rgba.shape[0]), find_features(rgba), thumbnail.astype(np.float64)
+    def look(number: int) -> tuple[Sensor, Look]:
+        path = pictures[number]
+        found = kept.look(stamps[number])
+        if found is None:
+            rgba = read_picture(path)
+            grey = Image.fromarray(rgba).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
+            found = Look(rgba.shape[1], rgba.shape[0], find_features(rgba), np.asarray(grey))
+            kept.keep_look(stamps[number], found)
+        return _sensor(path, found.width, found.height), found
 
-    looks = threads.in_threads(look, pictures, progress)
-    sensors, features, thumbnails = (list(column) for column in zip(*looks, strict=True))
+    looked = threads.in_threads(look, range(len(pictures)), progress)
+    sensors, looks = (list(column) for column in zip(*looked, strict=True))
+    features = [found.features for found in looks]
+    thumbnails = [found.thumbnail.astype(np.float64) for found in looks]
     n_good = sum(len(found.points) >= MIN_FEATURES for found in features)
     if n_good < _n_needed(len(pictures)):
         raise DataError(

@@ -34,6 +34,14 @@ def quiet(stage: str, done: int, of: int) -> None:
     assert 0 <= done <= of, stage
 
 
+@pytest.fixture(autouse=True)
+def kept(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where a test's matches are kept: not in the user's own cache."""
+    root = tmp_path_factory.mktemp("kept")
+    monkeypatch.setattr(poses, "cache_root", lambda: root)
+    return root
+
+
 def centres(model: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Camera centres [3] and rotations [3, 3], world to camera, by the names of the pictures."""
     images = [image for image in pycolmap.Reconstruction(model).images.values() if image.has_pose]
@@ -162,10 +170,48 @@ def test_a_model_that_cannot_be_finished_leaves_none(can, tmp_path: Path, monkey
             Path(folder, "cameras.bin").write_bytes(b"x")
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(poses, "map_pictures", lambda *_: HalfWritten())
+    monkeypatch.setattr(poses, "map_pictures", lambda *_: [HalfWritten()])
     with pytest.raises(KeyboardInterrupt):
         estimate_cameras(tmp_path, quiet)
     assert not list((tmp_path / "sparse").iterdir())
+
+
+def first_pictures(can, folder: Path, n: int) -> Path:
+    for path in sorted(can[0].glob("*.jpg"))[:n]:
+        shutil.copy(path, folder)
+    return folder
+
+
+def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kept: Path, monkeypatch):
+    photos = first_pictures(can, tmp_path, 5)
+
+    def interrupt(stage: str, done: int, of: int) -> None:
+        if stage == "cameras":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_cameras(photos, interrupt)
+    shutil.copy(sorted(can[0].glob("*.jpg"))[5], photos)
+    looked, matched = [], []
+    monkeypatch.setattr(poses, "find_features", lambda rgba: looked.append(1) or find_features(rgba))
+    monkeypatch.setattr(mapping, "match", lambda a, b: matched.append(1) or match(a, b))
+    assert estimate_cameras(photos, quiet).n_registered == 6
+    assert (len(looked), len(matched)) == (1, 5)  # only what the new picture brings
+    assert not list(kept.rglob("*.bin"))
+
+
+def test_pictures_without_a_place_and_why(can, tmp_path: Path):
+    photos = first_pictures(can, tmp_path, 8)
+    with Image.open(photos / "0000.jpg") as file:
+        size = file.size
+    Image.new("RGB", size, (90, 90, 90)).save(photos / "blank.jpg")
+    Image.fromarray(textured(3, *size)).save(photos / "other.jpg")
+    report = estimate_cameras(photos, quiet)
+    assert report.n_registered == 8
+    assert report.unplaced == {
+        "blank.jpg": "blank, blurred or out of focus: 0 features",
+        "other.jpg": "nothing in common with any other picture",
+    }
 
 
 # --- what cannot be used ---

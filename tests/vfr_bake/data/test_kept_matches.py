@@ -1,0 +1,95 @@
+"""Features and matches on disk: what was written comes back, and what is broken does not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vfr_bake.data.features import Features
+from vfr_bake.data.kept_matches import MOST_SECONDS, SIDE, KeptMatches, Look, stamp
+
+A, B, C = (bytes([number]) * 16 for number in range(3))
+
+
+def made(seed: int, n: int) -> Look:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 4000, (n, 2)).astype(np.float32).astype(np.float64)
+    features = Features(points, rng.integers(0, 256, (n, 128), np.uint8))
+    return Look(4000, 3000, features, rng.integers(0, 256, (SIDE, SIDE), np.uint8))
+
+
+def same(a: Look | None, b: Look) -> bool:
+    return (
+        a is not None
+        and (a.width, a.height) == (b.width, b.height)
+        and np.array_equal(a.thumbnail, b.thumbnail)
+        and np.array_equal(a.features.points, b.features.points)
+        and np.array_equal(a.features.sift, b.features.sift)
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two pictures, one without a feature, and their matches."""
+    kept = KeptMatches(tmp_path)
+    kept.keep_look(A, made(0, 7))
+    kept.keep_look(B, made(1, 0))
+    kept.keep_matches(A, B, np.array([[6, 2], [0, 1]], np.uint32))
+    return tmp_path
+
+
+def test_what_was_kept_comes_back(folder: Path):
+    kept = KeptMatches(folder)
+    assert same(kept.look(A), made(0, 7)) and same(kept.look(B), made(1, 0))
+    assert kept.look(C) is None and kept.matches(B, A, 9, 9) is None
+    matches = kept.matches(A, B, 7, 3)
+    assert matches is not None and matches.tolist() == [[6, 2], [0, 1]]
+
+
+def test_matches_of_features_that_are_not_there_do_not_count(folder: Path):
+    assert KeptMatches(folder).matches(A, B, 6, 3) is None
+
+
+@pytest.mark.parametrize("name", ["features.bin", "matches.bin"])
+def test_a_record_that_is_cut_short_is_left_out_wherever_it_is_cut(folder: Path, name: str):
+    content = (folder / name).read_bytes()
+    whole = made(0, 7)
+    for size in range(0, len(content), 61):
+        (folder / name).write_bytes(content[:size])
+        kept = KeptMatches(folder)
+        assert kept.look(A) is None or same(kept.look(A), whole)
+        kept.keep_look(C, made(2, 3))
+        kept.keep_matches(B, C, np.zeros((0, 2)))
+        again = KeptMatches(folder)
+        assert same(again.look(C), made(2, 3)) and again.matches(B, C, 0, 3) is not None
+
+
+def test_a_number_that_cannot_be_ends_the_file(folder: Path):
+    path = folder / "features.bin"
+    content = bytearray(path.read_bytes())
+    content[24:28] = b"\xff" * 4
+    path.write_bytes(content)
+    assert KeptMatches(folder).look(A) is None
+    assert path.stat().st_size == 0
+
+
+def test_a_picture_that_changed_has_another_stamp(tmp_path: Path):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"abc")
+    first = stamp(path)
+    assert stamp(path) == first and len(first) == 16
+    os.utime(path, (1, 1))
+    assert stamp(path) != first
+
+
+def test_what_nobody_came_back_to_is_deleted(tmp_path: Path):
+    old, new = (KeptMatches.of(tmp_path / name, tmp_path / "root") for name in "ab")
+    for kept in (old, new):
+        kept.keep_look(A, made(0, 1))
+    path = old._looks_path
+    os.utime(path, (path.stat().st_mtime - MOST_SECONDS - 60,) * 2)
+    KeptMatches.of(tmp_path / "c", tmp_path / "root")
+    assert not path.exists() and new._looks_path.exists()

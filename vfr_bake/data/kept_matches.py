@@ -1,0 +1,150 @@
+"""Features and matches of pictures whose cameras are not known yet, on disk until they are.
+
+An estimation that was interrupted goes on where it was, and one of more pictures begins with what is known.
+
+Two files of records, one after the other, little-endian; a last record that is cut short does not count.
+
+- `features.bin`: stamp of the picture (16 bytes), width, height and number of features n (uint32 each),
+  thumbnail (32 x 32 bytes, grey), n points (2 float32), n descriptors (128 bytes).
+- `matches.bin`: stamps of the two pictures, number of matches n (uint32), n pairs of indices (2 uint32).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import struct
+import threading
+import time
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from vfr_bake.data.features import MAX_FEATURES, Features
+
+VERSION = b"1"
+"""Changes whenever the same picture would give other features or matches."""
+SIDE = 32
+"""Pixels along a side of a thumbnail."""
+STAMP = 16
+MOST_SECONDS = 30 * 24 * 3600
+"""What nobody came back to for so long is deleted."""
+_LOOK = struct.Struct(f"<{STAMP}sIII")
+_MATCHES = struct.Struct(f"<{STAMP}s{STAMP}sI")
+_BYTES_A_FEATURE, _BYTES_A_MATCH = 8 + 128, 8
+
+
+class Look(NamedTuple):
+    """What one look at a picture tells."""
+
+    width: int
+    height: int
+    features: Features
+    thumbnail: np.ndarray
+    """[32, 32] uint8, grey."""
+
+
+def stamp(*files: Path) -> bytes:
+    """16 bytes that change with the path, the size or the time of change of any of the `files`."""
+    told = hashlib.blake2b(VERSION, digest_size=STAMP)
+    for path in files:
+        found = path.stat()
+        told.update(f"{path.resolve()}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+    return told.digest()
+
+
+class KeptMatches:
+    """The records of one set of pictures, in a folder of their own. Its methods may be called from several
+    threads."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder`: made where it is missing; what cannot be read in it is cut off."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._looks: dict[bytes, int] = {}
+        self._matches: dict[bytes, int] = {}
+        for path, header, index, n_bytes in (
+            (self._looks_path, _LOOK, self._looks, lambda n: SIDE * SIDE + n * _BYTES_A_FEATURE),
+            (self._matches_path, _MATCHES, self._matches, lambda n: n * _BYTES_A_MATCH),
+        ):
+            if path.exists():
+                end = 0
+                with path.open("r+b") as file:
+                    size = path.stat().st_size
+                    while (record := _header(file, end, header)) is not None:
+                        next_end = end + header.size + n_bytes(record[-1])
+                        if record[-1] > MAX_FEATURES or next_end > size:
+                            break
+                        index[b"".join(part for part in record if isinstance(part, bytes))] = end
+                        end = next_end
+                    file.truncate(end)
+
+    @classmethod
+    def of(cls, photos: Path, root: Path) -> KeptMatches:
+        """What is kept of the pictures in the folder `photos`, in a folder in `root`; others there that
+        nothing was added to for a month are deleted."""
+        for path in root.glob("*/features.bin"):
+            if time.time() - path.stat().st_mtime > MOST_SECONDS:
+                shutil.rmtree(path.parent, ignore_errors=True)
+        return cls(root / hashlib.blake2b(str(photos.resolve()).encode(), digest_size=STAMP).hexdigest())
+
+    @property
+    def _looks_path(self) -> Path:
+        return self._folder / "features.bin"
+
+    @property
+    def _matches_path(self) -> Path:
+        return self._folder / "matches.bin"
+
+    def look(self, of: bytes) -> Look | None:
+        """What was found in the picture with the stamp `of`; None if nothing is kept."""
+        at = self._looks.get(of)
+        if at is None:
+            return None
+        with self._looks_path.open("rb") as file:
+            file.seek(at)
+            _, width, height, n = _LOOK.unpack(file.read(_LOOK.size))
+            thumbnail = np.frombuffer(file.read(SIDE * SIDE), np.uint8).reshape(SIDE, SIDE)
+            points = np.frombuffer(file.read(8 * n), "<f4").reshape(n, 2).astype(np.float64)
+            sift = np.frombuffer(file.read(128 * n), np.uint8).reshape(n, 128)
+        return Look(width, height, Features(points, sift), thumbnail)
+
+    def keep_look(self, of: bytes, look: Look) -> None:
+        """Keep what was found in the picture with the stamp `of`."""
+        points, sift = look.features.points.astype("<f4"), look.features.sift
+        header = _LOOK.pack(of, look.width, look.height, len(points))
+        record = b"".join((header, look.thumbnail.tobytes(), points.tobytes(), sift.tobytes()))
+        self._append(self._looks_path, self._looks, of, record)
+
+    def matches(self, a: bytes, b: bytes, n_a: int, n_b: int) -> np.ndarray | None:
+        """The matches [n, 2] uint32 of pictures that have `n_a` and `n_b` features; None if none are kept."""
+        at = self._matches.get(a + b)
+        if at is None:
+            return None
+        with self._matches_path.open("rb") as file:
+            file.seek(at)
+            n = _MATCHES.unpack(file.read(_MATCHES.size))[-1]
+            found = np.frombuffer(file.read(_BYTES_A_MATCH * n), "<u4").reshape(n, 2)
+        return found if (found < (n_a, n_b)).all() else None
+
+    def keep_matches(self, a: bytes, b: bytes, matches: np.ndarray) -> None:
+        """Keep the `matches` [n, 2] of two pictures."""
+        record = _MATCHES.pack(a, b, len(matches)) + matches.astype("<u4").tobytes()
+        self._append(self._matches_path, self._matches, a + b, record)
+
+    def _append(self, path: Path, index: dict[bytes, int], key: bytes, record: bytes) -> None:
+        with self._lock, path.open("ab") as file:
+            index[key] = file.tell()
+            file.write(record)
+
+    def remove(self) -> None:
+        """Delete the folder."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _header(file: BinaryIO, at: int, header: struct.Struct) -> tuple | None:
+    file.seek(at)
+    content = file.read(header.size)
+    return header.unpack(content) if len(content) == header.size else None
