@@ -25,6 +25,7 @@ from vfr_bake.config import BakeConfig
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.model_file import Model
+    from vfr_bake.training.preview import Preview
     from vfr_bake.training.trainer import Trainer
 
 EVAL_VIEWS = {False: 10, True: 3}
@@ -88,7 +89,8 @@ def _train(options: Any) -> int:
         load_checkpoint(checkpoint, trainer)
         if processes.first:
             print(f"vfr-train: going on after step {trainer.next_step}", file=sys.stderr)
-    figures = _train_steps(trainer, checkpoint)
+    preview = _preview(options, scene) if options.preview and processes.first else None
+    figures = _train_steps(trainer, checkpoint, preview)
     interrupted = figures.pop("interrupted")
     if processes.first:
         model = trained_model(trainer, scene, figures)
@@ -135,7 +137,16 @@ def _warn_of_folds(scene: Scene) -> None:
         )
 
 
-def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
+def _preview(options: Any, scene: Scene) -> Preview:
+    from vfr_bake.training.preview import Preview, preview_path
+
+    path = preview_path(options.model)
+    check_target(path, options.force or options.resume)
+    print(f"vfr-train: look at {printable(str(path))}, new every minute", file=sys.stderr)
+    return Preview(scene, path)
+
+
+def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
 
@@ -157,6 +168,8 @@ def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
                     last.progress,
                     f"loss {error:.5f}  PSNR {_decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
                 )
+                if preview is not None:
+                    preview.update(trainer)
                 due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
                 if due and trainer.processes.first:
                     save_checkpoint(checkpoint, trainer)
@@ -165,6 +178,8 @@ def _train_steps(trainer: Trainer, checkpoint: Path) -> dict[str, Any]:
             interrupted = True
     if last is None and interrupted:
         raise KeyboardInterrupt
+    if preview is not None:
+        preview.write(trainer)
     return {
         "steps": trainer.next_step,
         "seconds": round(trainer.seconds, 1),

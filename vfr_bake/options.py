@@ -30,6 +30,9 @@ class Train:
     """Replace the model file if it exists."""
     resume: bool = False
     """Go on from the checkpoint that an interrupted run left beside the model file; without one, begin."""
+    preview: bool = False
+    """Every minute, write a view that is not learned from beside its photograph, and where they differ, to
+    MODEL.preview.png (model.preview.png for model.pt): a second or two each time."""
     json: Path | None = None
     """Also write what was measured as JSON to this file; - for stdout."""
 

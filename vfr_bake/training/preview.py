@@ -1,0 +1,59 @@
+"""A view that is not learned from beside its photograph, while a field learns: to be looked at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from player.files.images import to_8_bit, write_png
+from vfr_bake.data.scene import Scene
+from vfr_bake.rendering.render import render_image
+from vfr_bake.training.metrics import comparison, over_background
+from vfr_bake.training.trainer import Trainer
+
+SECONDS = 60.0
+"""Between two previews."""
+SIDE = 320
+"""Pixels of the longest side, at most: such a picture takes a second or two."""
+
+
+def preview_path(model: Path) -> Path:
+    """Path of the preview of the training of `model`.
+
+    >>> preview_path(Path("a/fox.pt")).name
+    'fox.preview.png'
+    """
+    return model.with_name(model.stem + ".preview.png")
+
+
+class Preview:
+    """One view of a scene, of the test split where there is one, and the file that shows it."""
+
+    def __init__(self, scene: Scene, path: Path) -> None:
+        views = scene.test if scene.test.cameras else scene.train
+        number = len(views.cameras) // 2
+        camera = views.cameras[number]
+        factor = min(1.0, SIDE / max(camera.width, camera.height))
+        width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+        self._camera = camera.resized(width, height)
+        rgba = views.images[number]
+        # A picture with alpha is shown over white, as data sets of objects are; another has no background.
+        self._background = np.ones(3) if scene.has_alpha else rgba[..., :3].mean(axis=(0, 1)) / 255
+        whole = Image.fromarray(to_8_bit(over_background(rgba, self._background)))
+        self._photograph = np.asarray(whole.resize((width, height), Image.Resampling.BOX)) / 255
+        self._path = path
+        # Before, all of the box is fog still, and a picture takes many times as long.
+        self._due = SECONDS / 4
+
+    def update(self, trainer: Trainer) -> None:
+        """`write` if SECONDS of training are over since the last time. Raises OutputError."""
+        if trainer.seconds >= self._due:
+            self.write(trainer)
+            self._due = trainer.seconds + SECONDS
+
+    def write(self, trainer: Trainer) -> None:
+        """Write photograph | rendered | error map, replacing what is there. Raises OutputError."""
+        rgb = render_image(trainer.field, trainer.sampler, self._camera, self._background)
+        write_png(self._path, comparison(self._photograph, rgb))
