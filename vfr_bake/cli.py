@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,7 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
 
 
 def _train(options: Any) -> int:
-    from vfr_bake.data import load_scene
+    from vfr_bake.data import load_scene, training_reader
     from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
     from vfr_bake.training.model_file import save_model, trained_model
     from vfr_bake.training.processes import Processes
@@ -79,8 +80,11 @@ def _train(options: Any) -> int:
     config = options.config
     processes = Processes.from_environment()
     data = processes.in_turn(lambda: _with_cameras(options.data))
+    say = partial(_say, options.data) if processes.first else None
+    reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
-        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
+        scene = processes.in_turn(lambda: load_scene(data, bar.count, kind=config.kind, reader=reader))
+    config = replace(config, max_side=reader.size.max_side)
     if processes.first:
         _warn_of_folds(scene)
     trainer = Trainer(scene, config, processes)
@@ -103,6 +107,10 @@ def _train(options: Any) -> int:
         _report_training(options, figures, interrupted)
     processes.leave()
     return 130 if interrupted else 0
+
+
+def _say(data: str, text: str) -> None:
+    print(f"vfr-train: {printable(f'{data}: {text}')}", file=sys.stderr)
 
 
 def _with_cameras(data: str) -> str:
@@ -300,7 +308,7 @@ def _eval(options: Any) -> int:
 
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
-    from vfr_bake.data import load_scene
+    from vfr_bake.data import load_scene, reader_as
     from vfr_bake.training.evaluation import render_views
     from vfr_bake.training.lpips import Lpips
     from vfr_bake.training.metrics import comparison, mean_scores, score_view
@@ -309,7 +317,7 @@ def _eval(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
-        scene = load_scene(options.data, bar.count, downscale=model.train.get("downscale", 1))
+        scene = load_scene(options.data, bar.count, reader=reader_as(model.train))
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
     to_model = np.linalg.inv(model.world_from_model)

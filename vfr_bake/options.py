@@ -28,6 +28,9 @@ class Train:
     config: TrainConfig = field(default_factory=TrainConfig)
     force: bool = False
     """Replace the model file if it exists."""
+    no_cache: bool = False
+    """Do not keep the pictures, reduced and decoded, for the next run with them (docs/train.md), and remove
+    them if they are kept."""
     resume: bool = False
     """Go on from the checkpoint that an interrupted run left beside the model file; without one, begin."""
     preview: bool = False

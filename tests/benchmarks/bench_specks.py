@@ -29,7 +29,7 @@ from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
 from player.render import Renderer
 from vfr_bake.bench.specks import speck_mask
-from vfr_bake.data import load_scene
+from vfr_bake.data import load_scene, reader_as
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.metrics import over_background
 from vfr_bake.training.model_file import Model, load_model
@@ -41,8 +41,8 @@ AROUND, TIMES = 12, 8
 
 def test_views(asset: Asset, data: Path) -> tuple[list[Camera], list[np.ndarray]]:
     """Test cameras of a data set, world frame, and their photographs over the asset's background."""
-    downscale = asset.manifest.provenance.get("train", {}).get("downscale", 1)
-    scene = load_scene(str(data), lambda done, of: None, downscale)
+    reader = reader_as(asset.manifest.provenance.get("train", {}))
+    scene = load_scene(str(data), reader=reader)
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]
     background = np.array(asset.manifest.background, np.float32)
     return cameras, [over_background(image, background) for image in scene.test.images]

@@ -30,7 +30,7 @@ from vfr_bake.bench.result import Setting, Trade, conclude
 from vfr_bake.bench.timing import Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
-from vfr_bake.data import load_scene
+from vfr_bake.data import load_scene, reader_as
 from vfr_bake.training.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
 
 N_FIRST_PICTURES = 3
@@ -248,8 +248,8 @@ def played_bytes(asset: Asset) -> int:
 
 
 def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) -> Views:
-    downscale = assets[0].manifest.provenance.get("train", {}).get("downscale", 1)
-    scene = load_scene(config.data, lambda done, of: progress("reading pictures", done, of), downscale)
+    reader = reader_as(assets[0].manifest.provenance.get("train", {}))
+    scene = load_scene(config.data, lambda done, of: progress("reading pictures", done, of), reader=reader)
     if not scene.test.cameras:
         raise DataError(f"{config.data}: test views: expected at least 1, got none")
     n_views = min(config.views, len(scene.test.cameras))

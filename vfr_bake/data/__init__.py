@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from player.cameras.colmap import colmap_folder
-from vfr_bake.config import SceneKind
+from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
+from vfr_bake.data.store.reading import PictureReader
+from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.threads import Progress
 
-__all__ = ["PosedImages", "Scene", "load_scene"]
+__all__ = ["PosedImages", "Scene", "load_scene", "needs_cameras", "reader_as", "training_reader"]
 
 
 def load_scene(
-    data: str | Path, progress: Progress | None = None, downscale: int = 1, kind: SceneKind = "auto"
+    data: str | Path,
+    progress: Progress | None = None,
+    downscale: int | None = None,
+    kind: SceneKind = "auto",
+    reader: PictureReader | None = None,
 ) -> Scene:
     """Load the posed pictures that `data` names.
 
@@ -24,11 +33,34 @@ def load_scene(
     nerfstudio) or a COLMAP model (`sparse/0`), or the word `demo` for the built-in scene (a folder of that
     name is `./demo`). `progress`: called with the number of pictures done and to do. `downscale`: pictures
     are reduced by this factor along each side. `kind`: object or unbounded, or found from the pictures.
+    `reader`: what reads the pictures, in place of `downscale`; None holds all of them in memory.
 
-    Raises DataError or FormatError in one line that names the file and what was expected.
+    Raises DataError or FormatError in one line that names the file and what was expected, OutputError where
+    the disk has no room for what the reader would keep there.
     """
-    capture = demo_capture(progress=progress) if str(data) == "demo" else load_folder(Path(data), progress)
-    return build_scene(capture, kind, downscale)
+    reader = reader or PictureReader(WorkingSize(downscale=downscale))
+    if str(data) == "demo":
+        capture = demo_capture(progress=progress)
+        train, test = reader.size.of(capture.train), reader.size.of(capture.test)
+        return build_scene(replace(capture, train=train, test=test), kind)
+    return build_scene(load_folder(Path(data), progress, reader), kind)
+
+
+def training_reader(
+    config: TrainConfig, model: Path, kept: bool, say: Callable[[str], object] | None
+) -> PictureReader:
+    """What reads pictures for the training of `model`; with `kept` it leaves them for the next
+    run."""
+    default = config.max_side is None and config.downscale is None
+    size = WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
+    return PictureReader(size, model, on_disk=True, kept=kept, may_shrink=default, say=say)
+
+
+def reader_as(settings: dict[str, Any]) -> PictureReader:
+    """What reads pictures as they were for a training with these `settings`, as a model or an asset has
+    them."""
+    size = WorkingSize(settings.get("max_side"), settings.get("downscale"))
+    return PictureReader(size, on_disk=True)
 
 
 def needs_cameras(data: str | Path) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,35 +14,98 @@ from player.errors import ShapeError
 HOLD_OUT_EVERY = 8
 
 
+class StoredImages(Sequence[np.ndarray]):
+    """Pictures that lie on a disk: each [height, width, 4] uint8 is read when it is asked for.
+
+    They are also cut into *chunks*: each has its share of the pixels of every picture, spread over all of it,
+    in one place on the disk. Who draws pixels at random draws them from one chunk after the other.
+    """
+
+    n_chunks: int
+
+    @abstractmethod
+    def some(self, numbers: Sequence[int]) -> StoredImages:
+        """The pictures with these numbers."""
+
+    @abstractmethod
+    def size(self, number: int) -> tuple[int, int]:
+        """Width and height of a picture, which is not read."""
+
+    @abstractmethod
+    def opaque(self, number: int) -> bool:
+        """Whether all of a picture is opaque; it is not read."""
+
+    @abstractmethod
+    def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """[n, 4] uint8: those of the picture's `pixels` [n], numbers in row-major order, alone."""
+
+    @abstractmethod
+    def chunk(self, number: int) -> np.ndarray:
+        """[n, 3 or 4] uint8: the pixels of a chunk, picture after picture."""
+
+    @abstractmethod
+    def chunk_places(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """[n_pictures] int64 each: of which place to which the pixels of each picture lie in a chunk. The
+        pixel at place p of a picture of n pixels is number `stride` p modulo n."""
+
+    @property
+    @abstractmethod
+    def strides(self) -> np.ndarray:
+        """[n_pictures] int64: see `chunk_places`."""
+
+
 @dataclass(frozen=True)
 class PosedImages:
     """Pictures and where they were taken from; each may have its own size."""
 
     cameras: list[Camera]
     """One a picture, of the picture's size; in the model frame in a `Scene`, in the world in a `Capture`."""
-    images: list[np.ndarray]
-    """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha."""
+    images: Sequence[np.ndarray]
+    """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha; in memory or on a disk."""
 
     def __post_init__(self) -> None:
         if len(self.images) != len(self.cameras):
             raise ShapeError(f"images: expected {len(self.cameras)}, one a camera, got {len(self.images)}")
-        for camera, image in zip(self.cameras, self.images, strict=True):
+        for index, camera in enumerate(self.cameras):
+            if isinstance(self.images, StoredImages):
+                width, height = self.images.size(index)
+                self._check_size(camera, (height, width))
+                continue
+            image = self.images[index]
             shape = image.shape
             if len(shape) != 3 or shape[2] != 4 or image.dtype != np.uint8:
                 raise ShapeError(
                     f"{camera.name}: image: expected [height, width, 4] uint8, "
                     f"got {list(shape)} {image.dtype}"
                 )
-            if (camera.height, camera.width) != shape[:2]:
-                raise ShapeError(
-                    f"{camera.name}: camera: expected {shape[1]}x{shape[0]} pixels as its picture has, "
-                    f"got {camera.width}x{camera.height}"
-                )
+            self._check_size(camera, shape)
+
+    def _check_size(self, camera: Camera, shape: tuple[int, ...]) -> None:
+        if (camera.height, camera.width) != shape[:2]:
+            raise ShapeError(
+                f"{camera.name}: camera: expected {shape[1]}x{shape[0]} pixels as its picture has, "
+                f"got {camera.width}x{camera.height}"
+            )
 
     def some(self, numbers: Iterable[int]) -> PosedImages:
         """The views with these numbers, in ascending order."""
         chosen = sorted(numbers)
-        return PosedImages([self.cameras[i] for i in chosen], [self.images[i] for i in chosen])
+        cameras, images = [self.cameras[i] for i in chosen], self.images
+        if isinstance(images, StoredImages):
+            return PosedImages(cameras, images.some(chosen))
+        return PosedImages(cameras, [images[i] for i in chosen])
+
+    def opaque(self, number: int) -> bool:
+        """Whether every pixel of a picture is opaque."""
+        if isinstance(self.images, StoredImages):
+            return self.images.opaque(number)
+        return bool((self.images[number][..., 3] == 255).all())
+
+    def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """[n, 4] uint8: the `pixels` [n] of a picture, numbers in row-major order."""
+        if isinstance(self.images, StoredImages):
+            return self.images.pixels(number, pixels)
+        return self.images[number].reshape(-1, 4)[pixels]
 
 
 @dataclass(frozen=True)

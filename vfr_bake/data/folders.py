@@ -12,29 +12,35 @@ from player.cameras.colmap import colmap_folder, read_cameras, read_images, read
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
 from vfr_bake.data.capture import Capture, held_out
-from vfr_bake.data.files.pictures import SUFFIXES, DescribedView, picture_size, read_pictures
+from vfr_bake.data.files.pictures import SUFFIXES, DescribedView, picture_size
+from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def load_folder(folder: Path, progress: Progress | None = None) -> Capture:
-    """The pictures and cameras in `folder`, in whichever form they are there. Raises as `load_scene`."""
+def load_folder(
+    folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
+) -> Capture:
+    """The pictures and cameras in `folder`, in whichever form they are there. `reader`: what reads the
+    pictures; None for all as they are, in memory. Raises as `load_scene`."""
     if not folder.exists():
         raise DataError(f"{folder}: no such folder: expected one with pictures and cameras, or the word demo")
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder with a transforms.json or a COLMAP model, got a file")
     if has_transforms(folder):
-        return load_transforms_folder(folder, progress)
+        return load_transforms_folder(folder, progress, reader)
     if colmap_folder(folder):
-        return load_colmap_folder(folder, progress)
+        return load_colmap_folder(folder, progress, reader)
     empty = "an empty folder" if not any(folder.iterdir()) else "neither"
     raise DataError(
         f"{folder}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got {empty}"
     )
 
 
-def load_transforms_folder(folder: Path, progress: Progress | None = None) -> Capture:
+def load_transforms_folder(
+    folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
+) -> Capture:
     """The pictures of `folder`: `transforms_train.json` and `transforms_test.json`, or one
     `transforms.json`.
 
@@ -50,7 +56,7 @@ def load_transforms_folder(folder: Path, progress: Progress | None = None) -> Ca
         described += _described_views(test_file)
     if n_train < 2:
         raise DataError(f"{train_file}: training views: expected at least 2, got {n_train}")
-    views = read_pictures(described, progress)
+    views = (reader or PictureReader()).read(described, progress)
     n_views = len(described)
     train, test = (
         (views.some(range(n_train)), views.some(range(n_train, n_views))) if has_test else held_out(views)
@@ -99,7 +105,9 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def load_colmap_folder(folder: Path, progress: Progress | None = None) -> Capture:
+def load_colmap_folder(
+    folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
+) -> Capture:
     """The pictures of `folder` that its COLMAP model has registered, in the order of their names.
 
     Pictures are looked for in `images/` and in the folder itself; every eighth is held out. Raises DataError
@@ -121,7 +129,7 @@ def load_colmap_folder(folder: Path, progress: Progress | None = None) -> Captur
         size = (lens.width, lens.height)
         camera = Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy)
         described.append(DescribedView(_colmap_picture(folder, image.name), camera, lens.distortion))
-    train, test = held_out(read_pictures(described, progress))
+    train, test = held_out((reader or PictureReader()).read(described, progress))
     return Capture(folder.resolve().name or "scene", train, test, points)
 
 

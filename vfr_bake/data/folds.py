@@ -106,7 +106,7 @@ def torn_views(views: PosedImages) -> list[tuple[str, str]]:
     torn = []
     for i in np.flatnonzero(angles > LEAP_TURN):
         ends = views.cameras[i : i + 2]
-        found = [find_features(image) for image in views.images[i : i + 2]]
+        found = [find_features(image) for image in views.images[int(i) : int(i) + 2]]
         matches = match(found[0].descriptors, found[1].descriptors)
         if len(matches) < MIN_MATCHES:
             continue

@@ -6,6 +6,7 @@ ball around what they look at, whatever the scene's unit; `world_from_model` und
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ BORDER = 2
 """Pixels along a picture's edge that tell a plain background."""
 PLAIN_SHARE, PLAIN_LEVELS = 0.95, 8
 """A background is plain if so large a share of the border pixels is within so many levels of one colour."""
+N_LOOKED_AT = 200
+"""Silhouettes and borders are looked at in so many of the pictures, spread evenly."""
 CAMERA_QUANTILE = 0.9
 """This share of an unbounded scene's cameras lies in the unit ball: one that strayed must not shrink the
 rest."""
@@ -62,13 +65,14 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     """
     train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
     _check_cameras(capture.name, train.cameras)
-    has_alpha = any(bool((image[..., 3] < 255).any()) for image in train.images)
-    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(train.images))
+    has_alpha = not all(train.opaque(number) for number in range(len(train.cameras)))
+    some = _spread(train)
+    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(some.images))
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:
         centre, half = scene_box(
-            train.cameras, [image[..., 3] for image in train.images] if has_alpha else None
+            *(some.cameras, [image[..., 3] for image in some.images]) if has_alpha else (train.cameras, None)
         )
     world_from_model = np.eye(4)
     world_from_model[:3, :3] *= half
@@ -94,7 +98,15 @@ def _check_cameras(name: str, cameras: list[Camera]) -> None:
         )
 
 
-def _plain_border(images: list[np.ndarray]) -> bool:
+def _spread(views: PosedImages) -> PosedImages:
+    """At most N_LOOKED_AT of the views, spread evenly."""
+    n_views = len(views.cameras)
+    return views.some(
+        set(np.linspace(0, n_views - 1, min(n_views, N_LOOKED_AT)).round().astype(int).tolist())
+    )
+
+
+def _plain_border(images: Sequence[np.ndarray]) -> bool:
     """Whether the pictures' edges show nothing but one colour."""
     edges = [
         strip.reshape(-1, 4)[:, :3]

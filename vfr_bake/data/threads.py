@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -29,14 +30,31 @@ def in_threads(
     ['1', '2']
     """
     results = []
-    with ThreadPoolExecutor(n_threads()) as pool:
-        futures = [pool.submit(function, item) for item in items]
+    for result in one_by_one(function, items, n_threads()):
+        results.append(result)
+        if progress is not None:
+            progress(len(results), len(items))
+    return results
+
+
+def one_by_one(function: Callable[[Item], Result], items: Sequence[Item], n_threads: int) -> Iterator[Result]:
+    """What `function` returns for every item, in the order of the items; no more are worked on, or done and
+    not yet taken, than `n_threads` and one.
+
+    What it raises ends the others, as does an interruption.
+
+    >>> list(one_by_one(str, [1, 2], 1))
+    ['1', '2']
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(n_threads) as pool:
         try:
-            for done, future in enumerate(futures):
-                results.append(future.result())
-                if progress is not None:
-                    progress(done + 1, len(items))
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > n_threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return results

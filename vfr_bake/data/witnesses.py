@@ -73,7 +73,7 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     counts[learned] = np.minimum(_shares(N_WITNESSES - n_of_whole, len(learned)), most)
     random = np.random.default_rng(SEED)
     pixels = [_spread(n, of, random) for n, of in zip(counts.tolist(), n_pixels.tolist(), strict=True)]
-    rgba = [image.reshape(-1, 4)[rows] for image, rows in zip(views.images, pixels, strict=True)]
+    rgba = [views.pixels(view, rows) for view, rows in enumerate(pixels)]
     return Witnesses(counts, np.concatenate(pixels).astype(np.int32), np.concatenate(rgba), whole)
 
 

@@ -33,7 +33,7 @@ def render_views(model: Model, views: PosedImages, n_views: int = 0) -> Iterator
     for index in chosen:
         camera = views.cameras[index]
         rgb = render_image(model.field, model.sampler, camera, model.background)
-        yield RenderedView(camera.name, rgb, over_background(views.images[index], model.background))
+        yield RenderedView(camera.name, rgb, over_background(views.images[int(index)], model.background))
 
 
 def evaluate(

@@ -9,8 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.capture import PosedImages, StoredImages
 from vfr_bake.data.witnesses import Witnesses
+
+CHUNK_SHARE = 0.25
+"""Pixels that are drawn from a chunk, as a share of those in it: few are drawn twice, and what is read from a
+disk is four times what is used."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +30,20 @@ class RayBatch:
 
 
 class Pixels(NamedTuple):
-    """All pixels of all pictures, which may differ in size; arrays, or tensors on one device."""
+    """Pixels of all pictures, which may differ in size: all of them, or one chunk of what lies on a disk
+    (`vfr_bake.data.capture.StoredImages`). Arrays, or tensors on one device."""
 
     rgba: Any
-    """[n_pixels, 4] uint8, picture after picture, row after row."""
+    """[n_pixels, 4] uint8, or 3 channels if all are opaque, picture after picture."""
     starts: Any
     ends: Any
-    """[n_pictures] int64: the first pixel of each picture, and the one behind its last."""
+    """[n_pictures] int64: the first pixel of each picture here, and the one behind its last."""
+    places: Any
+    strides: Any
+    sizes: Any
+    """[n_pictures] int64: the place of a picture's first pixel here, and how many pixels the picture has. The
+    pixel at place p is number (stride p) mod size in row-major order; all pixels are in the places 0, 1, 2,
+    ... of stride 1."""
     widths: Any
     """[n_pictures] int64."""
     poses: Any
@@ -41,18 +52,32 @@ class Pixels(NamedTuple):
     """[n_pictures, 4] float32: fx, fy, cx, cy in pixels."""
 
     @classmethod
-    def of(cls, views: PosedImages) -> Pixels:
-        cameras = views.cameras
-        n_pixels = np.array([camera.width * camera.height for camera in cameras])
-        ends = np.cumsum(n_pixels)
+    def of(cls, views: PosedImages, chunk: int = 0) -> Pixels:
+        """Those of `views`; one `chunk` of them if they lie on a disk."""
+        cameras, images = views.cameras, views.images
+        sizes = np.array([camera.width * camera.height for camera in cameras])
+        if isinstance(images, StoredImages):
+            rgba, strides = images.chunk(chunk), images.strides
+            places, behind = images.chunk_places(chunk)
+        else:
+            rgba = np.concatenate([image.reshape(-1, 4) for image in images])
+            strides, places, behind = np.ones_like(sizes), np.zeros_like(sizes), sizes
+        ends = np.cumsum(behind - places)
         return cls(
-            rgba=np.concatenate([image.reshape(-1, 4) for image in views.images]),
-            starts=ends - n_pixels,
+            rgba=rgba,
+            starts=ends - (behind - places),
             ends=ends,
+            places=places,
+            strides=strides,
+            sizes=sizes,
             widths=np.array([camera.width for camera in cameras]),
             poses=np.stack([camera.c2w[:3] for camera in cameras]).astype(np.float32),
             intrinsics=np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float32),
         )
+
+    def numbers(self, view: Any, index: Any) -> Any:
+        """The numbers [n] of the pixels `index` [n] in their pictures `view` [n], row-major."""
+        return (index - self.starts[view] + self.places[view]) * self.strides[view] % self.sizes[view]
 
     def directions(self, view: Any, row: Any, column: Any) -> Any:
         """Directions [n_rays, 3], not of unit length, through the centres of pixels of the pictures `view`
@@ -66,6 +91,9 @@ class Pixels(NamedTuple):
 class PixelSampler:
     """Draws pixels uniformly from all pixels of all training pictures that are no witnesses.
 
+    Of pictures on a disk it draws from one chunk after the other, for CHUNK_SHARE as many pixels as that has:
+    each is an even sample of all pictures, and the disk is read in long runs.
+
     In numpy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
     the step itself.
     """
@@ -75,57 +103,102 @@ class PixelSampler:
     ) -> None:
         """`witnesses`: of `views`; with None all pixels are drawn."""
         learned = range(len(views.cameras)) if witnesses is None else witnesses.learned()
-        self._pixels, self._generator = Pixels.of(views.some(learned)), generator
-        kept = np.zeros(0, np.int64) if witnesses is None else _single_pixels(witnesses, self._pixels.starts)
+        self._views, self._generator = views.some(learned), generator
+        self._singles = _single_pixels(witnesses, len(self._views.cameras))
+        images = self._views.images
+        self._n_chunks = images.n_chunks if isinstance(images, StoredImages) else 1
+        self._go_to(0)
+
+    @property
+    def position(self) -> list[int]:
+        """The chunk that is drawn from, and how many more pixels."""
+        return [self._chunk, self._n_left]
+
+    def restore(self, position: list[int]) -> None:
+        """Go on from a `position`."""
+        chunk, n_left = position
+        if chunk != self._chunk:
+            self._go_to(chunk % self._n_chunks)
+        self._n_left = n_left
+
+    def _go_to(self, chunk: int) -> None:
+        self._chunk = chunk
+        self._pixels = Pixels.of(self._views, chunk)
+        view, number = self._singles
+        kept = np.sort(_indices(self._pixels, view, number))
         self._n_drawn = len(self._pixels.rgba) - len(kept)
         self._n_before: Any = kept - np.arange(len(kept))
         """[n_single] int64, ascending: the number of pixels that are drawn before each single witness."""
+        self._n_left = max(1, int(CHUNK_SHARE * self._n_drawn))
+
+    def _count(self, n_rays: int) -> None:
+        """So many pixels are about to be drawn."""
+        if self._n_chunks > 1:
+            if self._n_left <= 0:
+                self._go_to((self._chunk + 1) % self._n_chunks)
+            self._n_left -= n_rays
 
     def draw(self, n_rays: int) -> RayBatch:
         """`n_rays` pixels, with replacement."""
+        self._count(n_rays)
         pixels = self._pixels
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator).numpy()
         index += np.searchsorted(self._n_before, index, side="right")
         view = np.searchsorted(pixels.ends, index, side="right")
-        row, column = np.divmod(index - pixels.starts[view], pixels.widths[view])
+        row, column = np.divmod(pixels.numbers(view, index), pixels.widths[view])
         rays_d = pixels.directions(view, row.astype(np.float32), column.astype(np.float32))
         rays_d /= np.sqrt((rays_d * rays_d).sum(axis=-1, keepdims=True))
+        rgba = np.ones((n_rays, 4), np.float32)
+        rgba[:, : pixels.rgba.shape[1]] = pixels.rgba[index] * np.float32(1 / 255)
         return RayBatch(
             rays_o=torch.from_numpy(pixels.poses[view, :, 3]),
             rays_d=torch.from_numpy(rays_d),
-            rgba=torch.from_numpy(pixels.rgba[index] * np.float32(1 / 255)),
+            rgba=torch.from_numpy(rgba),
         )
 
 
 class DevicePixelSampler(PixelSampler):
     """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
 
-    def __init__(
-        self, views: PosedImages, generator: torch.Generator, witnesses: Witnesses | None = None
-    ) -> None:
-        super().__init__(views, generator, witnesses)
-        self._pixels = Pixels(*(torch.from_numpy(array).to(generator.device) for array in self._pixels))
-        self._n_before = torch.from_numpy(self._n_before).to(generator.device)
+    def _go_to(self, chunk: int) -> None:
+        super()._go_to(chunk)
+        device = self._generator.device
+        self._pixels = Pixels(*(torch.from_numpy(array).to(device) for array in self._pixels))
+        self._n_before = torch.from_numpy(self._n_before).to(device)
 
     def draw(self, n_rays: int) -> RayBatch:
+        self._count(n_rays)
         pixels, device = self._pixels, self._generator.device
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator, device=device)
         index += torch.searchsorted(self._n_before, index, right=True)
         view = torch.searchsorted(pixels.ends, index, right=True)
-        inside, width = index - pixels.starts[view], pixels.widths[view]
-        rays_d = pixels.directions(view, inside // width, inside % width)
+        number, width = pixels.numbers(view, index), pixels.widths[view]
+        rays_d = pixels.directions(view, number // width, number % width)
+        rgba = torch.ones((n_rays, 4), device=device)
+        rgba[:, : pixels.rgba.shape[1]] = pixels.rgba[index] * (1 / 255)
         return RayBatch(
             rays_o=pixels.poses[view, :, 3],
             rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
-            rgba=pixels.rgba[index] * (1 / 255),
+            rgba=rgba,
         )
 
 
-def _single_pixels(witnesses: Witnesses, starts: np.ndarray) -> np.ndarray:
-    """[n_single] int64, ascending: the single witnesses among all pixels of the learned views, of which each
-    begins at `starts` [n_learned]."""
-    first = np.full(len(witnesses.counts), -1)
-    first[witnesses.learned()] = starts
-    of_view = first[witnesses.views()]
-    single = of_view >= 0
-    return of_view[single] + witnesses.pixels[single]
+def _single_pixels(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, np.ndarray]:
+    """[n_single] int64 each: the single witnesses' views, counted among the learned ones, and their numbers
+    in these."""
+    if witnesses is None:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    among = np.full(len(witnesses.counts), -1)
+    among[witnesses.learned()] = np.arange(n_learned)
+    view = among[witnesses.views()]
+    return view[view >= 0], witnesses.pixels[view >= 0].astype(np.int64)
+
+
+def _indices(pixels: Pixels, view: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """[n] int64: where those of the pixels `number` [n] of the pictures `view` [n] are that are there; the
+    inverse of `Pixels.numbers`."""
+    strides = zip(pixels.strides.tolist(), pixels.sizes.tolist(), strict=True)
+    inverse = np.array([pow(stride, -1, size) for stride, size in strides], np.int64)
+    place = number * inverse[view] % pixels.sizes[view] - pixels.places[view]
+    there = (place >= 0) & (place < (pixels.ends - pixels.starts)[view])
+    return pixels.starts[view[there]] + place[there]

@@ -309,6 +309,7 @@ class Trainer:
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
             "witnesses": witness_content(self.witnesses),
+            "pixels": self._pixels.position,
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
 
@@ -323,6 +324,7 @@ class Trainer:
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
         self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
+        self._pixels.restore(state["pixels"])
 
 
 def choose_device(name: str) -> torch.device:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ from player.errors import DataError, FormatError, MissingExtraError
 from player.files.files import open_file, read_bytes
 from player.files.images import MAX_FILE_BYTES, open_picture
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.threads import Progress, in_threads
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -28,20 +26,6 @@ class DescribedView(NamedTuple):
     """Scaled to the picture where it speaks of another size."""
     distortion: dict[str, float]
     """Keyword arguments of `undistort`."""
-
-
-def read_pictures(described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
-    """Read pictures, each with the pinhole camera that would have taken it. Raises DataError."""
-
-    def load(view: DescribedView) -> tuple[Camera, np.ndarray]:
-        image = read_picture(view.path)
-        camera = view.camera.resized(image.shape[1], image.shape[0])
-        if any(view.distortion.values()):
-            image = undistort(image, camera, **view.distortion)
-        return camera, image
-
-    results = in_threads(load, described, progress)
-    return PosedImages([camera for camera, _ in results], [image for _, image in results])
 
 
 def reduced(views: PosedImages, factor: int) -> PosedImages:
@@ -69,24 +53,28 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     if (image[..., 3] == 255).all():
         return np.asarray(Image.fromarray(image).reduce(factor))
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    return _straight(_premultiplied(image).reshape(height, factor, width, factor, 4).mean(axis=(1, 3)))
+    return straight(premultiplied(image).reshape(height, factor, width, factor, 4).mean(axis=(1, 3)))
 
 
-def _premultiplied(image: np.ndarray) -> np.ndarray:
-    """[height, width, 4] float32: colours under zero alpha mean nothing, so it is this that has a mean."""
+def premultiplied(image: np.ndarray) -> np.ndarray:
+    """[height, width, 4] float32 in [0, 255]: colours under zero alpha mean nothing, so it is this that has a
+    mean."""
     weighted = image.astype(np.float32)
     weighted[..., :3] *= weighted[..., 3:] / 255
     return weighted
 
 
-def _straight(weighted: np.ndarray) -> np.ndarray:
-    """[height, width, 4] uint8 with straight alpha; the inverse of `_premultiplied`, in place."""
+def straight(weighted: np.ndarray) -> np.ndarray:
+    """[height, width, 4] uint8 with straight alpha; the inverse of `premultiplied`, in place."""
     weighted[..., :3] /= np.maximum(weighted[..., 3:], 1e-6) / 255
     return (weighted + 0.5).clip(0, 255).astype(np.uint8)
 
 
-def read_picture(path: Path) -> np.ndarray:
+def read_picture(path: Path, least: tuple[int, int] | None = None) -> np.ndarray:
     """A picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures too.
+
+    `least`: width and height that are enough. A JPEG file that is twice, four or eight times as large is then
+    decoded at a half, a quarter or an eighth of its size, rounded up, in a fraction of the time.
 
     Raises DataError for what Pillow cannot read to its end, and for floating-point pictures.
     """
@@ -94,6 +82,9 @@ def read_picture(path: Path) -> np.ndarray:
         if _is_16_bit_colour(path):
             return _read_16_bit_colour(path)
         with open_picture(path) as file:
+            if least is not None:
+                turned = (file.width > file.height) != (least[0] > least[1])
+                file.draft(None, (least[1], least[0]) if turned else least)
             file.load()
             if file.mode == "I" or file.mode.startswith("I;16"):
                 # Pillow's own conversion clips 16-bit greys at 255.
@@ -180,13 +171,13 @@ def undistort(
     column = camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx - 0.5
     row = camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy - 0.5
     result = cv2.remap(
-        _premultiplied(image),
+        premultiplied(image),
         column.clip(-1e6, 1e6).astype(np.float32),
         row.clip(-1e6, 1e6).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return _straight(result)
+    return straight(result)
 
 
 def picture_size(path: Path) -> tuple[int, int]:

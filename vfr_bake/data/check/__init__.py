@@ -1,0 +1,1 @@
+"""What a set of pictures is good for, said before the minutes of a training go."""

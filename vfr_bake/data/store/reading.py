@@ -1,0 +1,240 @@
+"""Described pictures -> posed pictures at the working size, in memory or on the disk."""
+
+from __future__ import annotations
+
+import atexit
+import math
+import os
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from player.cameras.camera import Camera
+from player.errors import OutputError
+from player.files.memory import allowed_bytes
+from player.files.replace import PART
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.files.pictures import DescribedView, picture_size
+from vfr_bake.data.store import cache
+from vfr_bake.data.store.stored import Layout, in_order, write_picture
+from vfr_bake.data.store.working import WorkingSize
+from vfr_bake.data.threads import Progress, in_threads, n_threads, one_by_one
+
+HELD_BYTES = 1_000_000_000
+"""Pictures that take no more than this are held in memory, nor more than a quarter of what there is for the
+program: the trainer has another copy of those that it learns from."""
+DECODING_BYTES = 1_000_000_000
+"""Memory for pictures that are being decoded: large ones are read by fewer threads."""
+LEAST_SIDE = 480
+"""Pixels: the longest side is not made smaller than this for want of room."""
+
+
+class _TransparentError(Exception):
+    """A picture has alpha where three channels were expected."""
+
+
+class PictureReader:
+    """Reads the pictures of a data set at the working size.
+
+    >>> PictureReader(WorkingSize(1600)).size.size(4000, 3000)
+    (1600, 1200)
+    """
+
+    def __init__(
+        self,
+        size: WorkingSize | None = None,
+        model: Path | None = None,
+        on_disk: bool = False,
+        kept: bool = False,
+        may_shrink: bool = False,
+        say: Callable[[str], object] | None = None,
+    ) -> None:
+        """Make a reader.
+
+        Args:
+            size: the working size; None for pictures as they are.
+            model: the model that is trained on them, with which what is kept goes.
+            on_disk: whether pictures that take too much memory are read from the disk.
+            kept: whether they stay there for the next run.
+            may_shrink: whether the pictures may be smaller where the disk has no room.
+            say: called with a sentence on what was chosen.
+        """
+        self.size = size or WorkingSize()
+        """The working size; after reading the one that was used."""
+        self._model, self._on_disk, self._kept = model, on_disk, kept
+        self._may_shrink = may_shrink
+        self._say = say or (lambda text: None)
+
+    def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
+        """The pictures with the pinhole cameras that would have taken them.
+
+        Raises DataError (a picture), OutputError (a disk without room for them; what is missing).
+        """
+        sizes = in_threads(lambda view: picture_size(view.path), described, None)
+        if not self._on_disk or self._n_bytes(sizes, 4) <= held_bytes():
+            self._tell(sizes, "")
+            return self._held(described, sizes, progress)
+        root = cache.cache_folder()
+        folder = root / cache.digest(described, self.size)
+        if not self._kept and self._model is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        found = cache.opened(folder, described)
+        if found is None:
+            n_channels = 3 if all(view.path.suffix.lower() in (".jpg", ".jpeg") for view in described) else 4
+            cache.remove_unused(root, self._n_bytes(sizes, n_channels), folder)
+            self._fit(sizes, root, n_channels)
+            if self._n_bytes(sizes, 4) <= held_bytes():
+                self._tell(sizes, "")
+                return self._held(described, sizes, progress)
+            folder = root / cache.digest(described, self.size)
+            found = cache.opened(folder, described)
+        if found is None:
+            self._tell(sizes, f" on the disk ({'' if self._kept else 'for this run, '}in {root})")
+            try:
+                found = self._stored(described, sizes, folder, 3, progress)
+            except _TransparentError:
+                found = self._stored(described, sizes, folder, 4, progress)
+        else:
+            self._tell(sizes, f" as they were kept in {folder}")
+            if progress is not None:
+                progress(len(described), len(described))
+        if self._model is not None and folder.is_dir():
+            cache.note_use(folder, self._model)
+        return PosedImages(found.cameras, found.images)
+
+    def _n_bytes(self, sizes: Sequence[tuple[int, int]], n_channels: int) -> int:
+        return sum(math.prod(self.size.size(*size)) for size in sizes) * n_channels
+
+    def _tell(self, sizes: Sequence[tuple[int, int]], where: str) -> None:
+        targets = [self.size.size(*size) for size in sizes]
+        smaller = "" if targets == list(sizes) else f", reduced to {_named(targets)}"
+        self._say(f"{len(sizes)} pictures of {_named(sizes)}{smaller}{where}")
+
+    def _threads(self, described: Sequence[DescribedView], sizes: Sequence[tuple[int, int]]) -> int:
+        largest = max(map(self.size.reading_bytes, described, sizes), default=1)
+        return max(1, min(n_threads(), DECODING_BYTES // largest))
+
+    def _held(
+        self, described: Sequence[DescribedView], sizes: Sequence[tuple[int, int]], progress: Progress | None
+    ) -> PosedImages:
+        cameras: list[Camera] = []
+        images: list[np.ndarray] = []
+        for camera, image in one_by_one(self.size.read, described, self._threads(described, sizes)):
+            cameras.append(camera)
+            images.append(image)
+            if progress is not None:
+                progress(len(images), len(described))
+        return PosedImages(cameras, images)
+
+    def _fit(self, sizes: Sequence[tuple[int, int]], root: Path, n_channels: int) -> None:
+        """Make the working size smaller if the disk has too little room. Raises OutputError."""
+        free, needed = cache.free_bytes(root), self._n_bytes(sizes, n_channels)
+        if needed <= free:
+            return
+        longest = max(max(self.size.size(*size)) for size in sizes)
+        side = int(longest * math.sqrt(free / needed)) // 16 * 16
+        if not self._may_shrink or side < LEAST_SIDE:
+            raise OutputError(_no_room(root, needed, free))
+        self._say(
+            f"{root}: {needed / 1e9:.1f} GB for pictures of {longest} pixels, {free / 1e9:.1f} GB are free: "
+            f"the longest side is {side} instead; free some room for more"
+        )
+        self.size = replace(self.size, max_side=side, downscale=None)
+
+    def _stored(
+        self,
+        described: Sequence[DescribedView],
+        sizes: Sequence[tuple[int, int]],
+        folder: Path,
+        n_channels: int,
+        progress: Progress | None,
+    ) -> cache.Kept:
+        layout = Layout.of(self.size.size(*size) for size in sizes)
+        n_bytes = int(layout.chunks[-1]) * n_channels
+        try:
+            if self._kept:
+                with cache.new_set(folder) as new:
+                    self._fill(new, layout, described, sizes, n_channels, progress)
+                return _whole(folder, described)
+            folder.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            new = Path(tempfile.mkdtemp(prefix=".pictures.", suffix=PART, dir=folder.parent))
+            try:
+                self._fill(new, layout, described, sizes, n_channels, progress)
+                return _whole(new, described)
+            finally:
+                # What is mapped stays until the process ends, where systems have it so.
+                shutil.rmtree(new, ignore_errors=True)
+                if os.name == "nt":
+                    atexit.register(shutil.rmtree, new, ignore_errors=True)
+        except OSError as error:
+            if isinstance(error, OutputError) and not isinstance(error.__cause__, OSError):
+                raise
+            said = error.__cause__ if isinstance(error, OutputError) else error
+            raise OutputError(
+                f"{_no_room(folder.parent, n_bytes, cache.free_bytes(folder.parent))} ({said})"
+            ) from error
+
+    def _fill(
+        self,
+        folder: Path,
+        layout: Layout,
+        described: Sequence[DescribedView],
+        sizes: Sequence[tuple[int, int]],
+        n_channels: int,
+        progress: Progress | None,
+    ) -> None:
+        """Read every picture once, and write it into the new set in `folder`. Raises OSError."""
+
+        def load(view: DescribedView) -> tuple[Camera, bool, np.ndarray]:
+            camera, image = self.size.read(view)
+            opaque = bool((image[..., 3] == 255).all())
+            if not opaque and n_channels == 3:
+                raise _TransparentError
+            return camera, opaque, in_order(image[..., :n_channels])
+
+        cameras: list[Camera] = []
+        transparent: set[int] = set()
+        cache.reserve(folder / cache.PIXELS, int(layout.chunks[-1]) * n_channels)
+        with (folder / cache.PIXELS).open("r+b") as file:
+            for camera, opaque, pixels in one_by_one(load, described, self._threads(described, sizes)):
+                write_picture(file, layout, len(cameras), pixels)
+                if not opaque:
+                    transparent.add(len(cameras))
+                cameras.append(camera)
+                if progress is not None:
+                    progress(len(cameras), len(described))
+        (folder / cache.INDEX).write_bytes(cache.index_bytes(layout, cameras, n_channels, transparent))
+
+
+def held_bytes() -> int:
+    """Bytes of pictures that are held in memory."""
+    return min(HELD_BYTES, allowed_bytes() // 4)
+
+
+def _whole(folder: Path, described: Sequence[DescribedView]) -> cache.Kept:
+    found = cache.opened(folder, described)
+    if found is None:
+        raise OutputError(f"{folder}: pictures: what was written cannot be read again")
+    return found
+
+
+def _no_room(folder: Path, needed: int, free: int) -> str:
+    return (
+        f"{folder}: expected {needed / 1e9:.2f} GB of free disk for the pictures, got {free / 1e9:.2f} GB: "
+        "free some, pass a smaller --max-side, or set XDG_CACHE_HOME to a folder of another disk"
+    )
+
+
+def _named(sizes: Sequence[tuple[int, int]]) -> str:
+    """Sizes in words, the most frequent first.
+
+    >>> _named([(4, 3), (3, 4), (4, 3)]), _named([(1, 1), (2, 2), (3, 3), (4, 4)])
+    ('4x3 and 3x4', '1x1 and 3 other sizes')
+    """
+    counts = [f"{width}x{height}" for (width, height), _ in Counter(sizes).most_common()]
+    return " and ".join(counts) if len(counts) < 4 else f"{counts[0]} and {len(counts) - 1} other sizes"

@@ -1,0 +1,183 @@
+"""Pictures in one file on a disk, which is mapped into memory, in an order that random draws like.
+
+A step of training wants some hundred pixels from anywhere in all pictures. Read from the pictures where they
+lie, each would be a page of the disk of its own. So every picture's pixels are written in another order, in
+which neighbours come from far apart, and each picture is cut in that order into as many pieces as there are
+*chunks*. A chunk of the file holds one piece of every picture: an even sample of all of them, read at once.
+
+The pixel at place p of a picture of n pixels is number (stride p) mod n. The stride is next to n times the
+golden ratio and has no common factor with n: any run of places is then spread evenly over the picture, and
+a picture's order takes no memory. Pictures have three channels in the file if all are opaque, else four.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, overload
+
+import numpy as np
+
+from vfr_bake.data.capture import StoredImages
+
+PIXELS_OF_A_PIECE = 8192
+"""A piece is some 24 kB: a disk reads and writes that about as fast as if it were one file's."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+_PLACES_AT_ONCE = 1 << 20
+
+
+class Layout(NamedTuple):
+    """Where the pixels of pictures lie in the file, counted in pixels."""
+
+    sizes: np.ndarray
+    """[n_pictures, 2] int64: width and height."""
+    edges: np.ndarray
+    """[n_pictures, n_chunks + 1] int64: the places at which each picture is cut into pieces."""
+    begins: np.ndarray
+    """[n_pictures, n_chunks] int64: where in the file each piece begins."""
+    chunks: np.ndarray
+    """[n_chunks + 1] int64: where in the file each chunk begins, and the end of the last."""
+
+    @classmethod
+    def of(cls, sizes: Iterable[tuple[int, int]]) -> Layout:
+        """The layout of pictures of `sizes` (width, height), at least one.
+
+        >>> Layout.of([(160, 120), (160, 120), (2, 1)]).chunks.tolist()
+        [0, 19201, 38402]
+        """
+        table = np.array(list(sizes), np.int64)
+        n_pixels = table.prod(axis=1)
+        n_chunks = max(1, int(np.median(n_pixels)) // PIXELS_OF_A_PIECE)
+        edges = np.arange(n_chunks + 1) * n_pixels[:, None] // n_chunks
+        pieces = np.diff(edges, axis=1)
+        chunks = np.concatenate([[0], np.cumsum(pieces.sum(axis=0))])
+        begins = chunks[:-1] + np.cumsum(pieces, axis=0) - pieces
+        return cls(table, edges, begins, chunks)
+
+
+@lru_cache(maxsize=4096)
+def stride_of(n_pixels: int) -> int:
+    """The stride of the order of a picture of `n_pixels`.
+
+    >>> stride_of(1), stride_of(100), math.gcd(stride_of(1_920_000), 1_920_000)
+    (1, 61, 1)
+    """
+    stride = max(1, int(n_pixels * GOLDEN))
+    while math.gcd(stride, n_pixels) > 1:
+        stride += 1
+    return stride
+
+
+def in_order(image: np.ndarray) -> np.ndarray:
+    """The pixels [height * width, n_channels] of a picture [height, width, n_channels], place after place."""
+    height, width, n_channels = image.shape
+    return image.reshape(-1, n_channels).take(_order(height * width), axis=0)
+
+
+def write_picture(file: BinaryIO, layout: Layout, number: int, pixels: np.ndarray) -> None:
+    """Put a picture's pixels, as `in_order` has them, into their places in the file. Raises OSError."""
+    n_channels, edges = pixels.shape[1], layout.edges[number]
+    for chunk, begin in enumerate(layout.begins[number].tolist()):
+        file.seek(begin * n_channels)
+        file.write(pixels[edges[chunk] : edges[chunk + 1]].data)
+
+
+@lru_cache(maxsize=2)
+def _order(n_pixels: int) -> np.ndarray:
+    """[n_pixels] int32: the number of the pixel at each place."""
+    stride, order = stride_of(n_pixels), np.empty(n_pixels, np.int32)
+    for begin in range(0, n_pixels, _PLACES_AT_ONCE):
+        places = np.arange(begin, min(begin + _PLACES_AT_ONCE, n_pixels))
+        order[begin : begin + _PLACES_AT_ONCE] = places * stride % n_pixels
+    return order
+
+
+class MappedImages(StoredImages):
+    """Some of the pictures of a file that `write_picture` has filled."""
+
+    def __init__(
+        self,
+        file: np.ndarray,
+        layout: Layout,
+        transparent: frozenset[int],
+        numbers: Sequence[int] | None = None,
+    ) -> None:
+        """`file`: [n_pixels, 3 or 4] uint8, mapped. `transparent`: the pictures that are not opaque.
+        `numbers`: those of the file's pictures that are meant, in this order; None for all."""
+        self._file, self._layout, self._transparent = file, layout, transparent
+        self._numbers = list(range(len(layout.sizes)) if numbers is None else numbers)
+        self.n_chunks = len(layout.chunks) - 1
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+    @overload
+    def __getitem__(self, index: slice) -> StoredImages: ...
+    def __getitem__(self, index: int | slice) -> np.ndarray | StoredImages:
+        if isinstance(index, slice):
+            return self.some(range(len(self))[index])
+        number = self._numbers[index]
+        width, height = self._layout.sizes[number].tolist()
+        rgba = np.full((height * width, 4), 255, np.uint8)
+        order, edges = _order(width * height), self._layout.edges[number]
+        for chunk, begin in enumerate(self._layout.begins[number].tolist()):
+            piece = self._file[begin : begin + int(edges[chunk + 1] - edges[chunk])]
+            rgba[order[edges[chunk] : edges[chunk + 1]], : piece.shape[1]] = piece
+        return rgba.reshape(height, width, 4)
+
+    def some(self, numbers: Sequence[int]) -> MappedImages:
+        return MappedImages(self._file, self._layout, self._transparent, [self._numbers[i] for i in numbers])
+
+    def size(self, number: int) -> tuple[int, int]:
+        width, height = self._layout.sizes[self._numbers[number]].tolist()
+        return width, height
+
+    def opaque(self, number: int) -> bool:
+        return self._numbers[number] not in self._transparent
+
+    def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        which = self._numbers[number]
+        n_pixels = int(self._layout.sizes[which].prod())
+        places = np.asarray(pixels, np.int64) * pow(stride_of(n_pixels), -1, n_pixels) % n_pixels
+        edges = self._layout.edges[which]
+        chunk = np.searchsorted(edges, places, side="right") - 1
+        rgba = np.full((len(places), 4), 255, np.uint8)
+        rows = self._file[self._layout.begins[which][chunk] + places - edges[chunk]]
+        rgba[:, : rows.shape[1]] = rows
+        return rgba
+
+    def chunk(self, number: int) -> np.ndarray:
+        begins, edges = self._layout.begins[:, number], self._layout.edges
+        pieces = [
+            self._file[begins[i] : begins[i] + edges[i, number + 1] - edges[i, number]] for i in self._numbers
+        ]
+        # What comes next is read by the system while this one is drawn from.
+        self._expect((number + 1) % self.n_chunks)
+        return np.concatenate(pieces)
+
+    def chunk_places(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        edges = self._layout.edges[self._numbers]
+        return edges[:, number], edges[:, number + 1]
+
+    @property
+    def strides(self) -> np.ndarray:
+        return np.array([stride_of(int(n)) for n in self._layout.sizes[self._numbers].prod(axis=1)])
+
+    def _expect(self, chunk: int) -> None:
+        mapped = getattr(self._file, "_mmap", None)
+        if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_WILLNEED"):
+            n_channels = self._file.shape[1]
+            begin, end = (int(edge) * n_channels for edge in self._layout.chunks[chunk : chunk + 2])
+            begin -= begin % mmap.PAGESIZE
+            mapped.madvise(mmap.MADV_WILLNEED, begin, end - begin)
+
+
+def map_pictures(path: Path, layout: Layout, n_channels: int, transparent: frozenset[int]) -> MappedImages:
+    """The pictures of a file, none of which is read yet. Raises OSError, ValueError (it is too short)."""
+    file = np.memmap(path, np.uint8, "r", shape=(int(layout.chunks[-1]), n_channels))
+    return MappedImages(file, layout, transparent)

@@ -1,0 +1,124 @@
+"""The working size: how large the pictures are that everything after the data set sees.
+
+Pictures become smaller by the mean of the area that each new pixel covers, which has no gaps and no ringing
+whatever the factor is, and their cameras by exactly that factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from player.cameras.camera import Camera
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.files.pictures import (
+    DescribedView,
+    opencv,
+    picture_size,
+    premultiplied,
+    read_picture,
+    reduced,
+    straight,
+    undistort,
+)
+
+MAX_SIDE = 1600
+"""Pixels of the longest side, where nothing else is asked for: a capture's field resolves no finer detail in
+the minutes that it is trained for, and twelve megapixels take six times the room."""
+BYTES_DECODED, BYTES_UNDISTORTED = 16, 100
+"""Bytes of memory a decoded pixel takes while its picture is read, and where a lens is undone."""
+
+
+@dataclass(frozen=True)
+class WorkingSize:
+    """How pictures are reduced: to a longest side, or by a whole factor, which decides where it is given."""
+
+    max_side: int | None = None
+    """Pixels; None: as they are."""
+    downscale: int | None = None
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height that a picture of `width` x `height` pixels is worked on with.
+
+        >>> WorkingSize(1600).size(4032, 3024), WorkingSize(1600).size(400, 400)
+        ((1600, 1200), (400, 400))
+        >>> WorkingSize(1600, downscale=3).size(400, 299)
+        (133, 99)
+        """
+        if self.downscale is not None:
+            return max(1, width // self.downscale), max(1, height // self.downscale)
+        longest = max(width, height)
+        if self.max_side is None or longest <= self.max_side:
+            return width, height
+        scale = self.max_side / longest
+        return max(1, round(width * scale)), max(1, round(height * scale))
+
+    def reading_bytes(self, view: DescribedView, size: tuple[int, int]) -> int:
+        """About as many bytes of memory are taken while a picture of `size` is read."""
+        bent = any(view.distortion.values())
+        step = 1 if self.downscale is not None else self._whole_step(max(size))
+        undone = size[0] * size[1] // step**2 * BYTES_UNDISTORTED if bent else 0
+        return max(size[0] * size[1] * BYTES_DECODED, undone)
+
+    def read(self, view: DescribedView) -> tuple[Camera, np.ndarray]:
+        """A picture as [height, width, 4] uint8 at the working size, its lens undone, with its pinhole
+        camera. Raises DataError."""
+        width, height = picture_size(view.path)
+        target = self.size(width, height)
+        image = read_picture(view.path, None if self.downscale is not None else target)
+        # A JPEG decoder that leaves out the finest frequencies gives half, a quarter or an eighth, rounded
+        # up: the camera is divided by the whole number, and what is rounded up repeats the picture's edge.
+        step = max(1, round(width / image.shape[1]))
+        camera = _divided(view.camera.resized(width, height), step, image)
+        bent = any(view.distortion.values())
+        if self.downscale is not None or self.max_side is None:
+            if bent:
+                image = undistort(image, camera, **view.distortion)
+            views = reduced(PosedImages([camera], [image]), self.downscale or 1)
+            return views.cameras[0], views.images[0]
+        if bent:
+            # Not below the working size, so that the interpolation blurs nothing that is kept.
+            step = self._whole_step(max(image.shape[:2]))
+            camera, image = resized(camera, image, -(-image.shape[1] // step), -(-image.shape[0] // step))
+            image = undistort(image, camera, **view.distortion)
+        return resized(camera, image, *target)
+
+    def of(self, views: PosedImages) -> PosedImages:
+        """Views that are in memory, at the working size."""
+        if self.downscale is not None:
+            return reduced(views, self.downscale)
+        pairs = [
+            resized(camera, image, *self.size(camera.width, camera.height))
+            for camera, image in zip(views.cameras, views.images, strict=True)
+        ]
+        return PosedImages([camera for camera, _ in pairs], [image for _, image in pairs])
+
+    def _whole_step(self, longest: int) -> int:
+        return 1 if self.max_side is None else max(1, longest // self.max_side)
+
+
+def resized(camera: Camera, image: np.ndarray, width: int, height: int) -> tuple[Camera, np.ndarray]:
+    """A picture [height, width, 4] and its camera on fewer pixels, each the mean over the area it covers.
+
+    >>> camera = Camera("a", np.eye(4), 5, 5, 10.0, 10.0, 2.5, 2.5)
+    >>> smaller, image = resized(camera, np.full((5, 5, 4), 255, np.uint8), 2, 2)
+    >>> smaller.fx, image.shape
+    (4.0, (2, 2, 4))
+    """
+    if image.shape[:2] == (height, width):
+        return camera, image
+    cv2 = opencv(f"{camera.name}: size: expected OpenCV to reduce the picture", "train")
+    smaller = camera.resized(width, height)
+    if (image[..., 3] == 255).all():
+        return smaller, cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return smaller, straight(cv2.resize(premultiplied(image), (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _divided(camera: Camera, step: int, image: np.ndarray) -> Camera:
+    """The camera of a picture that was decoded at one `step`-th of its size."""
+    if step == 1:
+        return camera
+    height, width = image.shape[:2]
+    focal = {name: getattr(camera, name) / step for name in ("fx", "fy", "cx", "cy")}
+    return replace(camera, width=width, height=height, **focal)
