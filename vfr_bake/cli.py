@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from player.app.commands import run, write_result
-from player.errors import ConfigError, DataError, MissingExtraError
+from player.errors import ConfigError, DataError, MissingExtraError, VfrError
 from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
-from vfr_bake.config import BakeConfig
+from vfr_bake.config import BakeConfig, TrainConfig
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 EVAL_VIEWS = {False: 10, True: 3}
 """Number of test views rendered at the end, by whether the scene is unbounded, where none is asked for."""
+
+GLANCED_AT = 24
+"""Pictures that a run looks at before it begins; `--check` looks at all that ten seconds allow."""
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
@@ -76,9 +79,16 @@ def _train(options: Any) -> int:
     from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
+    if options.check:
+        return _check(options)
+    if options.model is None:
+        print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
+        return 2
     check_target(options.model, options.force)
     config = options.config
     processes = Processes.from_environment()
+    if processes.first:
+        _look(options.data, config)
     data = processes.in_turn(lambda: _with_cameras(options.data))
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
@@ -107,6 +117,37 @@ def _train(options: Any) -> int:
         _report_training(options, figures, interrupted)
     processes.leave()
     return 130 if interrupted else 0
+
+
+def _check(options: Any) -> int:
+    from vfr_bake.data import working_size
+    from vfr_bake.data.check.check import check_data
+    from vfr_bake.data.check.page import MARK, check_page
+
+    page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
+    ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
+    check_target(page, options.force or ours)
+    with Bar("looking") as bar:
+        check = check_data(options.data, working_size(options.config), progress=bar.count)
+    write_bytes(page, check_page(check))
+    lines = [f"{options.data}: {printable(line)}" for line in check.lines()]
+    write_result(options.json, check.document() | {"page": str(page)}, "\n".join([*lines, f"see {page}"]))
+    return 0
+
+
+def _look(data: str, config: TrainConfig) -> None:
+    """The first lines of a run: what a glance at some of the pictures tells."""
+    from vfr_bake.data import working_size
+    from vfr_bake.data.check.check import check_data
+
+    if data == "demo":
+        return
+    try:
+        check = check_data(data, working_size(config), seconds=3, most=GLANCED_AT)
+    except VfrError:  # said by what reads the pictures
+        return
+    for line in check.lines():
+        _say(data, line)
 
 
 def _say(data: str, text: str) -> None:

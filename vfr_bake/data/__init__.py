@@ -17,7 +17,15 @@ from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.threads import Progress
 
-__all__ = ["PosedImages", "Scene", "load_scene", "needs_cameras", "reader_as", "training_reader"]
+__all__ = [
+    "PosedImages",
+    "Scene",
+    "load_scene",
+    "needs_cameras",
+    "reader_as",
+    "training_reader",
+    "working_size",
+]
 
 
 def load_scene(
@@ -46,14 +54,19 @@ def load_scene(
     return build_scene(load_folder(Path(data), progress, reader), kind)
 
 
+def working_size(config: TrainConfig) -> WorkingSize:
+    """The size that pictures are trained on where the disk has room for them."""
+    default = config.max_side is None and config.downscale is None
+    return WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
+
+
 def training_reader(
     config: TrainConfig, model: Path, kept: bool, say: Callable[[str], object] | None
 ) -> PictureReader:
     """What reads pictures for the training of `model`; with `kept` it leaves them for the next
     run."""
     default = config.max_side is None and config.downscale is None
-    size = WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
-    return PictureReader(size, model, on_disk=True, kept=kept, may_shrink=default, say=say)
+    return PictureReader(working_size(config), model, on_disk=True, kept=kept, may_shrink=default, say=say)
 
 
 def reader_as(settings: dict[str, Any]) -> PictureReader:

@@ -12,8 +12,7 @@ from player.cameras.colmap import colmap_folder, read_cameras, read_images, read
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
 from vfr_bake.data.capture import Capture, held_out
-from vfr_bake.data.files.pictures import SUFFIXES, DescribedView, picture_size
-from vfr_bake.data.store.reading import PictureReader
+from vfr_bake.data.files.pictures import SUFFIXES, DescribedView, picture_size, read_pictures
 from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -95,7 +95,7 @@ def is_video(path: Path) -> bool:
 
 def has_pictures(folder: Path) -> bool:
     """Whether `estimate_cameras` finds pictures in `folder` itself or in its `images/`."""
-    return bool(_pictures(folder))
+    return bool(list_pictures(folder))
 
 
 def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
@@ -121,7 +121,7 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     if not photos.is_dir():
         found = "a file of another kind" if photos.exists() else "nothing"
         raise DataError(f"{photos}: expected a folder of pictures or a video, got {found}")
-    pictures = _pictures(photos)
+    pictures = list_pictures(photos)
     model = photos / "sparse" / "0"
     if model.exists():
         return _read_report(model, photos, len(pictures))
@@ -243,7 +243,7 @@ def _placed(
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
 
-def _pictures(folder: Path) -> list[Path]:
+def list_pictures(folder: Path) -> list[Path]:
     """The pictures in `images/`, or else in the folder itself, in the order of their names."""
     for place in (folder / "images", folder):
         if place.is_dir():

@@ -5,7 +5,7 @@ lie, each would be a page of the disk of its own. So every picture's pixels are 
 which neighbours come from far apart, and each picture is cut in that order into as many pieces as there are
 *chunks*. A chunk of the file holds one piece of every picture: an even sample of all of them, read at once.
 
-The pixel at place p of a picture of n pixels is number (stride p) mod n. The stride is next to n times the
+The pixel at place p of a picture of n pixels is number (stride p) mod n. The stride is about n times the
 golden ratio and has no common factor with n: any run of places is then spread evenly over the picture, and
 a picture's order takes no memory. Pictures have three channels in the file if all are opaque, else four.
 """
@@ -26,6 +26,7 @@ from vfr_bake.data.capture import StoredImages
 PIXELS_OF_A_PIECE = 8192
 """A piece is some 24 kB: a disk reads and writes that about as fast as if it were one file's."""
 GOLDEN = (math.sqrt(5) - 1) / 2
+STRIDES_TRIED = 100
 _PLACES_AT_ONCE = 1 << 20
 
 
@@ -60,15 +61,26 @@ class Layout(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def stride_of(n_pixels: int) -> int:
-    """The stride of the order of a picture of `n_pixels`.
+    """The stride of the order of a picture of `n_pixels`: of those around n_pixels times the golden ratio
+    that have no factor in common with it, the one whose runs are spread best.
 
     >>> stride_of(1), stride_of(100), math.gcd(stride_of(1_920_000), 1_920_000)
-    (1, 61, 1)
+    (1, 73, 1)
     """
-    stride = max(1, int(n_pixels * GOLDEN))
-    while math.gcd(stride, n_pixels) > 1:
-        stride += 1
-    return stride
+    middle = int(n_pixels * GOLDEN)
+    around = range(max(1, middle - STRIDES_TRIED), min(middle + STRIDES_TRIED, max(n_pixels, 2)))
+    fitting = [stride for stride in around if math.gcd(stride, n_pixels) == 1]
+    return min(fitting, key=lambda stride: (_largest_quotient(n_pixels, stride), abs(stride - middle)))
+
+
+def _largest_quotient(a: int, b: int) -> int:
+    """The largest partial quotient of the continued fraction of b / a: the larger, the wider the gaps between
+    the first multiples of b modulo a (Khinchin, Continued fractions; the golden ratio has ones alone)."""
+    largest = 0
+    while b:
+        largest = max(largest, a // b)
+        a, b = b, a % b
+    return largest
 
 
 def in_order(image: np.ndarray) -> np.ndarray:

@@ -1,0 +1,171 @@
+"""The check: what it says of sets that are good, blurred, apart, uneven; its page and its data."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from player.cameras.camera import Camera
+from player.cameras.transforms import write_cameras
+from player.errors import ConfigError, DataError
+from vfr_bake.cli import train_main
+from vfr_bake.data.check.check import BAD, Check, check_data, widest_gap
+from vfr_bake.data.check.page import check_page
+from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.store.working import WorkingSize
+
+MINUTES = 60.0
+"""Seconds that the check may take: so many that a slow machine looks at everything."""
+
+
+def wall(seed: int) -> Image.Image:
+    """A long wall full of blots of all sizes, which a window moves along."""
+    random = np.random.default_rng(seed)
+    layers = np.zeros((400, 2000))
+    for size in (4, 8, 16, 40):
+        coarse = random.normal(0, 1, (400 // size + 1, 2000 // size + 1))
+        layers += np.kron(coarse, np.ones((size, size)))[:400, :2000]
+    levels = (128 + 40 * layers).clip(0, 255).astype(np.uint8)
+    return Image.fromarray(levels).filter(ImageFilter.GaussianBlur(1.2)).convert("RGB")
+
+
+def walk(folder: Path, n: int = 12, seed: int = 0, step: int = 60, prefix: str = "p") -> Path:
+    """`n` pictures of 480 x 400 pixels, each a step along the wall."""
+    folder.mkdir(exist_ok=True)
+    picture = wall(seed)
+    for number in range(n):
+        window = picture.crop((number * step, 0, number * step + 480, 400))
+        window.save(folder / f"{prefix}{number:02d}.jpg", quality=92)
+    return folder
+
+
+def checked(folder: Path) -> Check:
+    return check_data(str(folder), WorkingSize(320), MINUTES)
+
+
+def test_a_good_walk(tmp_path: Path) -> None:
+    check = checked(walk(tmp_path / "walk", 24))
+    assert check.verdict == "good" and check.advice == []
+    figures = check.figures
+    assert (figures["n_pictures"], figures["n_looked_at"], figures["n_blurred"]) == (24, 24, 0)
+    assert figures["share_in_one_group"] == 1 and figures["sizes"] == {"480x400": 24}
+    assert figures["sizes_used"] == {"320x267": 24} and figures["exposure_spread"] < 0.1
+    assert all(picture.found is None and picture.why is None for picture in check.pictures)
+
+
+def test_a_blurred_picture_is_named(tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk")
+    blurred = Image.open(folder / "p05.jpg").filter(ImageFilter.GaussianBlur(5))
+    blurred.save(folder / "p05.jpg")
+    check = checked(folder)
+    assert [picture.name for picture in check.pictures if picture.why == "blurred"] == ["p05.jpg"]
+    assert any("1 blurred" in line for line in check.advice)
+
+
+def test_pictures_of_two_places_fall_apart(tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk", 8, 0, prefix="a")
+    walk(folder, 8, 1, prefix="b")
+    check = checked(folder)
+    assert check.figures["share_in_one_group"] == 0.5 and check.verdict != "good"
+    assert any("about 8 of 16" in line for line in check.likely)
+
+
+def test_all_blurred_and_plain(tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk", 8)
+    for path in folder.iterdir():
+        Image.open(path).filter(ImageFilter.GaussianBlur(12)).save(path)
+    check = checked(folder)
+    assert any("soft" in line for line in check.advice) and check.verdict != "good"
+    for path in folder.iterdir():
+        Image.new("RGB", (480, 400), (90, 80, 70)).save(path)
+    check = checked(folder)
+    assert check.verdict == BAD and check.figures["n_plain"] == 8
+
+
+def test_exposure_that_changes(tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk", 8)
+    for path in sorted(folder.iterdir())[::2]:
+        values = np.asarray(Image.open(path)).astype(float)
+        Image.fromarray((values * 0.6).astype(np.uint8)).save(path)
+    check = checked(folder)
+    assert 1.0 < check.figures["exposure_spread"] < 2.5  # 0.6 of the levels: 1.6 powers of two of the light
+    assert any("lock the exposure" in line for line in check.advice)
+
+
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk", 6)
+    (folder / "p03.jpg").write_bytes(b"no picture")
+    check = checked(folder)
+    (broken,) = (picture for picture in check.pictures if picture.size is None)
+    assert broken.name == "p03.jpg" and "p03.jpg" in str(broken.why)
+    assert json.dumps(check.document())
+
+
+def test_time_that_is_over_leaves_a_sample(tmp_path: Path) -> None:
+    check = check_data(str(walk(tmp_path / "walk")), WorkingSize(), seconds=0)
+    assert check.figures["n_looked_at"] == 0 and len(check.pictures) == 12
+    assert check_data(str(tmp_path / "walk"), WorkingSize(), MINUTES, most=4).figures["n_looked_at"] == 4
+
+
+def test_cameras_that_come_with_the_pictures(small_data: Path, tmp_path: Path) -> None:
+    check = check_data(str(small_data), WorkingSize(), MINUTES)
+    assert check.kind == "transforms.json" and check.figures["n_found"] == 14
+    assert all(picture.found for picture in check.pictures) and len(check.cameras) == 14
+    page = check_page(check).decode()
+    assert page.count("<svg") == 2 and page.count("<circle") == 2 * 15
+
+
+def test_the_widest_gap_of_a_walk() -> None:
+    def ring(degrees: np.ndarray) -> list[Camera]:
+        cameras = []
+        for angle in np.radians(degrees):
+            back = np.array([np.cos(angle), np.sin(angle), 0.2])
+            back /= np.linalg.norm(back)
+            right = np.array([-np.sin(angle), np.cos(angle), 0.0])
+            c2w = np.eye(4)
+            c2w[:3] = np.stack([right, np.cross(back, right), back, 3 * back], axis=-1)
+            cameras.append(Camera("a", c2w, 8, 8, 9.0, 9.0, 4.0, 4.0))
+        return cameras
+
+    assert widest_gap(ring(np.arange(0, 360, 20))) == pytest.approx(20)
+    assert widest_gap(ring(np.arange(0, 181, 10))) == pytest.approx(180, abs=0.1)
+    assert widest_gap(ring(np.array([0.0]))) is None
+    assert (widest_gap(demo_cameras(8, 64)) or 0) < 30
+
+
+def test_the_command_writes_a_page_and_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = walk(tmp_path / "my <walk>", 6)
+    monkeypatch.chdir(tmp_path)
+    arguments = [str(folder), "--check", "--json", "check.json", "--max-side", "240"]
+    assert train_main(arguments) == 0
+    page = (tmp_path / "my <walk>_check.html").read_text(encoding="utf-8")
+    assert "my &lt;walk&gt;" in page and "<walk>" not in page
+    assert page.count("data:image/jpeg;base64,") == 6
+    assert not re.findall(r"(?:src|href)=(?![\"']?data:)|url\(|@import|https?:", page)
+    images = json.loads((tmp_path / "check.json").read_text())["images"]
+    assert [image["name"] for image in images] == [f"p{number:02d}.jpg" for number in range(6)]
+    assert {(image["width"], image["height"]) for image in images} == {(240, 200)}
+    assert all(image["sharpness"] > 0 for image in images if image["n_features"] is not None)
+    assert "6 pictures of 480x400, used at 240x200" in capsys.readouterr().out
+    assert train_main(arguments) == 0, "its own page may be replaced"
+    (tmp_path / "my <walk>_check.html").write_text("something else")
+    assert train_main(arguments) == 1
+    assert train_main([str(folder)]) == 2
+    assert "expected a model file" in capsys.readouterr().err
+
+
+def test_what_cannot_be_checked(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="demo"):
+        check_data("demo", WorkingSize())
+    with pytest.raises(DataError, match="expected a folder of pictures or a video, got none"):
+        check_data(str(tmp_path), WorkingSize())
+    (tmp_path / "transforms.json").write_bytes(write_cameras(demo_cameras(8, 3)))
+    with pytest.raises(DataError, match="picture is missing"):
+        check_data(str(tmp_path), WorkingSize())

@@ -1,0 +1,407 @@
+"""A set of pictures, judged in seconds: what there is, what is likely to come out, what to photograph."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from player.cameras.camera import Camera, focus_point, world_up
+from player.cameras.colmap import colmap_folder
+from player.errors import ConfigError, DataError
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
+from vfr_bake.data.files.pictures import DescribedView
+from vfr_bake.data.files.video import extract_frames
+from vfr_bake.data.folders import has_transforms, load_folder
+from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE, is_video, list_pictures
+from vfr_bake.data.store.reading import PictureReader
+from vfr_bake.data.store.working import WorkingSize
+from vfr_bake.data.threads import Progress
+
+BLURRED = 0.3
+"""A picture is blurred if its sharpness is less than this share of its neighbours' median."""
+NEIGHBOURS = 4
+"""Pictures on either side that a picture's sharpness is held against."""
+PLAIN_FEATURES = 30
+"""With fewer features at the size of the check there is nothing to recognise."""
+SOFT_SHARPNESS = 15.0
+"""Where the median sharpness is less, all are out of focus, blurred, or enlarged."""
+GOOD_SHARED = 40
+"""Neighbours that share as many features, at the size of the check, overlap well."""
+UNEVEN = 0.7
+"""Where pictures show the same by more brighter or darker than each other (powers of two; 95 in 100 pairs
+less), it becomes fog."""
+FEW, GOOD_NUMBER = 20, 40
+"""Pictures: fewer leave holes; about as many show a subject from all sides."""
+GAP_DEGREES = 90.0
+"""A wider gap in the walk around the subject is a side that nobody has seen."""
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+
+
+@dataclass(frozen=True)
+class CheckedPicture:
+    """One picture of a set."""
+
+    name: str
+    size: tuple[int, int] | None
+    """Width and height in pixels, upright; None where it cannot be read."""
+    used: tuple[int, int] | None
+    """Width and height at the working size."""
+    look: Look | None
+    """None where there was no time for it, or it cannot be read."""
+    relative: float | None
+    """Sharpness, divided by the neighbours' median."""
+    partners: int | None
+    """Pictures that share features with it, of those that it was compared with; None if with none."""
+    found: bool | None
+    """Whether its camera is known; None where cameras have not been looked for yet."""
+    why: str | None
+    """What is wrong with it, or why it has no camera."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What is known of a set of pictures."""
+
+    data: str
+    kind: str
+    """Where the cameras come from: transforms.json, COLMAP, or "none yet"."""
+    pictures: list[CheckedPicture]
+    cameras: list[Camera]
+    figures: dict[str, Any]
+    verdict: str
+    """GOOD, DOUBTFUL or BAD."""
+    likely: list[str]
+    """What is likely to come out, in sentences."""
+    advice: list[str]
+    """What to photograph, in sentences; empty where there is nothing to add."""
+    seconds: float = 0.0
+
+    def lines(self) -> list[str]:
+        """The check in a few lines for people."""
+        return [*_summary(self.figures), f"{self.verdict}: {' '.join(self.likely)}", *self.advice]
+
+    def document(self) -> dict[str, Any]:
+        """The check as data, for JSON."""
+        return {
+            "data": self.data,
+            "cameras": self.kind,
+            **self.figures,
+            "verdict": self.verdict,
+            "likely": self.likely,
+            "advice": self.advice,
+            "seconds": round(self.seconds, 2),
+            "images": [_image(picture) for picture in self.pictures],
+        }
+
+
+@dataclass
+class _Set:
+    """The pictures of a data set, and the cameras that are known."""
+
+    kind: str
+    names: list[str]
+    paths: list[Path]
+    found: list[bool | None]
+    cameras: list[Camera] = field(default_factory=list)
+
+
+class _Describing(PictureReader):
+    """Takes note of what is to be read, and reads nothing."""
+
+    described: Sequence[DescribedView] = ()
+
+    def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
+        self.described = described
+        cameras = [view.camera for view in described]
+        blank = np.zeros((1, 1, 4), np.uint8)
+        return PosedImages(
+            cameras, [np.broadcast_to(blank, (camera.height, camera.width, 4)) for camera in cameras]
+        )
+
+
+def check_data(
+    data: str,
+    size: WorkingSize,
+    seconds: float = 8.0,
+    progress: Progress | None = None,
+    most: int | None = None,
+) -> Check:
+    """Look at the pictures that `data` names.
+
+    Args:
+        data: a folder of pictures with or without cameras, or a video, as for `load_scene`.
+        size: the working size.
+        seconds: about how long to look; what is not seen in that time is a sample's rest.
+        progress: called with the number of pictures seen and to see.
+        most: pictures to look at, at most.
+
+    Raises DataError, FormatError: there is no such folder, or no picture in it. ConfigError: the built-in
+    scene has no pictures.
+    """
+    begin = time.monotonic()
+    pictures = _listed(data)
+    looks = look_at(pictures.paths, 0.8 * seconds, progress, most)
+    seen = [look if isinstance(look, Look) else None for look in looks]
+    shared = compare(seen, 0.2 * seconds)
+    relative = _relative_sharpness(seen)
+    partners = _partners(len(seen), shared)
+    checked = []
+    for number, (name, look) in enumerate(zip(pictures.names, looks, strict=True)):
+        why = look if isinstance(look, str) else _fault(seen[number], relative[number], partners[number])
+        if pictures.found[number] is False and why is None:
+            why = "the estimation of cameras found no place for it"
+        picture_look = seen[number]
+        full = picture_look.size if picture_look else _size(pictures.paths[number])
+        checked.append(
+            CheckedPicture(
+                name,
+                full,
+                size.size(*full) if full else None,
+                picture_look,
+                relative[number],
+                partners[number],
+                pictures.found[number],
+                why,
+            )
+        )
+    figures = _figures(checked, shared)
+    verdict, likely, advice = _judged(figures, pictures.cameras)
+    return Check(
+        *(data, pictures.kind, checked, pictures.cameras, figures, verdict, likely, advice),
+        time.monotonic() - begin,
+    )
+
+
+def _listed(data: str) -> _Set:
+    folder = Path(data)
+    if data == "demo":
+        raise ConfigError("demo: expected a folder of pictures or a video to check, got the built-in scene")
+    if is_video(folder):
+        folder = extract_frames(folder, lambda done, of: None)
+    if folder.is_dir() and (has_transforms(folder) or colmap_folder(folder) is not None):
+        reader = _Describing()
+        load_folder(folder, None, reader)
+        paths = [view.path for view in reader.described]
+        cameras = [view.camera for view in reader.described]
+        names = [camera.name for camera in cameras]
+        kind = "transforms.json" if has_transforms(folder) else "COLMAP"
+        found: list[bool | None] = [True] * len(paths)
+        if kind == "COLMAP":
+            others = [path for path in list_pictures(folder) if path not in set(paths)]
+            paths, names = paths + others, names + [path.name for path in others]
+            found += [False] * len(others)
+        return _Set(kind, names, paths, found, cameras)
+    paths = list_pictures(folder) if folder.is_dir() else []
+    if not paths:
+        raise DataError(f"{folder}: expected a folder of pictures or a video, got none")
+    return _Set("none yet", [path.name for path in paths], paths, [None] * len(paths))
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    from vfr_bake.data.files.pictures import picture_size
+
+    try:
+        return picture_size(path)
+    except DataError:
+        return None
+
+
+def _relative_sharpness(looks: Sequence[Look | None]) -> list[float | None]:
+    """Each picture's sharpness by the median of up to NEIGHBOURS seen pictures on either side."""
+    there = [i for i, look in enumerate(looks) if look is not None]
+    values = np.array([look.sharpness for look in looks if look is not None])
+    relative: list[float | None] = [None] * len(looks)
+    for n, i in enumerate(there):
+        around = np.delete(values, n)[max(0, n - NEIGHBOURS) : n + NEIGHBOURS]
+        if len(around) and (usual := float(np.median(around))) > 0:
+            relative[i] = float(values[n] / usual)
+    return relative
+
+
+def _partners(n: int, shared: dict[tuple[int, int], Shared]) -> list[int | None]:
+    compared, partners = np.zeros(n, int), np.zeros(n, int)
+    for pair, number in shared.items():
+        compared[list(pair)] += 1
+        partners[list(pair)] += number.n_features >= MIN_SHARED
+    return [int(p) if c else None for p, c in zip(partners, compared, strict=True)]
+
+
+def _fault(look: Look | None, relative: float | None, partners: int | None) -> str | None:
+    if look is None:
+        return None
+    if relative is not None and relative < BLURRED:
+        return "blurred"
+    if len(look.descriptors) < PLAIN_FEATURES:
+        return "nothing to recognise: plain, dark or out of focus"
+    return "nothing in common with the pictures around it" if partners == 0 else None
+
+
+def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], Shared]) -> dict[str, Any]:
+    looks = [picture.look for picture in pictures if picture.look is not None]
+    next_ones = [both.n_features for (i, j), both in shared.items() if j == i + 1]
+    changes = [abs(both.change) for both in shared.values() if both.n_features >= GOOD_SHARED]
+    group = _largest_group(shared)
+    faults = Counter(picture.why for picture in pictures if picture.why)
+    return {
+        "n_pictures": len(pictures),
+        "n_looked_at": len(looks),
+        "n_found": sum(picture.found is True for picture in pictures),
+        "n_unreadable": sum(picture.size is None for picture in pictures),
+        "sizes": _counted(picture.size for picture in pictures),
+        "sizes_used": _counted(picture.used for picture in pictures),
+        "sharpness": _rounded(np.median([look.sharpness for look in looks]) if looks else 0.0),
+        "n_blurred": faults["blurred"],
+        "n_plain": sum(n for why, n in faults.items() if str(why).startswith("nothing to recognise")),
+        "exposure_spread": _rounded(np.quantile(changes, 0.95) if changes else 0.0),
+        "shared_features": _rounded(np.median(next_ones) if next_ones else 0.0),
+        "share_in_one_group": _rounded(group),
+    }
+
+
+def _largest_group(shared: dict[tuple[int, int], Shared]) -> float:
+    """The share of the compared pictures in the largest group that hangs together by shared features."""
+    leader: dict[int, int] = {}
+
+    def lead(i: int) -> int:
+        while leader.setdefault(i, i) != i:
+            i = leader[i]
+        return i
+
+    for (i, j), number in shared.items():
+        a, b = lead(i), lead(j)
+        if number.n_features >= MIN_SHARED:
+            leader[a] = b
+    groups = Counter(lead(i) for i in list(leader))
+    return max(groups.values()) / len(leader) if leader else 0.0
+
+
+def _judged(figures: dict[str, Any], cameras: Sequence[Camera]) -> tuple[str, list[str], list[str]]:
+    """Verdict, what is likely to come out, and what to photograph."""
+    n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
+    likely, advice, bad, doubts = [], [], False, False
+    if cameras:
+        likely.append(f"the cameras of {figures['n_found']} pictures are known.")
+        bad = figures["n_found"] < 2
+    else:
+        share = figures["share_in_one_group"]
+        bad = n < MIN_PICTURES or share < MIN_SHARE / 2
+        doubts |= share < 0.9
+        likely.append(
+            f"about {min(n, round(share * n))} of {n} pictures hang together and are likely to find their "
+            "cameras."
+        )
+        if share < 0.9:
+            advice.append(
+                "photograph with steps of some 10 degrees, so that each picture shows most of what the one "
+                "before it does, and add pictures between those that share nothing."
+            )
+        elif figures["shared_features"] < GOOD_SHARED:
+            advice.append(
+                "take smaller steps, or keep more of textured surroundings in the picture: neighbours "
+                "share few features."
+            )
+    if n < FEW:
+        doubts = True
+        advice.append(f"take more pictures: {n} leave holes, {GOOD_NUMBER} to 100 show a subject well.")
+    if figures["sharpness"] < SOFT_SHARPNESS:
+        doubts = True
+        advice.append(
+            "all pictures are soft: focus on the subject, use more light, hold still while the shutter is "
+            "open; the model will be no sharper than they are."
+        )
+    if figures["n_blurred"]:
+        doubts |= figures["n_blurred"] > 0.2 * seen
+        advice.append(f"take the {figures['n_blurred']} blurred pictures again, or leave them out.")
+    if figures["n_plain"] and not cameras:
+        bad |= figures["n_plain"] > 0.5 * seen
+        advice.append(
+            "put something with a pattern under or behind the subject: there is nothing to recognise in "
+            f"{figures['n_plain']} pictures."
+        )
+    if figures["exposure_spread"] > UNEVEN:
+        advice.append(
+            "lock the exposure: pictures show the same things up to "
+            f"{2 ** figures['exposure_spread']:.1f} times as bright as each other, which becomes fog."
+        )
+    gap = widest_gap(cameras)
+    if gap is not None and gap > GAP_DEGREES:
+        advice.append(
+            f"photograph the other side as well: the cameras leave {gap:.0f} degrees around the subject open."
+        )
+    likely.append(
+        "Training is not worth its minutes yet." if bad
+        else "A model comes out, with weak places." if doubts
+        else "A good model is likely."
+    )  # fmt: skip
+    return BAD if bad else DOUBTFUL if doubts else GOOD, likely, advice
+
+
+def widest_gap(cameras: Sequence[Camera]) -> float | None:
+    """Degrees of the widest gap between cameras, seen from above from where they look at; None for too few,
+    or where they look outwards."""
+    if len(cameras) < 3:
+        return None
+    focus, up = focus_point(cameras), world_up(cameras)
+    arms = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
+    looks = -np.stack([camera.c2w[:3, 2] for camera in cameras])
+    if np.median((arms * looks).sum(axis=1) / np.maximum(np.linalg.norm(arms, axis=1), 1e-9)) > -0.5:
+        return None
+    right, back = level_axes(up)
+    angles = np.sort(np.degrees(np.arctan2(arms @ back, arms @ right)))
+    return float(np.diff([*angles, angles[0] + 360]).max())
+
+
+def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions [3] of unit length at right angles to `up` [3] and to each other."""
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, up)
+
+
+def _summary(figures: dict[str, Any]) -> list[str]:
+    sizes = " and ".join(list(figures["sizes"])[:3])
+    used = " and ".join(list(figures["sizes_used"])[:3])
+    working = "" if sizes == used else f", used at {used}"
+    looked = "" if figures["n_looked_at"] == figures["n_pictures"] else (
+        f"; {figures['n_looked_at']} of them were looked at")  # fmt: skip
+    return [
+        f"{figures['n_pictures']} pictures of {sizes}{working}{looked}",
+        f"sharpness {figures['sharpness']:.0f}, {figures['n_blurred']} blurred; brightness alike to "
+        f"{2 ** figures['exposure_spread']:.1f} times; neighbours share {figures['shared_features']:.0f} "
+        f"features, {figures['share_in_one_group']:.0%} hang together",
+    ]
+
+
+def _image(picture: CheckedPicture) -> dict[str, Any]:
+    width, height = picture.used or (None, None)
+    look = picture.look
+    return {
+        "name": picture.name,
+        "width": width,
+        "height": height,
+        "full_size": list(picture.size) if picture.size else None,
+        "sharpness": None if look is None else _rounded(look.sharpness),
+        "relative_sharpness": None if picture.relative is None else _rounded(picture.relative),
+        "exposure": None if look is None else _rounded(look.exposure),
+        "n_features": None if look is None else len(look.descriptors),
+        "n_partners": picture.partners,
+        "found": picture.found,
+        "why": picture.why,
+    }
+
+
+def _counted(sizes: Any) -> dict[str, int]:
+    return dict(Counter(f"{size[0]}x{size[1]}" for size in sizes if size).most_common())
+
+
+def _rounded(value: Any) -> float:
+    number = float(value)
+    return round(number, 3) if math.isfinite(number) else 0.0

@@ -1,0 +1,159 @@
+"""What a quick look at a picture tells: its sharpness, its exposure, and what could be recognised in it."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from player.errors import VfrError
+from vfr_bake.data.features import match
+from vfr_bake.data.files.pictures import opencv, picture_size, read_picture, shrunk
+from vfr_bake.data.threads import Progress, n_threads, one_by_one
+
+SHARPNESS_SIDE = 800
+"""Pixels of the longest side at which sharpness is measured: blur that it does not show is below two pixels
+at the working size."""
+FEATURE_SIDE, N_FEATURES = 480, 400
+"""Pixels of the longest side in which features are looked for, and how many are kept."""
+THUMBNAIL_SIDE = 144
+MIN_SHARED = 18
+"""Features that two pictures must share to be said to show the same; of different scenes, they were seen to
+share 13."""
+MOST_COMPARED = 120
+"""Each of so many pictures, spread evenly, is compared with each other: seven thousand pairs."""
+GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was seen of one picture."""
+
+    size: tuple[int, int]
+    """Width and height in pixels, upright."""
+    sharpness: float
+    """Variance of the Laplacian of the grey levels (0 to 255) at SHARPNESS_SIDE."""
+    exposure: float
+    """Mean of log2 of the luminance: one more is twice the light."""
+    descriptors: np.ndarray
+    """[n_features, 128] float32 of unit length."""
+    levels: np.ndarray
+    """[n_features] float32: log2 of the luminance around each feature."""
+    thumbnail: bytes
+    """JPEG."""
+
+
+class Shared(NamedTuple):
+    """What two pictures have in common."""
+
+    n_features: int
+    change: float
+    """How much brighter the second shows it, in powers of two."""
+
+
+def look(path: Path) -> Look:
+    """Look at one picture. Raises DataError, MissingExtraError."""
+    cv2 = opencv(f"{path}: picture: expected OpenCV to look at it", "train")
+    size = picture_size(path)
+    rgba = read_picture(path, _least(size))
+    small = shrunk(cv2, rgba, SHARPNESS_SIDE)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY)
+    seen = small[..., 3] > 127
+    laplacian = cv2.Laplacian(grey, cv2.CV_32F)[seen]
+    light = _light(grey)
+    descriptors, levels = _features(cv2, small, cv2.GaussianBlur(light, (0, 0), 2))
+    thumbnail = io.BytesIO()
+    over_grey = Image.new("RGBA", (small.shape[1], small.shape[0]), (210, 210, 210, 255))
+    over_grey.alpha_composite(Image.fromarray(small))
+    over_grey.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX)
+    over_grey.convert("RGB").save(thumbnail, "JPEG", quality=70)
+    return Look(
+        size=size,
+        sharpness=float(laplacian.var()) if len(laplacian) else 0.0,
+        exposure=float(light[seen].mean()) if seen.any() else 0.0,
+        descriptors=descriptors,
+        levels=levels,
+        thumbnail=thumbnail.getvalue(),
+    )
+
+
+def _least(size: tuple[int, int]) -> tuple[int, int]:
+    scale = min(1.0, SHARPNESS_SIDE / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
+def _light(grey: np.ndarray) -> np.ndarray:
+    """Log2 of the luminance of grey levels (sRGB, uint8); float32, 0 for white."""
+    return (2.2 * np.log2((grey.astype(np.float32) + 1) / 256)).astype(np.float32)
+
+
+def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Descriptors [n, 128] of a picture, and its `light` [height, width] around each [n]."""
+    small = shrunk(cv2, rgba, FEATURE_SIDE)
+    sift = cv2.SIFT.create(nfeatures=N_FEATURES, contrastThreshold=0.02)
+    mask = np.where(small[..., 3] > 127, np.uint8(255), np.uint8(0))
+    points, found = sift.detectAndCompute(cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY), mask)
+    if found is None:
+        return np.zeros((0, 128), np.float32), np.zeros(0, np.float32)
+    scale = len(light) / len(small)
+    columns, rows = np.array([point.pt for point in points]).T * scale
+    levels = light[rows.astype(int).clip(0, len(light) - 1), columns.astype(int).clip(0, light.shape[1] - 1)]
+    return np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6)), levels
+
+
+def look_at(
+    paths: Sequence[Path], seconds: float, progress: Progress | None = None, most: int | None = None
+) -> list[Look | str | None]:
+    """Look at pictures for about so many `seconds`, and at no more than `most`.
+
+    Pairs of neighbours are taken in an order that spreads them over all pictures, so that what is seen in the
+    time is a sample of everything. Returns for each picture what was seen, why it cannot be read, or None
+    where the time was over.
+    """
+    end = time.monotonic() + seconds
+    pairs = sorted(range((len(paths) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
+    order = [i for pair in pairs for i in (2 * pair, 2 * pair + 1) if i < len(paths)][:most]
+
+    def looked(number: int) -> tuple[int, Look | str | None]:
+        if time.monotonic() > end:
+            return number, None
+        try:
+            return number, look(paths[number])
+        except VfrError as error:
+            return number, str(error)
+
+    seen: list[Look | str | None] = [None] * len(paths)
+    for done, (number, found) in enumerate(one_by_one(looked, order, n_threads())):
+        seen[number] = found
+        if progress is not None:
+            progress(done + 1, len(order))
+    return seen
+
+
+def compare(looks: Sequence[Look | None], seconds: float) -> dict[tuple[int, int], Shared]:
+    """What pairs (i, j), i < j, of pictures share: neighbours in their order, and then, for about so many
+    `seconds`, each of a sample with each other. Pairs that were not compared are missing."""
+    end = time.monotonic() + seconds
+    there = [i for i, seen in enumerate(looks) if seen is not None]
+    pairs = [(i, i + 1) for i in there if i + 1 < len(looks) and looks[i + 1] is not None]
+    step = max(1, -(-len(there) // MOST_COMPARED))
+    sample = there[::step]
+    others = [(i, j) for n, i in enumerate(sample) for j in sample[n + 1 :] if j != i + 1]
+    others.sort(key=lambda pair: (pair[0] * GOLDEN + pair[1] * GOLDEN**2) % 1)
+    shared = {}
+    for n, (i, j) in enumerate([*pairs, *others]):
+        if n >= len(pairs) and time.monotonic() > end:
+            break
+        a, b = looks[i], looks[j]
+        assert a is not None and b is not None
+        matches = match(a.descriptors, b.descriptors)
+        n_shared = len(matches)
+        change = float(np.median(b.levels[matches[:, 1]] - a.levels[matches[:, 0]])) if n_shared else 0.0
+        shared[i, j] = Shared(n_shared, change)
+    return shared
