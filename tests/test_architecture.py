@@ -31,7 +31,18 @@ LAZY = {
     "exporters": {
         *("onnx", "onnxruntime", "skimage", "scipy", "numba", "PIL", "OpenEXR", "open3d", "pxr", "xatlas"),
     },
-    "vfr_bake": {"onnx", "onnxruntime", "skimage", "tyro", "tqdm", "cv2", "scipy", "triton", "pycolmap"},
+    "vfr_bake": {
+        "onnx",
+        "onnxruntime",
+        "skimage",
+        "tyro",
+        "tqdm",
+        "cv2",
+        "scipy",
+        "triton",
+        "pycolmap",
+        "pillow_heif",
+    },
 }
 # Modules that are nothing without it; whoever imports them does so inside a function.
 TOP_LEVEL_EXCEPTIONS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,20 +69,21 @@ MAX_FILE_BYTES = 1 << 30
 
 
 @contextmanager
-def open_picture(path: Path) -> Iterator[Image.Image]:
+def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Image.Image]:
     """A picture file, opened by Pillow, as a context manager.
 
-    Raises FormatError: no such file, not a regular one, too large, or no picture that can be read to its
-    end, there or in the block.
+    `formats`: Pillow's names of those that it may have. Raises FormatError: no such file, not a regular one,
+    too large, or no picture that can be read to its end, there or in the block.
     """
     from PIL import Image, UnidentifiedImageError
 
     with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         try:
-            with Image.open(file, formats=FORMATS) as picture:
+            with Image.open(file, formats=formats) as picture:
                 yield picture
         except UnidentifiedImageError:
-            raise FormatError(f"{path}: picture: expected a PNG or JPEG file, got something else") from None
+            expected = " or ".join(filter(None, (", ".join(formats[:-1]), formats[-1])))
+            raise FormatError(f"{path}: picture: expected {expected}, got something else") from None
         except (
             *(OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError),
             MemoryError,  # a chunk may say that it has gigabytes, for which Pillow asks at once

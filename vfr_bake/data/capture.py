@@ -118,6 +118,8 @@ class Capture:
     """Views that training never sees; none when there are too few to spare one."""
     points: np.ndarray | None = None
     """[n_points, 3] points of the scene, world frame, where the data set knows some."""
+    masked: bool = False
+    """Whether pixels that are not opaque are masked: they say nothing, and not that nothing is there."""
 
 
 def held_out(views: PosedImages) -> tuple[PosedImages, PosedImages]:

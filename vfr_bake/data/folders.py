@@ -4,15 +4,23 @@ instant-ngp and nerfstudio, or a COLMAP model, `sparse/0/cameras.bin`, `images.b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from player.cameras.camera import Camera
 from player.cameras.colmap import colmap_folder, read_cameras, read_images, read_points
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
-from vfr_bake.data.capture import Capture, held_out
-from vfr_bake.data.files.pictures import SUFFIXES, DescribedView, picture_size, read_pictures
+from player.files.json_files import brief
+from vfr_bake.data.capture import Capture, PosedImages, held_out
+from vfr_bake.data.files.estimate_record import read_record
+from vfr_bake.data.files.masks import check_masked, mask_of
+from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.files.orientation import Layout, is_taken_upright, read_layout
+from vfr_bake.data.files.pictures import DescribedView, read_pictures
 from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -60,7 +68,21 @@ def load_transforms_folder(
     train, test = (
         (views.some(range(n_train)), views.some(range(n_train, n_views))) if has_test else held_out(views)
     )
-    return Capture(folder.resolve().name or "scene", train, test)
+    return _capture(folder, described, train, test)
+
+
+def _capture(
+    folder: Path,
+    described: Sequence[DescribedView],
+    train: PosedImages,
+    test: PosedImages,
+    points: np.ndarray | None = None,
+) -> Capture:
+    masked = any(view.mask is not None for view in described)
+    name = folder.resolve().name or "scene"
+    if masked:
+        check_masked(name, train.images)
+    return Capture(name, train, test, points, masked)
 
 
 def has_transforms(folder: Path) -> bool:
@@ -73,9 +95,43 @@ def _described_views(path: Path) -> list[DescribedView]:
     document = load_transforms(path)
     frames: list[dict[str, Any]] = document["frames"]
     paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
-    cameras = transforms_cameras(document, path, [picture_size(picture) for picture in paths])
+    layouts = [_layout(picture) for picture in paths]
+    upright = [
+        is_taken_upright(layout, _given_size(document, path, index)) for index, layout in enumerate(layouts)
+    ]
+    sizes = [layout.upright_size if up else layout.size for layout, up in zip(layouts, upright, strict=True)]
+    cameras = transforms_cameras(document, path, sizes)
     distortions = [_distortion(document, path, index) for index in range(len(frames))]
-    return [DescribedView(*view) for view in zip(paths, cameras, distortions, strict=True)]
+    masks = [_mask(path, index, frames[index], picture) for index, picture in enumerate(paths)]
+    return [DescribedView(*view) for view in zip(paths, cameras, distortions, upright, masks, strict=True)]
+
+
+def _layout(picture: Path) -> Layout:
+    try:
+        return read_layout(picture)
+    except FormatError as error:
+        raise DataError(str(error)) from error
+
+
+def _given_size(document: dict[str, Any], path: Path, index: int) -> tuple[float, float] | None:
+    """Width and height that a frame, or all of them, are said to have; None where that is not said."""
+    frame = document["frames"][index]
+    where = f"{path}: frame {index} ({frame['file_path']})"
+    width, height = (transforms_number(document, frame, key, where) for key in ("w", "h"))
+    return (width, height) if width is not None and height is not None else None
+
+
+def _mask(path: Path, index: int, frame: dict[str, Any], picture: Path) -> Path | None:
+    """The mask of a frame: the one that it names (nerfstudio's `mask_path`), or the one in `masks/`."""
+    root = path.parent
+    named = frame.get("mask_path")
+    if named is not None:
+        if not isinstance(named, str) or not _is_file(root / named):
+            where = f"{path}: frame {index} ({frame['file_path']})"
+            raise DataError(f"{where}: mask_path: expected a picture, got {brief(named)}")
+        return root / named
+    inside = picture.relative_to(root).as_posix() if picture.is_relative_to(root) else picture.name
+    return mask_of(root, inside)
 
 
 def _distortion(document: dict[str, Any], path: Path, index: int) -> dict[str, float]:
@@ -109,8 +165,9 @@ def load_colmap_folder(
 ) -> Capture:
     """The pictures of `folder` that its COLMAP model has registered, in the order of their names.
 
-    Pictures are looked for in `images/` and in the folder itself; every eighth is held out. Raises DataError
-    (pictures, camera models) or FormatError (the model's files), in one line that names the file.
+    Pictures are looked for in `images/` and in the folder itself; every eighth is held out. They are taken as
+    stored, unless the model was estimated here, from upright ones, or its cameras fit no others. Raises
+    DataError (pictures, camera models) or FormatError (the model's files), in one line that names the file.
     """
     model = colmap_folder(folder)
     assert model is not None
@@ -120,6 +177,7 @@ def load_colmap_folder(
         raise DataError(f"{model}: registered pictures: expected at least 2, got {len(registered)}")
     points_file = model / "points3D.bin"
     points = read_points(points_file) if points_file.exists() else None
+    upright = read_record(model).upright
     described = []
     for image in registered:
         if image.camera_id not in lenses:
@@ -127,9 +185,18 @@ def load_colmap_folder(
         lens = lenses[image.camera_id]
         size = (lens.width, lens.height)
         camera = Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy)
-        described.append(DescribedView(_colmap_picture(folder, image.name), camera, lens.distortion))
-    train, test = held_out((reader or PictureReader()).read(described, progress))
-    return Capture(folder.resolve().name or "scene", train, test, points)
+        picture = _colmap_picture(folder, image.name)
+        described.append(
+            DescribedView(
+                picture,
+                camera,
+                lens.distortion,
+                upright or is_taken_upright(_layout(picture), size),
+                mask_of(folder, image.name),
+            )
+        )
+    train, test = held_out(read_pictures(described, progress))
+    return _capture(folder, described, train, test, points)
 
 
 def _colmap_picture(folder: Path, name: str) -> Path:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import struct
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba.misc.appdirs import AppDirs
-from PIL import Image
 
 from player.cameras.colmap import MAX_FILE_BYTES
+from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError
 from player.files.files import new_folder, read_bytes
-from player.files.images import open_picture
-from vfr_bake.data import threads
-from vfr_bake.data.features import Features, find_features, pairs_to_match
+from vfr_bake.data.features import Features, pairs_to_match
 from vfr_bake.data.files import video
-from vfr_bake.data.files.pictures import read_picture
+from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
+from vfr_bake.data.files.listing import find_pictures, other_kinds
+from vfr_bake.data.files.looks import Look, look_at
+from vfr_bake.data.files.masks import mask_of
+from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
 from vfr_bake.data.kept_matches import SIDE, KeptMatches, Look, stamp
 from vfr_bake.data.mapping import (
@@ -31,8 +33,8 @@ from vfr_bake.data.mapping import (
     pycolmap_module,
     write_database,
 )
+from vfr_bake.data.world import find_up, turn_to_z
 
-SUFFIXES = (".jpg", ".jpeg", ".png")
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 MIN_PICTURES = 3
@@ -43,8 +45,6 @@ MIN_REGISTERED = 8
 """If there are fewer pictures, all must be registered: a handful can agree on a wrong model."""
 MIN_FEATURES = 50
 """Fewer than these, and a picture is blank, out of focus, or all blur."""
-SAME = 1.5
-"""Grey levels of 255, mean difference of thumbnails: what a camera's noise is below on a tripod."""
 
 ADVICE = (
     "photograph with more overlap (a step of some 10 degrees from one picture to the next), move around the "
@@ -72,15 +72,26 @@ class PoseReport:
     unplaced: Mapping[str, str] = field(default_factory=dict)
     """Why a picture found no place, by its name; empty where the cameras were there already."""
 
+    repeated: dict[str, str] = field(default_factory=dict)
+    """Pictures that were left out because another shows the same, and which."""
+
     def summary(self) -> str:
         """One sentence for whoever took the pictures.
 
         >>> PoseReport(Path("garden"), 50, 48, 0.61, 7.25).summary()
         'garden: cameras of 48 of 50 pictures, off by 0.61 pixels, a point is seen in 7.2 pictures'
         """
+        left_out = ""
+        if self.repeated:
+            n, (name, kept) = len(self.repeated), next(iter(self.repeated.items()))
+            others = f"{name} and {n - 1} more show" if n > 1 else f"{name} shows"
+            left_out = (
+                f"; {others} what another picture ({kept}) does, and {'are' if n > 1 else 'is'} left out"
+            )
         return (
             f"{self.folder}: cameras of {self.n_registered} of {self.n_pictures} pictures, "
             f"off by {self.mean_error:.2f} pixels, a point is seen in {self.mean_track_length:.1f} pictures"
+            f"{left_out}"
         )
 
 
@@ -94,24 +105,26 @@ def is_video(path: Path) -> bool:
 
 
 def has_pictures(folder: Path) -> bool:
-    """Whether `estimate_cameras` finds pictures in `folder` itself or in its `images/`."""
-    return bool(list_pictures(folder))
+    """Whether `estimate_cameras` finds pictures in `folder`."""
+    return bool(find_pictures(folder)[1])
 
 
 def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     """Estimate the camera of every picture, and keep the result as `sparse/0` beside the pictures.
 
-    `photos`: a folder with JPEG or PNG pictures in `images/` or in itself, or a video, whose frames are
-    first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and left as it
-    is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a video, then
-    `features`, `matches`, `cameras`; where those are folded also `walk`, `turns`, `cameras again`), how much
-    of it is done and how much there is.
+    `photos`: a folder with pictures in `images/` or in itself, or in folders within these, or a video, whose
+    frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and
+    left as it is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a
+    video, then `features`, `matches`, `cameras`; where those are folded also `walk`, `turns`, `cameras
+    again`), how much of it is done and how much there is.
 
-    Pictures of one size, and of one maker, model and focal length where EXIF tells, share one camera (model
-    RADIAL), which begins with EXIF's focal length. The model's unit and axes are arbitrary: pictures alone
-    do not tell them. A subject that looks the same from two sides is folded into one, as if walked around
-    half, where nothing but it is matched. Pictures of one walk, named in its order, are unfolded
-    (`vfr_bake.data.folds`); pictures in no order are not, unless their surroundings prevent it.
+    Pictures are turned upright as EXIF says. Those that show what another one shows are left out
+    (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
+    tells, share one camera (model RADIAL), which begins with EXIF's focal length. In the model the z axis is
+    up (`vfr_bake.data.world`); its unit is arbitrary: pictures alone do not tell it. A subject that looks the
+    same from two sides is folded into one, as if walked around half, where nothing but it is matched.
+    Pictures of one walk, named in its order, are unfolded (`vfr_bake.data.folds`); pictures in no order are
+    not, unless their surroundings prevent it.
 
     Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
     `sparse/0`), OutputError, MissingExtraError.
@@ -121,23 +134,24 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     if not photos.is_dir():
         found = "a file of another kind" if photos.exists() else "nothing"
         raise DataError(f"{photos}: expected a folder of pictures or a video, got {found}")
-    pictures = list_pictures(photos)
+    place, pictures = find_pictures(photos)
     model = photos / "sparse" / "0"
     if model.exists():
         return _read_report(model, photos, len(pictures))
     if len(pictures) < MIN_PICTURES:
         raise DataError(
             f"{photos}: pictures ({', '.join(SUFFIXES)}): expected at least {MIN_PICTURES}, "
-            f"got {len(pictures)}{_other_kinds(photos)}"
+            f"got {len(pictures)}{other_kinds(photos)}"
         )
     pycolmap_module()  # said at once if it is missing, not after minutes
-    kept = KeptMatches.of(photos, cache_root())
-    stamps = [stamp(path) for path in pictures]
-    sensors, features = _look_at(pictures, photos, kept, stamps, lambda *n: progress("features", *n))
-
-    def known(i: int, j: int) -> np.ndarray | None:
-        return kept.matches(stamps[i], stamps[j], len(features[i].points), len(features[j].points))
-
+    names = [path.relative_to(place).as_posix() for path in pictures]
+    masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
+    looks = look_at(masked, lambda done, of: progress("features", done, of))
+    repeated = _repeated(photos, looks)
+    kept = [number for number in range(len(names)) if number not in repeated]
+    record = EstimateRecord(True, {names[number]: names[other] for number, other in repeated.items()})
+    names, looks = [names[number] for number in kept], [looks[number] for number in kept]
+    sensors, features = [look.sensor for look in looks], [look.features for look in looks]
     pairs = match_pictures(
         sensors,
         features,
@@ -146,85 +160,45 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
         known,
         lambda i, j, matches: kept.keep_matches(stamps[i], stamps[j], matches),
     )
-    models = _placed(pictures, sensors, features, pairs, progress)
-    n_registered = models[0].num_reg_images() if models else 0
-    if n_registered < _n_needed(len(pictures)):
+    result = _placed(place, names, sensors, features, pairs, progress)
+    n_registered = result.num_reg_images() if result is not None else 0
+    if result is None or n_registered < _n_needed(len(names)):
         raise DataError(
-            f"{photos}: cameras: expected to find those of at least {_n_needed(len(pictures))} of "
-            f"{len(pictures)} pictures, got {n_registered}{_in_groups(models)}: {ADVICE}"
+            f"{photos}: cameras: expected to find those of at least {_n_needed(len(names))} of "
+            f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}{ADVICE}"
         )
+    _turn_upright(result)
     with new_folder(model) as new:
-        models[0].write_binary(str(new))
-    kept.remove()
-    reasons = why_unplaced([path.name for path in pictures], features, pairs, models)
-    return replace(_read_report(model, photos, len(pictures)), unplaced=reasons)
+        result.write_binary(str(new))
+        write_record(new, record)
+    return _read_report(model, photos, len(pictures))
 
 
-def cache_root() -> Path:
-    """The user's folder of what is kept of sets of pictures whose cameras are not known yet."""
-    return Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir) / "matches"
-
-
-def _in_groups(models: Sequence[Any]) -> str:
-    """How the pictures fall apart, where they do.
-
-    >>> _in_groups([])
-    ''
-    """
-    sizes = [str(model.num_reg_images()) for model in models]
-    if len(sizes) < 2:
-        return ""
-    return f" (they fall into groups of {', '.join(sizes)} that have nothing in common: two places?)"
-
-
-def why_unplaced(
-    names: Sequence[str], features: Sequence[Features], pairs: Sequence[Pair], models: Sequence[Any]
-) -> dict[str, str]:
-    """Why pictures are not in the first of the `models`, by their names."""
-    placed = _names_in(models[0])
-    partners: dict[str, set[str]] = {name: set() for name in names}
-    for pair in pairs:
-        partners[names[pair.i]].add(names[pair.j])
-        partners[names[pair.j]].add(names[pair.i])
-    reasons = {}
-    for name, found in zip(names, features, strict=True):
-        others = [len(group) for group in map(_names_in, models[1:]) if name in group]
-        if name in placed:
-            continue
-        if len(found.points) < MIN_FEATURES:
-            reasons[name] = f"blank, blurred or out of focus: {len(found.points)} features"
-        elif not partners[name]:
-            reasons[name] = "nothing in common with any other picture"
-        elif others:
-            reasons[name] = f"in a group of {others[0]} with too little in common with the others"
-        elif partners[name] & placed:
-            reasons[name] = f"too little in common with {min(partners[name] & placed)}"
-        else:
-            reasons[name] = f"something in common with {min(partners[name])} alone, which has no place either"
-    return reasons
-
-
-def _names_in(model: Any) -> set[str]:
-    return {image.name for image in model.images.values() if image.has_pose}
+def _turn_upright(model: Any) -> None:
+    """Turn a `pycolmap.Reconstruction` of upright pictures so that its z axis is up."""
+    poses = [image.cam_from_world().inverse().matrix() for image in model.images.values() if image.has_pose]
+    c2w = np.concatenate([np.array(poses), np.tile([[[0.0, 0, 0, 1]]], (len(poses), 1, 1))], axis=1)
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    turn = turn_to_z(find_up(c2w @ OPENGL_FROM_OPENCV, points))
+    model.transform(pycolmap_module().Sim3d(1.0, pycolmap_module().Rotation3d(turn), np.zeros(3)))
 
 
 def _placed(
-    pictures: Sequence[Path],
+    place: Path,
+    names: Sequence[str],
     sensors: Sequence[Sensor],
     features: Sequence[Features],
     pairs: Sequence[Pair],
     progress: Progress,
-) -> list[Any]:
-    """The `pycolmap.Reconstruction`s of the pictures, the largest first; if that is folded, others."""
-    names = [path.name for path in pictures]
+) -> Any:
+    """The `pycolmap.Reconstruction` of the pictures in the folder `place`, or None; if that is folded, one
+    that is not."""
 
-    def place(some: Sequence[Pair], stage: str) -> list[Any]:
+    def built(some: Sequence[Pair], stage: str) -> Any:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
-            return map_pictures(
-                database, pictures[0].parent, Path(name), len(names), lambda *n: progress(stage, *n)
-            )
+            return map_pictures(database, place, Path(name), len(names), lambda *n: progress(stage, *n))
 
     def n_torn(models: list[Any]) -> int:
         return len(torn_neighbours(models[0], names, pairs))
@@ -232,102 +206,59 @@ def _placed(
     def enough(models: list[Any]) -> bool:
         return bool(models) and models[0].num_reg_images() >= _n_needed(len(names))
 
-    models = place(pairs, "cameras")
-    if not models or not n_torn(models):
-        return models
-    walk = place(near_pairs(pairs), "walk")
-    if not enough(walk) or n_torn(walk) >= n_torn(models):
-        return models  # no walk
-    agreeing = agreeing_pairs(walk[0], names, features, pairs, lambda *n: progress("turns", *n))
-    closed = place(agreeing, "cameras again")
+    model = built(pairs, "cameras")
+    if model is None or not n_torn(model):
+        return model
+    walk = built(near_pairs(pairs), "walk")
+    if not enough(walk) or n_torn(walk) >= n_torn(model):
+        return model  # no walk
+    agreeing = agreeing_pairs(walk, names, features, pairs, lambda *n: progress("turns", *n))
+    closed = built(agreeing, "cameras again")
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
 
-def list_pictures(folder: Path) -> list[Path]:
-    """The pictures in `images/`, or else in the folder itself, in the order of their names."""
-    for place in (folder / "images", folder):
-        if place.is_dir():
-            # Names that begin with a dot are what systems leave behind (`._a.jpg` is no picture).
-            found = [
-                path
-                for path in place.iterdir()
-                if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()
-            ]
-            if found:
-                return sorted(found)
-    return []
+def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
+    """A clause on pictures that fall into several groups which have nothing in common; empty for one."""
+    groups = {number: {number} for number in range(len(names))}
+    for pair in pairs:
+        if groups[pair.i] is not groups[pair.j]:
+            groups[pair.i] |= groups[pair.j]
+            groups |= dict.fromkeys(groups[pair.j], groups[pair.i])
+    distinct = {id(group): group for group in groups.values() if len(group) >= MIN_PICTURES}
+    large = sorted(distinct.values(), key=lambda group: (-len(group), min(group)))
+    if len(large) < 2:
+        return ""
+    named = " and ".join(f"{len(group)} ({names[min(group)]} to {names[max(group)]})" for group in large[:3])
+    return (
+        f"they show {len(large)} places that have nothing in common, in {named} pictures: name a folder of "
+        "one place, or add pictures that lead from one to the other: "
+    )
 
 
-def _other_kinds(folder: Path) -> str:
-    kinds = {
-        path.suffix.lower()
-        for place in (folder, folder / "images")
-        if place.is_dir()
-        for path in place.iterdir()
-        if path.suffix.lower()
-        in (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".dng", ".bmp", ".gif")
-    }
-    return f"; there are {', '.join(sorted(kinds))} files: save them as JPEG" if kinds else ""
-
-
-def _look_at(
-    pictures: Sequence[Path],
-    photos: Path,
-    kept: KeptMatches,
-    stamps: Sequence[bytes],
-    progress: threads.Progress,
-) -> tuple[list[Sensor], list[Features]]:
-    """Sensor and features of every picture; raises DataError where they cannot be enough."""
-
-    def look(number: int) -> tuple[Sensor, Look]:
-        path = pictures[number]
-        found = kept.look(stamps[number])
-        if found is None:
-            rgba = read_picture(path)
-            grey = Image.fromarray(rgba).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
-            found = Look(rgba.shape[1], rgba.shape[0], find_features(rgba), np.asarray(grey))
-            kept.keep_look(stamps[number], found)
-        return _sensor(path, found.width, found.height), found
-
-    looked = threads.in_threads(look, range(len(pictures)), progress)
-    sensors, looks = (list(column) for column in zip(*looked, strict=True))
-    features = [found.features for found in looks]
-    thumbnails = [found.thumbnail.astype(np.float64) for found in looks]
-    n_good = sum(len(found.points) >= MIN_FEATURES for found in features)
-    if n_good < _n_needed(len(pictures)):
+def _repeated(photos: Path, looks: Sequence[Look]) -> dict[int, int]:
+    """The pictures that are left out, and which are kept instead; raises DataError where too few would be
+    left, or too few show anything."""
+    n_good = sum(len(look.features.points) >= MIN_FEATURES for look in looks)
+    if n_good < _n_needed(len(looks)):
         raise DataError(
             f"{photos}: pictures with something to recognise (at least {MIN_FEATURES} features): expected at "
-            f"least {_n_needed(len(pictures))} of {len(pictures)}, got {n_good}: the rest are blank, out of "
+            f"least {_n_needed(len(looks))} of {len(looks)}, got {n_good}: the rest are blank, out of "
             f"focus or blurred: {ADVICE}"
         )
-    if all(np.abs(thumbnail - thumbnails[0]).mean() < SAME for thumbnail in thumbnails):
+    repeated = repeats(
+        [look.features for look in looks],
+        [(look.sensor.width, look.sensor.height) for look in looks],
+        np.stack([look.thumbnail for look in looks]),
+        [look.sharpness for look in looks],
+    )
+    n_left = len(looks) - len(repeated)
+    if n_left < MIN_PICTURES:
         raise DataError(
-            f"{photos}: expected pictures from different places, got {len(pictures)} times the same: {ADVICE}"
+            f"{photos}: expected pictures from different places, got {len(looks)} times the same"
+            + (f" but for {n_left - 1}" if n_left > 1 else "")
+            + f": {ADVICE}"
         )
-    return sensors, features
-
-
-def _sensor(path: Path, width: int, height: int) -> Sensor:
-    try:
-        with open_picture(path) as file:
-            exif = file.getexif()
-            details = exif.get_ifd(0x8769)
-    except FormatError:  # damaged EXIF is as good as none
-        return Sensor(width, height, (), None)
-    # Maker, model; focal length, and the same as it would be on 35 mm film.
-    device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
-    film = _positive(details.get(0xA405))
-    # The standard (CIPA DC-008, 4.6.5) compares by diagonals; that of film is 43.27 mm.
-    focal = film / 43.27 * float(np.hypot(width, height)) if film else None
-    return Sensor(width, height, device, focal)
-
-
-def _positive(value: object) -> float | None:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if 0 < number < 1e4 else None
+    return repeated
 
 
 def _n_needed(n_pictures: int) -> int:
@@ -360,6 +291,12 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
         at = -1
     if at != len(points):
         raise FormatError(f"{model}: cut short: remove {model} to estimate the cameras anew")
+    repeated = read_record(model).repeated
     return PoseReport(
-        folder, n_pictures, n_registered, error_sum / max(n_points, 1), n_seen / max(n_points, 1)
+        folder,
+        n_pictures - len(repeated),
+        n_registered,
+        error_sum / max(n_points, 1),
+        n_seen / max(n_points, 1),
+        repeated,
     )

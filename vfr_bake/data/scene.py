@@ -43,13 +43,15 @@ class Scene:
     test: PosedImages
     """Views that training never sees; none when there are too few to spare one."""
     has_alpha: bool
-    """Whether any training picture has a pixel that is not opaque."""
+    """Whether any training picture has a pixel that is not opaque and not masked either."""
     world_from_model: np.ndarray
     """[4, 4] float64: uniform scale and translation."""
     unbounded: bool = False
     """Whether the pictures show surroundings without end, or an object in a box."""
     near: float = 0.0
     """Unbounded: how near to a camera matter may begin, model units."""
+    masked: bool = False
+    """Whether pixels that are not opaque are masked: they are neither drawn nor scored."""
 
 
 def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) -> Scene:
@@ -65,9 +67,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     """
     train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
     _check_cameras(capture.name, train.cameras)
-    has_alpha = not all(train.opaque(number) for number in range(len(train.cameras)))
-    some = _spread(train)
-    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(some.images))
+    has_alpha = not capture.masked and any(bool((image[..., 3] < 255).any()) for image in train.images)
+    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(train.images))
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:
@@ -83,7 +84,12 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     def moved(views: PosedImages) -> PosedImages:
         return PosedImages([camera.transformed(model_from_world) for camera in views.cameras], views.images)
 
-    return Scene(capture.name, moved(train), moved(test), has_alpha, world_from_model, unbounded, near)
+    # Nothing is empty in front of surroundings without end: what is transparent there has been masked.
+    masked = capture.masked or (unbounded and has_alpha)
+    has_alpha = has_alpha and not masked
+    return Scene(
+        capture.name, moved(train), moved(test), has_alpha, world_from_model, unbounded, near, masked
+    )
 
 
 def _check_cameras(name: str, cameras: list[Camera]) -> None:

@@ -67,7 +67,7 @@ def data(small_data: Path, tmp_path: Path) -> Path:
         (huge, "size: expected at most 1073741824 bytes for a picture"),
         (large, "picture: cannot be read to its end: Image size"),
         (large_16_bit, "picture: cannot be read to its end: Image size"),
-        (postscript, "picture: expected a PNG or JPEG file, got something else"),
+        (postscript, "picture: expected JPEG, PNG, AVIF, WEBP, TIFF or BMP, got something else"),
     ],
 )
 def test_pictures(make: Callable[[Path], None], message: str, data: Path) -> None:

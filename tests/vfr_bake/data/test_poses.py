@@ -17,6 +17,7 @@ from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import mapping, poses
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
 from vfr_bake.data.files import video
+from vfr_bake.data.files.looks import sensor_of
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
 
 N_CAN = 10
@@ -170,7 +171,8 @@ def test_a_model_that_cannot_be_finished_leaves_none(can, tmp_path: Path, monkey
             Path(folder, "cameras.bin").write_bytes(b"x")
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(poses, "map_pictures", lambda *_: [HalfWritten()])
+    monkeypatch.setattr(poses, "map_pictures", lambda *_: HalfWritten())
+    monkeypatch.setattr(poses, "_turn_upright", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
         estimate_cameras(tmp_path, quiet)
     assert not list((tmp_path / "sparse").iterdir())
@@ -242,9 +244,9 @@ def test_too_few_pictures(tmp_path: Path):
 
 
 def test_pictures_of_another_kind_are_named(tmp_path: Path):
-    (tmp_path / "a.HEIC").write_bytes(b"")
+    (tmp_path / "a.DNG").write_bytes(b"")
     (tmp_path / "._a.jpg").write_bytes(b"")
-    assert message(tmp_path).endswith("got 0; there are .heic files: save them as JPEG")
+    assert message(tmp_path).endswith("got 0; there are .dng files: save them as JPEG")
     assert not has_pictures(tmp_path)
 
 
@@ -341,7 +343,7 @@ def test_one_camera_for_one_device_and_its_focal_length(tmp_path: Path):
     exif[0x8769] = {0xA405: 26}  # Pillow before 11.3 does not write what get_ifd was given
     for name, tags in (("a", exif), ("b", exif), ("c", Image.Exif())):
         Image.fromarray(textured(0, 400, 300)).save(tmp_path / f"{name}.jpg", exif=tags)
-    a, b, c = (poses._sensor(tmp_path / f"{name}.jpg", 400, 300) for name in "abc")
+    a, b, c = (sensor_of(tmp_path / f"{name}.jpg", 400, 300) for name in "abc")
     assert a == b != c and c.focal is None
     assert a.focal == pytest.approx(26 / 43.27 * 500)
     assert mapping.colmap_camera(a).has_prior_focal_length
@@ -390,7 +392,7 @@ def test_a_short_video_gives_all_its_frames(short_video: Path):
 
 
 def test_a_video_becomes_a_folder_of_pictures(short_video: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(poses, "_look_at", lambda pictures, *_: pytest.fail(f"{len(pictures)} pictures"))
+    monkeypatch.setattr(poses, "look_at", lambda pictures, *_: pytest.fail(f"{len(pictures)} pictures"))
     assert is_video(short_video)
     with pytest.raises(pytest.fail.Exception, match="12 pictures"):
         estimate_cameras(short_video, quiet)

@@ -1,4 +1,4 @@
-"""Picture files: read whole, lens distortion undone, made smaller."""
+"""Picture files: read whole, turned, masked, lens distortion undone, made smaller."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from PIL import Image
 from player.cameras.camera import Camera
 from player.errors import DataError, FormatError, MissingExtraError
 from player.files.files import open_file, read_bytes
-from player.files.images import MAX_FILE_BYTES, open_picture
+from player.files.images import MAX_FILE_BYTES
 from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.files.masks import apply_mask
+from vfr_bake.data.files.opening import open_photograph
+from vfr_bake.data.files.orientation import as_stored, layout_of, turned_upright
+from vfr_bake.data.threads import Progress, in_threads
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SHARPNESS_SIDE = 960
+"""Pixels of the longer side that sharpness is measured at: what is blurred by less teaches nothing more."""
 
 
 class DescribedView(NamedTuple):
@@ -26,6 +31,28 @@ class DescribedView(NamedTuple):
     """Scaled to the picture where it speaks of another size."""
     distortion: dict[str, float]
     """Keyword arguments of `undistort`."""
+    upright: bool = False
+    """Whether the camera belongs to the picture turned upright, and not to the pixels as stored."""
+    mask: Path | None = None
+    """A picture that is black where this one is masked."""
+
+
+def read_pictures(described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
+    """Read pictures, each with the pinhole camera that would have taken it. Raises DataError."""
+    results = in_threads(read_view, described, progress)
+    return PosedImages([camera for camera, _ in results], [image for _, image in results])
+
+
+def read_view(view: DescribedView) -> tuple[Camera, np.ndarray]:
+    """One picture [height, width, 4] uint8, transparent where it is masked, and the pinhole camera that would
+    have taken it. Raises DataError."""
+    image = read_picture(view.path, view.upright)
+    if view.mask is not None:
+        image = apply_mask(image, view.path, view.mask, view.upright)
+    camera = view.camera.resized(image.shape[1], image.shape[0])
+    if any(view.distortion.values()):
+        image = undistort(image, camera, **view.distortion)
+    return camera, image
 
 
 def reduced(views: PosedImages, factor: int) -> PosedImages:
@@ -70,33 +97,35 @@ def straight(weighted: np.ndarray) -> np.ndarray:
     return (weighted + 0.5).clip(0, 255).astype(np.uint8)
 
 
-def read_picture(path: Path, least: tuple[int, int] | None = None) -> np.ndarray:
+def read_picture(path: Path, upright: bool = False) -> np.ndarray:
     """A picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures too.
 
-    `least`: width and height that are enough. A JPEG file that is twice, four or eight times as large is then
-    decoded at a half, a quarter or an eighth of its size, rounded up, in a fraction of the time.
+    `upright`: turned as EXIF says that it is to be looked at, not as stored.
 
     Raises DataError for what Pillow cannot read to its end, and for floating-point pictures.
     """
     try:
-        if _is_16_bit_colour(path):
-            return _read_16_bit_colour(path)
-        with open_picture(path) as file:
-            if least is not None:
-                turned = (file.width > file.height) != (least[0] > least[1])
-                file.draft(None, (least[1], least[0]) if turned else least)
-            file.load()
-            if file.mode == "I" or file.mode.startswith("I;16"):
-                # Pillow's own conversion clips 16-bit greys at 255.
-                grey = np.asarray(file.convert("I"), np.int64).clip(0, 65535)
-                rgba = np.full((*grey.shape, 4), 255, np.uint8)
-                rgba[..., :3] = ((grey * 255 + 32767) // 65535)[..., None]
-                return rgba
-            if file.mode == "F":
-                raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
-            return np.asarray(file.convert("RGBA"))
+        with open_photograph(path) as file:  # so that one of 16 bits is no larger than one of 8 may be, too
+            layout = layout_of(file)
+            rgba = _read_16_bit_colour(path) if _is_16_bit_colour(path) else _decoded(path, file)
     except FormatError as error:
         raise DataError(str(error)) from error
+    if layout.turned == upright:
+        return rgba
+    return turned_upright(rgba, layout.number) if upright else as_stored(rgba, layout.number)
+
+
+def _decoded(path: Path, file: Image.Image) -> np.ndarray:
+    file.load()
+    if file.mode == "I" or file.mode.startswith("I;16"):
+        # Pillow's own conversion clips 16-bit greys at 255.
+        grey = np.asarray(file.convert("I"), np.int64).clip(0, 65535)
+        rgba = np.full((*grey.shape, 4), 255, np.uint8)
+        rgba[..., :3] = ((grey * 255 + 32767) // 65535)[..., None]
+        return rgba
+    if file.mode == "F":
+        raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
+    return np.asarray(file.convert("RGBA"))
 
 
 def _is_16_bit_colour(path: Path) -> bool:
@@ -111,8 +140,7 @@ def _is_16_bit_colour(path: Path) -> bool:
 def _read_16_bit_colour(path: Path) -> np.ndarray:
     cv2 = opencv(f"{path}: 16-bit picture: expected OpenCV to read it", "train")
     data = read_bytes(path, "a picture", MAX_FILE_BYTES)
-    with open_picture(path):  # so that it is no larger than one of 8 bits may be
-        values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)  # as stored
     if values is None or values.dtype != np.uint16:
         raise DataError(f"{path}: picture: cannot be read to its end")
     values = ((values.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
@@ -134,6 +162,15 @@ def opencv(wanted: str, extra: str = "poses") -> Any:
     except ImportError as error:
         raise MissingExtraError(f"{wanted}: pip install 'vfr-bake[{extra}]'") from error
     return cv2
+
+
+def sharpness(cv2: Any, image: np.ndarray) -> float:
+    """Mean square of the second derivative of a picture [height, width, 3] uint8.
+
+    Blur of any direction lowers it. It compares pictures of one scene: a plain wall has none.
+    """
+    grey = shrunk(cv2, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), SHARPNESS_SIDE)
+    return float(np.square(cv2.Laplacian(grey, cv2.CV_32F)).mean())
 
 
 def shrunk(cv2: Any, image: np.ndarray, side: int, interpolation: int | None = None) -> np.ndarray:
@@ -177,13 +214,4 @@ def undistort(
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return straight(result)
-
-
-def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture file, which is not decoded. Raises DataError."""
-    try:
-        with open_picture(path) as file:
-            return file.size
-    except FormatError as error:
-        raise DataError(str(error)) from error
+    return _straight(result)

@@ -1,0 +1,48 @@
+"""What is kept beside the cameras that were estimated from pictures: which pixels they belong to, and which
+pictures were left out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from player.errors import FormatError
+from player.files.json_files import parse_json, read_json
+
+NAME = "pictures.json"
+
+
+@dataclass(frozen=True)
+class EstimateRecord:
+    """What an estimate says of its pictures."""
+
+    upright: bool
+    """Whether the cameras belong to pictures turned upright as EXIF says, and not to the pixels as stored."""
+    repeated: dict[str, str] = field(default_factory=dict)
+    """Pictures that were left out because another shows the same, and which."""
+
+
+def write_record(model: Path, record: EstimateRecord) -> None:
+    """Write the record into the folder of a COLMAP model."""
+    document = {"upright": record.upright, "repeated": record.repeated}
+    (model / NAME).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def read_record(model: Path) -> EstimateRecord:
+    """The record in the folder of a COLMAP model; pixels as stored where there is none, because the model was
+    made by another program. Raises FormatError.
+
+    >>> read_record(Path("surely/not/there")).upright
+    False
+    """
+    path = model / NAME
+    if not path.exists():
+        return EstimateRecord(upright=False)
+    document = parse_json(read_json(path, "what an estimate says of its pictures"), str(path))
+    if not isinstance(document, dict) or not isinstance(document.get("upright"), bool):
+        raise FormatError(f"{path}: upright: expected true or false: remove {model} to begin anew")
+    repeated = document.get("repeated", {})
+    if not isinstance(repeated, dict) or not all(isinstance(name, str) for name in repeated.values()):
+        raise FormatError(f"{path}: repeated: expected names of pictures: remove {model} to begin anew")
+    return EstimateRecord(document["upright"], repeated)

@@ -1,0 +1,76 @@
+"""What has to be known of each photograph before its camera is looked for."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from player.errors import FormatError
+from vfr_bake.data import threads
+from vfr_bake.data.features import Features, find_features
+from vfr_bake.data.files.masks import apply_mask
+from vfr_bake.data.files.opening import open_photograph
+from vfr_bake.data.files.pictures import opencv, read_picture, sharpness
+from vfr_bake.data.mapping import Sensor
+
+THUMBNAIL = 32
+"""Pixels of either side of a thumbnail."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """One picture, turned upright and without what is masked."""
+
+    sensor: Sensor
+    features: Features
+    thumbnail: np.ndarray
+    """[n_pixels] float32 grey levels."""
+    sharpness: float
+
+
+def look_at(pictures: Sequence[tuple[Path, Path | None]], progress: threads.Progress | None) -> list[Look]:
+    """What is seen in each picture; `pictures`: each with its mask, where it has one. Raises DataError."""
+
+    def look(picture: tuple[Path, Path | None]) -> Look:
+        path, mask = picture
+        rgba = read_picture(path, upright=True)
+        if mask is not None:
+            rgba = apply_mask(rgba, path, mask, upright=True)
+        grey = Image.fromarray(rgba).convert("L").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+        return Look(
+            sensor_of(path, rgba.shape[1], rgba.shape[0]),
+            find_features(rgba),
+            np.asarray(grey, np.float32).reshape(-1),
+            sharpness(opencv(f"{path}: picture: expected OpenCV to look at it"), rgba[..., :3]),
+        )
+
+    return threads.in_threads(look, pictures, progress)
+
+
+def sensor_of(path: Path, width: int, height: int) -> Sensor:
+    """What took a picture, as EXIF has it; `width`, `height` of the picture upright."""
+    try:
+        with open_photograph(path) as file:
+            exif = file.getexif()
+            details = exif.get_ifd(0x8769)
+    except (FormatError, struct.error, KeyError, IndexError):  # damaged EXIF is as good as none
+        return Sensor(width, height, (), None)
+    # Maker, model; focal length, and the same as it would be on 35 mm film.
+    device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
+    film = _positive(details.get(0xA405))
+    # The standard (CIPA DC-008, 4.6.5) compares by diagonals; that of film is 43.27 mm.
+    focal = film / 43.27 * float(np.hypot(width, height)) if film else None
+    return Sensor(width, height, device, focal)
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < 1e4 else None

@@ -1,0 +1,69 @@
+"""Photographs are opened here, in the formats that cameras and phones write, and limits hold before they are
+decoded.
+
+Pillow reads the header of a file and says how large the picture is; one of more pixels than Pillow's own
+limit is refused before any of them is decoded. What a file is follows from its content and not from its name:
+phones share JPEG files called `.heic`, and the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+from player.errors import FormatError, MissingExtraError
+from player.files.files import open_file
+from player.files.images import MAX_FILE_BYTES, open_picture
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".avif", ".webp", ".tif", ".tiff")
+"""Names of photographs end in one of these, in small or capital letters."""
+FORMATS = ("JPEG", "PNG", "AVIF", "WEBP", "TIFF", "BMP")
+"""What a photograph that is not HEIC may be, whatever its name is, by Pillow's names."""
+HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")
+AVIF_BRANDS = (b"avif", b"avis")
+
+
+@contextmanager
+def open_photograph(path: Path) -> Iterator[Image.Image]:
+    """A photograph, opened by Pillow, as a context manager; its pixels are not decoded yet.
+
+    Raises FormatError as `open_picture` does, MissingExtraError for HEIC where nothing reads it.
+    """
+    heic = is_heic(path)
+    if heic:
+        _read_heic_from_now_on(path)
+    try:
+        with open_picture(path, ("HEIF",) if heic else FORMATS) as picture:
+            yield picture
+    except (FormatError, RuntimeError, EOFError) as error:
+        if not heic or isinstance(error.__cause__, Image.DecompressionBombError):
+            raise
+        raise FormatError(
+            f"{path}: HEIC picture: cannot be read to its end: it is cut short or damaged: copy it again, or "
+            "leave it out"
+        ) from error
+
+
+def is_heic(path: Path) -> bool:
+    """Whether the file begins as a HEIC picture does (ISO/IEC 23008-12, 10.2). Raises FormatError."""
+    with open_file(path, "a picture", MAX_FILE_BYTES) as file:
+        head = file.read(64)
+    if head[4:8] != b"ftyp":
+        return False
+    n_bytes = min(int.from_bytes(head[:4], "big"), len(head))
+    brands = [head[8:12], *(head[at : at + 4] for at in range(16, n_bytes, 4))]
+    return any(brand in HEIF_BRANDS for brand in brands) and not any(b in AVIF_BRANDS for b in brands)
+
+
+def _read_heic_from_now_on(path: Path) -> None:
+    """Have Pillow read HEIC files. Raises MissingExtraError."""
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{path}: HEIC picture: expected pillow-heif to read it: pip install 'vfr-bake[train]'"
+        ) from error
+    pillow_heif.register_heif_opener(thumbnails=False)
