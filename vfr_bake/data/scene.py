@@ -6,7 +6,6 @@ ball around what they look at, whatever the scene's unit; `world_from_model` und
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,8 +66,9 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     """
     train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
     _check_cameras(capture.name, train.cameras)
-    has_alpha = not capture.masked and any(bool((image[..., 3] < 255).any()) for image in train.images)
-    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(train.images))
+    has_alpha = not all(train.opaque(number) for number in range(len(train.cameras)))
+    some = _spread(train)
+    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(some))
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:
@@ -112,16 +112,22 @@ def _spread(views: PosedImages) -> PosedImages:
     )
 
 
-def _plain_border(images: Sequence[np.ndarray]) -> bool:
+def _plain_border(views: PosedImages) -> bool:
     """Whether the pictures' edges show nothing but one colour."""
     edges = [
-        strip.reshape(-1, 4)[:, :3]
-        for image in images
-        for strip in (image[:BORDER], image[-BORDER:], image[:, :BORDER], image[:, -BORDER:])
+        views.pixels(number, _border(camera.width, camera.height))[:, :3]
+        for number, camera in enumerate(views.cameras)
     ]
     pixels = np.concatenate(edges).astype(np.int16)
     off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
     return float((off <= PLAIN_LEVELS).mean()) >= PLAIN_SHARE
+
+
+def _border(width: int, height: int) -> np.ndarray:
+    """[n] the numbers of a picture's pixels along its four edges; those of its corners come twice."""
+    numbers = np.arange(width * height).reshape(height, width)
+    edges = (numbers[:BORDER], numbers[-BORDER:], numbers[:, :BORDER], numbers[:, -BORDER:])
+    return np.concatenate([edge.reshape(-1) for edge in edges])
 
 
 def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:

@@ -195,7 +195,7 @@ class PictureReader:
             opaque = bool((image[..., 3] == 255).all())
             if not opaque and n_channels == 3:
                 raise _TransparentError
-            return camera, opaque, in_order(image[..., :n_channels])
+            return camera, opaque, in_order(image, n_channels)
 
         cameras: list[Camera] = []
         transparent: set[int] = set()

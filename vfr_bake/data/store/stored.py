@@ -83,10 +83,12 @@ def _largest_quotient(a: int, b: int) -> int:
     return largest
 
 
-def in_order(image: np.ndarray) -> np.ndarray:
-    """The pixels [height * width, n_channels] of a picture [height, width, n_channels], place after place."""
-    height, width, n_channels = image.shape
-    return image.reshape(-1, n_channels).take(_order(height * width), axis=0)
+def in_order(image: np.ndarray, n_channels: int) -> np.ndarray:
+    """The pixels [height * width, n_channels] of a picture [height, width, 4] uint8, place after place."""
+    # Four bytes at a time: ten times as fast as rows of a few bytes.
+    whole = np.ascontiguousarray(image).view(np.uint32).reshape(-1)
+    pixels = whole.take(_order(len(whole))).view(np.uint8).reshape(-1, 4)
+    return np.ascontiguousarray(pixels[:, :n_channels])
 
 
 def write_picture(file: BinaryIO, layout: Layout, number: int, pixels: np.ndarray) -> None:
@@ -135,12 +137,14 @@ class MappedImages(StoredImages):
             return self.some(range(len(self))[index])
         number = self._numbers[index]
         width, height = self._layout.sizes[number].tolist()
-        rgba = np.full((height * width, 4), 255, np.uint8)
-        order, edges = _order(width * height), self._layout.edges[number]
+        edges = self._layout.edges[number].tolist()
+        places = np.full((height * width, 4), 255, np.uint8)
         for chunk, begin in enumerate(self._layout.begins[number].tolist()):
-            piece = self._file[begin : begin + int(edges[chunk + 1] - edges[chunk])]
-            rgba[order[edges[chunk] : edges[chunk + 1]], : piece.shape[1]] = piece
-        return rgba.reshape(height, width, 4)
+            piece = self._file[begin : begin + edges[chunk + 1] - edges[chunk]]
+            places[edges[chunk] : edges[chunk + 1], : piece.shape[1]] = piece
+        image = np.empty(height * width, np.uint32)
+        image[_order(height * width)] = places.view(np.uint32)[:, 0]
+        return image.view(np.uint8).reshape(height, width, 4)
 
     def some(self, numbers: Sequence[int]) -> MappedImages:
         return MappedImages(self._file, self._layout, self._transparent, [self._numbers[i] for i in numbers])

@@ -46,7 +46,7 @@ def written(folder: Path, images: list[np.ndarray], n_channels: int) -> stored.M
     cache.reserve(path, int(layout.chunks[-1]) * n_channels)
     with path.open("r+b") as file:
         for number, image in enumerate(images):
-            write_picture(file, layout, number, in_order(image[..., :n_channels]))
+            write_picture(file, layout, number, in_order(image, n_channels))
     return map_pictures(path, layout, n_channels, frozenset())
 
 
