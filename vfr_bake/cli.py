@@ -93,8 +93,7 @@ def _train(options: Any) -> int:
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
-        scene = processes.in_turn(lambda: load_scene(data, bar.count, kind=config.kind, reader=reader))
-    config = replace(config, max_side=reader.size.max_side)
+        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind, scale=config.scale)
     if processes.first:
         _warn_of_folds(scene)
     trainer = Trainer(scene, config, processes)
@@ -155,10 +154,14 @@ def _say(data: str, text: str) -> None:
 
 
 def _with_cameras(data: str) -> str:
-    """The folder to load; for photographs or a video without cameras, these are estimated first."""
-    from vfr_bake.data import needs_cameras
+    """The folder to load; a ZIP is unpacked, and for photographs or a video without cameras these are
+    estimated first."""
+    from vfr_bake.data import needs_cameras, unpacked
     from vfr_bake.data.poses import estimate_cameras
 
+    if data != "demo":
+        with Bars() as bars:
+            data = str(unpacked(data, lambda done, of: bars.count("unpacking", done, of)))
     if not needs_cameras(data):
         return data
     with Bars() as bars:
@@ -264,7 +267,7 @@ def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
     scores = []
     n_views = min(n_views, len(scene.test.cameras))
     with Bar("test views") as bar:
-        for score in evaluate(model, scene.test, n_views):
+        for score in evaluate(model, scene.test, n_views, masked=scene.masked):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
     return {
@@ -358,7 +361,9 @@ def _eval(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
-        scene = load_scene(options.data, bar.count, reader=reader_as(model.train))
+        scene = load_scene(
+            options.data, bar.count, downscale=model.train.get("downscale", 1), scale=model.train.get("scale")
+        )
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
     to_model = np.linalg.inv(model.world_from_model)
@@ -367,11 +372,11 @@ def _eval(options: Any) -> int:
     names = frame_names(views.cameras)
     scores = []
     with Bar("test views") as bar:
-        for view in render_views(model, views):
+        for view in render_views(model, views, masked=scene.masked):
             if options.pictures is not None:
                 picture = comparison(view.photograph, view.rgb)
                 write_png(options.pictures / f"{names[len(scores)]}.png", picture)
-            scores.append(score_view(view.name, view.rgb, view.photograph, lpips))
+            scores.append(score_view(view.name, view.rgb, view.photograph, lpips, view.seen))
             bar.count(len(scores), len(world))
     means = mean_scores(scores)
     figures = _finite(means) | {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +69,7 @@ MAX_FILE_BYTES = 1 << 30
 
 
 @contextmanager
-def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Image.Image]:
+def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Image.Image]:
     """A picture file, opened by Pillow, as a context manager.
 
     `formats`: Pillow's names of those that it may have. Raises FormatError: no such file, not a regular one,

@@ -248,8 +248,13 @@ def played_bytes(asset: Asset) -> int:
 
 
 def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) -> Views:
-    reader = reader_as(assets[0].manifest.provenance.get("train", {}))
-    scene = load_scene(config.data, lambda done, of: progress("reading pictures", done, of), reader=reader)
+    train = assets[0].manifest.provenance.get("train", {})
+    scene = load_scene(
+        config.data,
+        lambda done, of: progress("reading pictures", done, of),
+        train.get("downscale", 1),
+        scale=train.get("scale"),
+    )
     if not scene.test.cameras:
         raise DataError(f"{config.data}: test views: expected at least 1, got none")
     n_views = min(config.views, len(scene.test.cameras))

@@ -10,70 +10,56 @@ from typing import Any
 from player.cameras.colmap import colmap_folder
 from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.files.archives import is_archive, unpack
+from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.threads import Progress
+from vfr_bake.data.world import scaled
 
-__all__ = [
-    "PosedImages",
-    "Scene",
-    "load_scene",
-    "needs_cameras",
-    "reader_as",
-    "training_reader",
-    "working_size",
-]
+__all__ = ["PosedImages", "Scene", "load_scene", "needs_cameras", "unpacked"]
 
 
 def load_scene(
     data: str | Path,
     progress: Progress | None = None,
-    downscale: int | None = None,
+    downscale: int = 1,
     kind: SceneKind = "auto",
-    reader: PictureReader | None = None,
+    scale: tuple[str, str, float] | None = None,
 ) -> Scene:
     """Load the posed pictures that `data` names.
 
     `data`: a folder with `transforms_train.json` (NeRF-synthetic), `transforms.json` (instant-ngp,
-    nerfstudio) or a COLMAP model (`sparse/0`), or the word `demo` for the built-in scene (a folder of that
-    name is `./demo`). `progress`: called with the number of pictures done and to do. `downscale`: pictures
-    are reduced by this factor along each side. `kind`: object or unbounded, or found from the pictures.
-    `reader`: what reads the pictures, in place of `downscale`; None holds all of them in memory.
+    nerfstudio) or a COLMAP model (`sparse/0`), a ZIP of one, a video whose cameras have been estimated, or
+    the word `demo` for the built-in scene (a folder of that name is `./demo`). `progress`: called with the
+    number of pictures done and to do. `downscale`: pictures are reduced by this factor along each side.
+    `kind`: object or unbounded, or found from the pictures. `scale`: two pictures and the distance between
+    their cameras, which the world then has.
 
     Raises DataError or FormatError in one line that names the file and what was expected, OutputError where
     the disk has no room for what the reader would keep there.
     """
-    reader = reader or PictureReader(WorkingSize(downscale=downscale))
     if str(data) == "demo":
         capture = demo_capture(progress=progress)
-        train, test = reader.size.of(capture.train), reader.size.of(capture.test)
-        return build_scene(replace(capture, train=train, test=test), kind)
-    return build_scene(load_folder(Path(data), progress, reader), kind)
+    else:
+        folder = unpacked(data)
+        capture = load_folder(frames_folder(folder) if is_video(folder) else folder, progress)
+    if scale is not None:
+        capture = scaled(capture, *scale)
+    return build_scene(capture, kind, downscale)
 
 
-def working_size(config: TrainConfig) -> WorkingSize:
-    """The size that pictures are trained on where the disk has room for them."""
-    default = config.max_side is None and config.downscale is None
-    return WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
+def unpacked(data: str | Path, progress: Progress | None = None) -> Path:
+    """What `data` names; for a ZIP the folder that it is unpacked into, once (`files.archives.unpack`).
 
-
-def training_reader(
-    config: TrainConfig, model: Path, kept: bool, say: Callable[[str], object] | None
-) -> PictureReader:
-    """What reads pictures for the training of `model`; with `kept` it leaves them for the next
-    run."""
-    default = config.max_side is None and config.downscale is None
-    return PictureReader(working_size(config), model, on_disk=True, kept=kept, may_shrink=default, say=say)
-
-
-def reader_as(settings: dict[str, Any]) -> PictureReader:
-    """What reads pictures as they were for a training with these `settings`, as a model or an asset has
-    them."""
-    size = WorkingSize(settings.get("max_side"), settings.get("downscale"))
-    return PictureReader(size, on_disk=True)
+    >>> unpacked("garden").name
+    'garden'
+    """
+    path = Path(data)
+    return unpack(path, progress or (lambda done, of: None)) if is_archive(path) else path
 
 
 def needs_cameras(data: str | Path) -> bool:

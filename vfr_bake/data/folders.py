@@ -17,7 +17,7 @@ from player.errors import DataError, FormatError
 from player.files.json_files import brief
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
-from vfr_bake.data.files.masks import check_masked, mask_of
+from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.orientation import Layout, is_taken_upright, read_layout
 from vfr_bake.data.files.pictures import DescribedView, read_pictures
@@ -80,8 +80,6 @@ def _capture(
 ) -> Capture:
     masked = any(view.mask is not None for view in described)
     name = folder.resolve().name or "scene"
-    if masked:
-        check_masked(name, train.images)
     return Capture(name, train, test, points, masked)
 
 

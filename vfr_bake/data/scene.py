@@ -15,6 +15,7 @@ from player.errors import DataError
 from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
 from vfr_bake.data.capture import Capture, PosedImages
+from vfr_bake.data.files.masks import check_masked
 from vfr_bake.data.files.pictures import reduced
 
 BORDER = 2
@@ -87,6 +88,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     # Nothing is empty in front of surroundings without end: what is transparent there has been masked.
     masked = capture.masked or (unbounded and has_alpha)
     has_alpha = has_alpha and not masked
+    if masked:
+        check_masked(capture.name, train.images)
     return Scene(
         capture.name, moved(train), moved(test), has_alpha, world_from_model, unbounded, near, masked
     )

@@ -90,22 +90,29 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def score_view(
-    name: str, rgb: np.ndarray, photograph: np.ndarray, lpips: Distance | None = None
+    name: str,
+    rgb: np.ndarray,
+    photograph: np.ndarray,
+    lpips: Distance | None = None,
+    seen: float = 1.0,
 ) -> ViewScore:
     """All scores of a picture against its photograph, both [height, width, 3] in [0, 1], not rounded.
 
-    `lpips`: also measure this on the 8-bit pictures. Raises ShapeError as `ssim` does.
+    `lpips`: also measure this on the 8-bit pictures. `seen`: share of the pixels, more than 0, that count;
+    elsewhere the two pictures are equal, and PSNR is that of the pixels that count. Raises ShapeError as
+    `ssim` does.
 
     >>> score = score_view("grey", np.full((16, 16, 3), 0.5), np.full((16, 16, 3), 0.501))
     >>> score.psnr, round(score.psnr_float), score.lpips
     (inf, 60, None)
     """
+    elsewhere = 10 * float(np.log10(max(seen, 1e-9)))
     rgb_8_bit, photograph_8_bit = to_8_bit(rgb) / 255, to_8_bit(photograph) / 255
     return ViewScore(
         name=name,
-        psnr=psnr(rgb_8_bit, photograph_8_bit),
+        psnr=psnr(rgb_8_bit, photograph_8_bit) + elsewhere,
         ssim=ssim(rgb_8_bit, photograph_8_bit),
-        psnr_float=psnr(rgb, photograph),
+        psnr_float=psnr(rgb, photograph) + elsewhere,
         ssim_float=ssim(rgb, photograph),
         lpips=None if lpips is None else lpips(rgb_8_bit, photograph_8_bit),
     )

@@ -35,6 +35,7 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
+from vfr_bake.training.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 MINUTES = {False: 9.4, True: 12.0}
@@ -114,7 +115,9 @@ class Trainer:
         # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
         self._random_background = scene.has_alpha or scene.unbounded
         self._views = scene.train
-        self._keep_apart(choose_witnesses(scene.train))
+        self._masked = scene.masked
+        witnesses = choose_witnesses(scene.train)
+        self._keep_apart(unmasked_witnesses(witnesses) if scene.masked else witnesses)
         self._guide: Guide
         self._grid_adam: TableAdam
         if self._backend == "torch":
@@ -227,7 +230,7 @@ class Trainer:
 
     def _draw(self, n_rays: int) -> Batch:
         """This process' share of a joint batch, drawn alike in all of them."""
-        rays = self._pixels.draw(n_rays)
+        rays = draw_unmasked(self._pixels, n_rays) if self._masked else self._pixels.draw(n_rays)
         jitter = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         if self._random_background:
             background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)

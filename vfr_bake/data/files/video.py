@@ -1,4 +1,11 @@
-"""A video -> a folder of its sharpest frames, evenly spread."""
+"""A video -> a folder of its sharpest frames, taken where the camera has moved.
+
+The video is read once, one frame at a time, however long it is. How far the camera has moved is measured by
+optical flow between small grey frames. Where it has moved by `STEP` of the picture, a stretch ends, and the
+sharpest frame of each stretch is kept. A camera that stands still gives one frame, and one that hurries more
+of them. If the stretches get too many, every two become one, and the step doubles: so a walk of an hour takes
+no more memory and no more disk than one of a minute.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +17,19 @@ from PIL import Image
 
 from player.errors import DataError
 from player.files.files import new_folder
-from vfr_bake.data.files.pictures import opencv, shrunk
+from vfr_bake.data.files.pictures import opencv, sharpness, shrunk
 from vfr_bake.data.threads import Progress
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-N_FRAMES = 80
-"""A walk around a subject at a frame every 4.5 degrees: neighbours share nearly everything, and their
-matching still takes minutes."""
+STEP = 0.03
+"""The shortest stretch: what the picture moves by, as a share of its longer side. A step of 4.5 degrees
+around a subject moves it by some 0.05."""
+MOST_FRAMES = 160
+"""Twice as many as are enough for a walk around a subject; where there are more, every two become one."""
 MAX_SIDE = 1920
-"""Frames are reduced to this: a video's compression leaves nothing finer, and 80 frames of 4K are 2.7 GB."""
-_SHARPNESS_SIDE = 960
+"""Frames are reduced to this: a video's compression leaves nothing finer, and 160 frames of 4K are 5 GB."""
+FLOW_SIDE = 160
+"""Pixels of the longer side of the frames that are compared for how far the camera has moved."""
 
 
 def frames_folder(video: Path) -> Path:
@@ -32,12 +42,12 @@ def frames_folder(video: Path) -> Path:
 
 
 def extract_frames(video: Path, progress: Progress) -> Path:
-    """Write about `N_FRAMES` frames of `video` as JPEG files into `<stem>_frames/images/` beside it.
+    """Write at most `MOST_FRAMES` frames of `video` as JPEG files into `<stem>_frames/images/` beside it.
 
-    The video is cut into stretches of equal length, and each gives its sharpest frame: a hand-held camera
-    shakes, and one frame in three is blurred. A short video gives all its frames. `progress`: called with
-    the number of frames looked at and to look at. The folder appears when it is complete; one that is there
-    is taken as it is. Returns it.
+    Each is the sharpest of a stretch in which the camera has moved by the same part of the picture: a
+    hand-held camera shakes, and one frame in three is blurred. `progress`: called with the number of frames
+    looked at and to look at. The folder appears when it is complete; one that is there is taken as it is.
+    Returns it.
 
     Raises DataError (not a video, no frames), OutputError, MissingExtraError.
     """
@@ -48,44 +58,76 @@ def extract_frames(video: Path, progress: Progress) -> Path:
     # Turned upright by OpenCV where the file says how the camera was held.
     capture = cv2.VideoCapture(str(video))
     try:
+        # The count in a video's header is a guess, and some have none.
         n_frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-        if n_frames < 1:
+        read, frame = capture.read() if capture.isOpened() else (False, None)
+        if not read:
             raise DataError(f"{video}: video: expected one that OpenCV can read, with frames in it")
         with new_folder(folder) as new:
             (new / "images").mkdir()
-            _write_sharpest(cv2, capture, n_frames, new / "images", progress)
-            if not any((new / "images").iterdir()):
-                raise DataError(f"{video}: video: expected {n_frames} frames, none of them can be read")
+            stretches = _Stretches(cv2, new / "images")
+            n_read = 0
+            while read:
+                stretches.add(frame)
+                n_read += 1
+                progress(n_read, max(n_frames, n_read + 1))
+                read, frame = capture.read()
+            stretches.finish()
+            progress(n_read, n_read)
     finally:
         capture.release()
     return folder
 
 
-def _write_sharpest(cv2: Any, capture: Any, n_frames: int, folder: Path, progress: Progress) -> None:
-    n_kept = min(N_FRAMES, n_frames)
-    best: np.ndarray | None = None
-    best_sharpness = -1.0
-    for index in range(n_frames):
-        read, frame = capture.read()
-        if read:
-            sharpness = _sharpness(cv2, frame)
-            if sharpness > best_sharpness:
-                best, best_sharpness = frame, sharpness
-        stretch = index * n_kept // n_frames
-        if best is not None and (not read or (index + 1) * n_kept // n_frames > stretch):
-            _write(cv2, best, folder / f"{stretch:04d}.jpg")
-            best, best_sharpness = None, -1.0
-        progress(index + 1, n_frames)
-        if not read:  # the count in a video's header is a guess
-            break
+class _Stretches:
+    """The sharpest frame of every stretch of a video so far, each in a file."""
 
+    def __init__(self, cv2: Any, folder: Path) -> None:
+        self._cv2, self._folder = cv2, folder
+        self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._before: np.ndarray | None = None
+        self._step, self._moved = STEP, 0.0
+        self._n_files = 0
+        self._kept: list[tuple[float, Path]] = []
+        self._best: tuple[float, np.ndarray] | None = None
 
-def _sharpness(cv2: Any, frame: np.ndarray) -> float:
-    """Mean square of the second derivative: blur of any direction lowers it."""
-    grey = shrunk(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), _SHARPNESS_SIDE)
-    return float(np.square(cv2.Laplacian(grey, cv2.CV_32F)).mean())
+    def add(self, frame: Any) -> None:
+        """The next frame [height, width, 3], blue first."""
+        cv2 = self._cv2
+        small = shrunk(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), FLOW_SIDE)
+        if self._before is not None and min(small.shape) >= 16 and small.shape == self._before.shape:
+            flow = self._flow.calc(self._before, small, None)
+            self._moved += float(np.median(np.linalg.norm(flow, axis=-1))) / max(small.shape)
+        self._before = small
+        if self._moved >= self._step and self._best is not None:
+            self._end_stretch()
+            self._moved = 0.0
+        sharp = sharpness(cv2, frame[..., ::-1])
+        if self._best is None or sharp > self._best[0]:
+            self._best = sharp, frame
 
+    def finish(self) -> None:
+        """End the last stretch, and number the frames that are kept."""
+        if self._best is not None:
+            self._end_stretch()
+        for number, (_, path) in enumerate(self._kept):
+            path.rename(self._folder / f"{number:04d}.jpg")
 
-def _write(cv2: Any, frame: np.ndarray, path: Path) -> None:
-    rgb = cv2.cvtColor(shrunk(cv2, frame, MAX_SIDE), cv2.COLOR_BGR2RGB)
-    Image.fromarray(rgb).save(path, quality=95)
+    def _end_stretch(self) -> None:
+        assert self._best is not None
+        sharp, frame = self._best
+        path = self._folder / f"stretch_{self._n_files:08d}.jpg"
+        rgb = self._cv2.cvtColor(shrunk(self._cv2, frame, MAX_SIDE), self._cv2.COLOR_BGR2RGB)
+        Image.fromarray(rgb).save(path, quality=95)
+        self._n_files += 1
+        self._kept.append((sharp, path))
+        self._best = None
+        if len(self._kept) > MOST_FRAMES:
+            self._step *= 2
+            pairs = [self._kept[start : start + 2] for start in range(0, len(self._kept), 2)]
+            self._kept = [max(pair, key=lambda entry: entry[0]) for pair in pairs]
+            chosen = {path for _, path in self._kept}
+            for pair in pairs:
+                for _, path in pair:
+                    if path not in chosen:
+                        path.unlink()

@@ -1,0 +1,124 @@
+"""A ZIP of pictures: unpacked once, and never beyond its folder, its disk or its size."""
+
+from __future__ import annotations
+
+import io
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from player.errors import DataError
+from vfr_bake.data import load_scene, needs_cameras, unpacked
+from vfr_bake.data.files import archives
+from vfr_bake.data.files.archives import unpack
+from vfr_bake.data.files.listing import find_pictures
+
+
+def quiet(done: int, of: int) -> None:
+    assert 0 < done <= of
+
+
+def picture() -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def pack(path: Path, files: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for name, data in files.items():
+            file.writestr(name, data)
+    return path
+
+
+def test_a_zip_as_phones_share_it(tmp_path: Path) -> None:
+    names = ["Urlaub/IMG_9.png", "Urlaub/IMG_10.PNG", "Urlaub/\u56fe\u7247/a.png"]
+    archive = pack(
+        tmp_path / "photos.zip",
+        dict.fromkeys([*names, "__MACOSX/Urlaub/._IMG_9.png", "Urlaub/.hidden.png"], picture())
+        | {"Urlaub/notes.txt": b"x", "Urlaub/": b""},
+    )
+    folder = unpack(archive, quiet)
+    assert folder == tmp_path / "photos_unpacked" / "Urlaub"
+    place, found = find_pictures(folder)
+    assert [path.relative_to(place).as_posix() for path in found] == [
+        "IMG_9.png",
+        "IMG_10.PNG",
+        "\u56fe\u7247/a.png",
+    ]
+    assert needs_cameras(folder) and not (tmp_path / "__MACOSX").exists()
+    archive.write_bytes(b"")  # what is there is taken as it is
+    assert unpacked(archive) == folder
+
+
+def test_a_zip_of_a_data_set(small_data: Path, tmp_path: Path) -> None:
+    files = {
+        str(path.relative_to(small_data)): path.read_bytes()
+        for path in small_data.rglob("*")
+        if path.is_file()
+    }
+    assert len(load_scene(pack(tmp_path / "a.zip", files)).train.images) == 12
+
+
+def link(path: Path) -> None:
+    entry = zipfile.ZipInfo("a.png")
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr(entry, "/etc/passwd")
+
+
+def with_a_password(path: Path) -> None:
+    data = bytearray(pack(path, {"a.png": picture()}).read_bytes())
+    at = data.index(b"PK\x01\x02")
+    data[at + 8] |= 1
+    path.write_bytes(data)
+
+
+def cut_short(path: Path) -> None:
+    data = pack(path, {"a.png": picture()}).read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def damaged(path: Path) -> None:
+    data = bytearray(pack(path, {"a.png": bytes(5000)}).read_bytes())
+    data[1000] ^= 255
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda path: pack(path, {"../a.png": picture()}), "expected names that stay in its folder"),
+        (lambda path: pack(path, {"/tmp/a.png": picture()}), "expected names that stay in its folder"),
+        (lambda path: pack(path, {"a\\..\\..\\b.png": picture()}), "expected names that stay in its folder"),
+        (lambda path: pack(path, {"C:/a.png": picture()}), "expected names that stay in its folder"),
+        (lambda path: pack(path, {"a.png": b"", "A.PNG": b""}), "expected different names, got a.png twice"),
+        (lambda path: pack(path, {"a.txt": b"x"}), r"expected pictures \(\.png"),
+        (link, "expected files, got a link"),
+        (with_a_password, "expected one without a password"),
+        (cut_short, "cannot be read to its end"),
+        (damaged, "cannot be read to its end"),
+        (lambda path: path.write_bytes(b"no zip"), "cannot be read to its end"),
+    ],
+)
+def test_what_is_refused(make: Callable[[Path], object], expected: str, tmp_path: Path) -> None:
+    archive = tmp_path / "a.zip"
+    make(archive)
+    with pytest.raises(DataError, match=expected) as raised:
+        unpack(archive, lambda done, of: None)
+    assert str(raised.value).startswith(f"{archive}: ZIP: ") and "\n" not in str(raised.value)
+    assert list(tmp_path.iterdir()) == [archive]
+
+
+def test_a_zip_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused by what its directory says; nothing of it is unpacked."""
+    monkeypatch.setattr(archives, "SPARED", 1 << 20)
+    archive = pack(tmp_path / "a.zip", {"a.png": bytes(4 << 20)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(DataError, match=r"expected at most 0\.0 GB of pictures"):
+        unpack(archive, quiet)
+    assert list(tmp_path.iterdir()) == [archive]

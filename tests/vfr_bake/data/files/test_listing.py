@@ -1,0 +1,51 @@
+"""Which pictures of a folder are found, and in which order."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from player.errors import DataError
+from vfr_bake.data.files import listing
+from vfr_bake.data.files.listing import find_pictures
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+
+
+def names(folder: Path) -> list[str]:
+    place, found = find_pictures(folder)
+    return [path.relative_to(place).as_posix() for path in found]
+
+
+def test_folders_within_the_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "DCIM/101/IMG_2.jpg", "DCIM/100/IMG_10.HEIC", "DCIM/100/IMG_9.heic", "a.webp", "b.txt")
+    touch(tmp_path, "masks/a.png", "sparse/0/c.png", ".trash/d.png", "._e.jpg", "__MACOSX/f.jpg")
+    touch(tmp_path, "other/transforms.json", "other/g.png", "out/manifest.json", "out/h.png")
+    assert names(tmp_path) == ["a.webp", "DCIM/100/IMG_9.heic", "DCIM/100/IMG_10.HEIC", "DCIM/101/IMG_2.jpg"]
+
+
+def test_images_come_first(tmp_path: Path) -> None:
+    touch(tmp_path, "images/left/1.png", "images/2.png", "preview.png")
+    assert names(tmp_path) == ["2.png", "left/1.png"]
+    assert find_pictures(tmp_path)[0] == tmp_path / "images"
+
+
+def test_a_whole_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, *(f"{index}.png" for index in range(4)))
+    monkeypatch.setattr(listing, "MOST", 3)
+    with pytest.raises(DataError, match="expected at most 3 pictures of one scene"):
+        find_pictures(tmp_path)
+
+
+def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Linux lets people have it, and other systems do not."""
+    monkeypatch.setattr(Path, "is_file", lambda path: True)
+    monkeypatch.setattr(os, "walk", lambda place: [(str(place), [], ["\udcff.png"])])
+    with pytest.raises(DataError, match="expected a name in UTF-8"):
+        find_pictures(tmp_path)

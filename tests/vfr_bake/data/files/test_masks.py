@@ -1,0 +1,117 @@
+"""Masks: found by name, of the right size, and what they hide is neither drawn nor scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from player.cameras.transforms import write_cameras
+from player.errors import DataError
+from vfr_bake.config import TrainConfig
+from vfr_bake.data import load_scene
+from vfr_bake.data.demo import demo_views
+from vfr_bake.data.features import find_features
+from vfr_bake.data.files.masks import apply_mask, mask_of
+from vfr_bake.training.metrics import score_view
+from vfr_bake.training.rays import PixelSampler
+from vfr_bake.training.trainer import Trainer
+from vfr_bake.training.unmasked import draw_unmasked
+
+
+def masked_folder(folder: Path, share: float = 0.5) -> Path:
+    """24 opaque views, of each of which the left part is masked, and red."""
+    train, _ = demo_views(32, 24, 1)
+    (folder / "images").mkdir()
+    (folder / "masks").mkdir()
+    cameras = []
+    for index, (camera, image) in enumerate(zip(train.cameras, train.images, strict=True)):
+        pixels, mask = image[..., :3].copy(), np.full((32, 32), 255, np.uint8)
+        hidden = round(32 * share)
+        pixels[:, :hidden], mask[:, :hidden] = (255, 0, 0), 0
+        Image.fromarray(pixels).save(folder / "images" / f"{index:02d}.png")
+        Image.fromarray(mask).save(
+            folder / "masks" / (f"{index:02d}.png" if index % 2 else f"{index:02d}.png.png")
+        )
+        cameras.append(replace(camera, name=f"images/{index:02d}.png"))
+    (folder / "transforms.json").write_bytes(write_cameras(cameras))
+    return folder
+
+
+def test_what_is_masked_is_not_drawn(tmp_path: Path) -> None:
+    scene = load_scene(masked_folder(tmp_path), kind="unbounded")
+    assert scene.masked and not scene.has_alpha
+    assert all(
+        (image[:, :16, 3] == 0).all() and (image[:, 16:, 3] == 255).all() for image in scene.train.images
+    )
+    sampler = PixelSampler(scene.train, torch.Generator().manual_seed(0))
+    batch = draw_unmasked(sampler, 3000)
+    assert len(batch.rgba) == len(batch.rays_o) == len(batch.rays_d) == 3000
+    assert (batch.rgba[:, 3] == 1).all() and not ((batch.rgba[:, 0] == 1) & (batch.rgba[:, 1] == 0)).any()
+    trainer = Trainer(scene, TrainConfig(device="cpu", batch_rays=64))
+    assert (trainer.witnesses.rgba[:, 3] == 255).all() and len(trainer.witnesses.pixels) > 100
+    assert (trainer._draw(500).rgba[:, 3] == 1).all()
+
+
+def test_a_masked_scene_is_none_with_an_object(tmp_path: Path) -> None:
+    """Masks say nothing of the background: without them the pictures are as opaque as they were."""
+    scene = load_scene(masked_folder(tmp_path))
+    assert scene.masked and not scene.has_alpha
+
+
+def test_everything_masked(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"masks: expected some of the pictures to be seen, got 0 of"):
+        load_scene(masked_folder(tmp_path, 1.0))
+
+
+def test_a_mask_of_another_size(tmp_path: Path) -> None:
+    folder = masked_folder(tmp_path)
+    Image.new("L", (16, 16)).save(folder / "masks" / "01.png")
+    with pytest.raises(
+        DataError, match=r"01\.png: mask: expected 32x32 pixels as 01\.png has, got 16x16: save"
+    ):
+        load_scene(folder)
+
+
+def test_names(tmp_path: Path) -> None:
+    (tmp_path / "masks" / "sub").mkdir(parents=True)
+    for name in ("a.png", "b.jpg.png", "sub/c.png"):
+        (tmp_path / "masks" / name).write_bytes(b"")
+    for name, mask in {"a.jpg": "a.png", "images/b.jpg": "b.jpg.png", "sub/c.heic": "sub/c.png"}.items():
+        assert mask_of(tmp_path, name) == tmp_path / "masks" / mask
+    assert mask_of(tmp_path, "d.jpg") is None and mask_of(tmp_path, "../a.jpg") is None
+
+
+def test_a_mask_of_the_stored_pixels_of_a_turned_picture(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png", exif=exif)
+    stored = np.full((30, 40), 255, np.uint8)
+    stored[:10] = 0  # which is on the right once it is turned clockwise
+    upright = np.ascontiguousarray(np.rot90(stored, -1))
+    for pixels in (stored, upright):
+        Image.fromarray(pixels).save(tmp_path / "mask.png")
+        rgba = np.full((40, 30, 4), 255, np.uint8)
+        masked = apply_mask(rgba, tmp_path / "a.png", tmp_path / "mask.png", upright=True)
+        np.testing.assert_array_equal(masked[..., 3], upright)
+        assert not masked[:, 20:, 3].any() and masked[:, :20, 3].all()
+
+
+def test_nothing_is_matched_where_a_picture_is_masked() -> None:
+    rgba = np.full((120, 160, 4), 255, np.uint8)
+    rgba[..., :3] = np.random.default_rng(0).integers(0, 256, (120, 160, 3))
+    rgba[:, :80, 3] = 0
+    points = find_features(rgba).points
+    assert len(points) and points[:, 0].min() > 79
+
+
+def test_scores_are_of_what_is_seen() -> None:
+    random = np.random.default_rng(0)
+    rgb, photograph = random.random((2, 16, 16, 3)).astype(np.float32)
+    alone = score_view("a", rgb[:8].repeat(2, axis=0), photograph[:8].repeat(2, axis=0))
+    half = np.concatenate([photograph[:8], rgb[8:]])
+    assert score_view("a", rgb, half, seen=0.5).psnr_float == pytest.approx(alone.psnr_float, abs=1e-4)

@@ -1,0 +1,132 @@
+"""Pictures of every format, turned by every orientation: upright where cameras are estimated, as stored where
+they come with the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image, ImageOps
+
+from player.cameras.transforms import write_cameras
+from player.errors import DataError
+from vfr_bake.data import load_scene
+from vfr_bake.data.demo import demo_views
+from vfr_bake.data.files.orientation import TAG, as_stored, turned_upright
+from vfr_bake.data.files.pictures import read_picture
+
+pillow_heif.register_heif_opener()
+
+LOSSLESS = {"png": {}, "webp": {"lossless": True}, "tiff": {}}
+LOSSY = {"jpg": {"quality": 95}, "avif": {"quality": 95}, "heic": {"quality": 95}}
+TURN = Image.Transpose
+TO_STORED = {
+    1: None, 2: TURN.FLIP_LEFT_RIGHT, 3: TURN.ROTATE_180, 4: TURN.FLIP_TOP_BOTTOM, 5: TURN.TRANSPOSE,
+    6: TURN.ROTATE_90, 7: TURN.TRANSVERSE, 8: TURN.ROTATE_270,
+}  # fmt: skip
+
+
+def corners() -> np.ndarray:
+    """[48, 32, 3]: a quarter of each colour, so that no turn of it is another."""
+    pixels = np.zeros((48, 32, 3), np.uint8)
+    pixels[:24, :16], pixels[:24, 16:], pixels[24:, :16] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    return pixels
+
+
+def save_turned(upright: np.ndarray, path: Path, number: int, **options: object) -> np.ndarray:
+    """Save a picture as a camera does that was held so; returns the pixels as stored."""
+    image, turn = Image.fromarray(upright), TO_STORED[number]
+    stored = image if turn is None else image.transpose(turn)
+    exif = Image.Exif()
+    exif[TAG] = number
+    stored.save(path, exif=exif.tobytes(), **options)
+    return np.asarray(stored)
+
+
+@pytest.mark.parametrize("number", range(1, 9))
+def test_turns_are_pillows(number: int) -> None:
+    stored = np.random.default_rng(number).integers(0, 256, (3, 5, 4), np.uint8)
+    image = Image.fromarray(stored)
+    image.getexif()[TAG] = number
+    np.testing.assert_array_equal(turned_upright(stored, number), np.asarray(ImageOps.exif_transpose(image)))
+    np.testing.assert_array_equal(as_stored(turned_upright(stored, number), number), stored)
+
+
+@pytest.mark.parametrize("number", range(1, 9))
+@pytest.mark.parametrize("kind", [*LOSSLESS, *LOSSY])
+def test_every_format_is_turned_once(kind: str, number: int, tmp_path: Path) -> None:
+    path, upright = tmp_path / f"ein Bild \u56fe\u7247.{kind}", corners()
+    stored = save_turned(upright, path, number, **(LOSSLESS | LOSSY)[kind])
+    for read, expected in ((read_picture(path, upright=True), upright), (read_picture(path), stored)):
+        assert read.shape == (*expected.shape[:2], 4) and (read[..., 3] == 255).all()
+        off = np.abs(read[..., :3].astype(int) - expected)
+        assert off.max() == 0 if kind in LOSSLESS else off.mean() < 6
+
+
+@pytest.mark.parametrize("n_bytes", [1, 200, 3000])
+def test_a_heic_that_is_cut_short(n_bytes: int, tmp_path: Path) -> None:
+    path = tmp_path / "IMG_1.HEIC"
+    noise = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    Image.fromarray(noise).save(path, quality=90)
+    path.write_bytes(path.read_bytes()[:-n_bytes])
+    with pytest.raises(DataError, match="HEIC picture: cannot be read to its end: it is cut short") as raised:
+        read_picture(path, upright=True)
+    assert str(raised.value).startswith(f"{path}: ") and "\n" not in str(raised.value)
+
+
+def test_the_content_and_not_the_name_says_what_a_picture_is(tmp_path: Path) -> None:
+    Image.fromarray(corners()).save(tmp_path / "a.heic", format="PNG")
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.heic")[..., :3], corners())
+
+
+def test_a_heic_of_too_many_pixels_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.heic"
+    Image.fromarray(corners()).save(path)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 500)
+    with pytest.raises(DataError, match="Image size"):
+        read_picture(path)
+
+
+# --- cameras that come with a data set ---
+
+
+def data_set(folder: Path, kind: str, with_size: str) -> tuple[Path, list[np.ndarray]]:
+    """Four views of the demo scene, 48 pixels high and 32 wide as stored, which EXIF turns by a quarter.
+
+    `with_size`: the cameras name the size of the pixels as stored, of the upright picture, or none.
+    """
+    train, _ = demo_views(48, 4, 1)
+    cameras, stored = [], []
+    for index, (camera, image) in enumerate(zip(train.cameras, train.images, strict=True)):
+        pixels = np.ascontiguousarray(image[:, 8:40, :3])
+        camera = replace(camera, width=32, cx=camera.cx - 8, name=f"{index}.{kind}")
+        if with_size == "upright":
+            upright = turned_upright(pixels, 6)
+            camera = replace(camera, width=48, height=32, cx=camera.cy, cy=camera.cx)
+            save_turned(upright, folder / camera.name, 6, **(LOSSLESS | LOSSY)[kind])
+            stored.append(upright)
+        else:
+            stored.append(
+                save_turned(turned_upright(pixels, 6), folder / camera.name, 6, **(LOSSLESS | LOSSY)[kind])
+            )
+        cameras.append(camera)
+    text = write_cameras(cameras).decode()
+    if with_size == "none":
+        text = text.replace('"w": 32,', "").replace('"h": 48,', "")
+    (folder / "transforms.json").write_text(text)
+    return folder, stored
+
+
+@pytest.mark.parametrize("with_size", ["stored", "upright", "none"])
+@pytest.mark.parametrize("kind", ["png", "jpg", "tiff", "heic"])
+def test_given_cameras_belong_to_the_pixels_that_they_fit(kind: str, with_size: str, tmp_path: Path) -> None:
+    if (kind, with_size) == ("heic", "none"):
+        with_size = "upright"  # whoever reads a HEIC reads it upright
+    folder, expected = data_set(tmp_path, kind, with_size)
+    scene = load_scene(folder)
+    for camera, image, pixels in zip(scene.train.cameras, scene.train.images, expected, strict=True):
+        assert (camera.height, camera.width) == image.shape[:2] == pixels.shape[:2]
+        assert np.abs(image[..., :3].astype(int) - pixels).mean() < (0.5 if kind in LOSSLESS else 12)

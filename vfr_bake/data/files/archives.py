@@ -1,0 +1,163 @@
+"""A ZIP of pictures, as phones and drives share it -> a folder.
+
+A ZIP is written by strangers. Everything that it says is checked before the first byte is unpacked: names
+that leave the folder, links, passwords, and how much it unpacks to.
+"""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from player.errors import DataError, OutputError
+from player.files.files import new_folder
+from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.threads import Progress
+
+SUFFIX = ".zip"
+KEPT = (*SUFFIXES, ".bmp", ".json", ".bin")
+"""Pictures and masks, and the cameras of a data set; what else there may be is left packed."""
+MOST_ENTRIES = 50_000
+MOST_BYTES = 1 << 37
+"""128 GB: ten thousand pictures of 12 MB."""
+MOST_OF_ONE = 1 << 30
+MOST_TIMES, SPARED = 50, 64 << 20
+"""What is unpacked is at most so many times as large as the ZIP, beyond the bytes that are spared: pictures
+are compressed already."""
+FREE = 0.9
+"""Share of the free disk that is taken at most."""
+_AT_ONCE = 1 << 20
+
+
+def is_archive(path: Path) -> bool:
+    """Whether `path` is a file that goes by the name of a ZIP.
+
+    >>> is_archive(Path("surely/not/there.zip"))
+    False
+    """
+    return path.suffix.lower() == SUFFIX and path.is_file()
+
+
+def unpacked_folder(archive: Path) -> Path:
+    """The folder into which a ZIP is unpacked: `garden.zip` -> `garden_unpacked`.
+
+    >>> unpacked_folder(Path("a/garden.zip")).name
+    'garden_unpacked'
+    """
+    return archive.with_name(f"{archive.stem}_unpacked")
+
+
+def unpack(archive: Path, progress: Progress) -> Path:
+    """Unpack the pictures and cameras of a ZIP into `<stem>_unpacked/` beside it.
+
+    Returns what is to be loaded: that folder, or the only one in it.
+
+    `progress`: called with the number of files unpacked and to unpack. The folder appears when it is
+    complete; one that is there is taken as it is.
+
+    Raises DataError: not a ZIP, damaged, with a password, nothing in it that is read, a name that leaves
+    the folder, a link, or more bytes than it may unpack to; OutputError: the disk is too full.
+    """
+    folder = unpacked_folder(archive)
+    if folder.is_dir():
+        return _inner(folder)
+    try:
+        with zipfile.ZipFile(archive) as file:
+            entries = _checked(archive, file)
+            with new_folder(folder) as new:
+                for done, (entry, name) in enumerate(entries, start=1):
+                    _unpack_one(archive, file, entry, new / name)
+                    progress(done, len(entries))
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DataError(
+            f"{archive}: ZIP: cannot be read to its end: {reason}: share or copy it again"
+        ) from error
+    return _inner(folder)
+
+
+def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo, PurePosixPath]]:
+    """The entries to unpack, and their names within the folder. Raises DataError."""
+    if len(file.infolist()) > MOST_ENTRIES:
+        raise DataError(f"{archive}: ZIP: expected at most {MOST_ENTRIES} files, got {len(file.infolist())}")
+    entries = []
+    for entry in file.infolist():
+        name = _safe_name(archive, entry)
+        kept = name.suffix.lower() in KEPT and not any(part.startswith((".", "__")) for part in name.parts)
+        if kept and not entry.is_dir():
+            entries.append((entry, name))
+    if any(entry.flag_bits & 1 for entry, _ in entries):
+        raise DataError(f"{archive}: ZIP: expected one without a password: unpack it, and name the folder")
+    if not entries:
+        raise DataError(f"{archive}: ZIP: expected pictures ({', '.join(SUFFIXES)}) in it, got none")
+    folded = [str(name).casefold() for _, name in entries]
+    if len(set(folded)) < len(folded):
+        raise DataError(f"{archive}: ZIP: expected different names, got {_twice(folded)} twice")
+    n_bytes = sum(entry.file_size for entry, _ in entries)
+    most = min(MOST_BYTES, MOST_TIMES * archive.stat().st_size + SPARED)
+    largest = max(entry.file_size for entry, _ in entries)
+    if n_bytes > most or largest > MOST_OF_ONE:
+        raise DataError(
+            f"{archive}: ZIP: expected at most {most / 1e9:.1f} GB of pictures and "
+            f"{MOST_OF_ONE / 1e9:.1f} GB of one, got {n_bytes / 1e9:.1f} GB and {largest / 1e9:.1f} GB: "
+            "unpack it yourself if you trust it"
+        )
+    free = shutil.disk_usage(archive.absolute().parent).free
+    if n_bytes > FREE * free:
+        raise OutputError(
+            f"{unpacked_folder(archive)}: cannot write: {n_bytes / 1e9:.1f} GB to unpack, and the disk has "
+            f"{free / 1e9:.1f} GB free"
+        )
+    return entries
+
+
+def _safe_name(archive: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
+    """The name of an entry, which stays in the folder. Raises DataError."""
+    name = PurePosixPath(_decoded(entry).replace("\\", "/"))
+    on_windows = PureWindowsPath(str(name))
+    leaves = ".." in name.parts or name.is_absolute() or on_windows.drive or on_windows.root
+    if leaves or any(ord(character) < 32 for character in str(name)) or ":" in str(name):
+        raise DataError(
+            f"{archive}: ZIP: expected names that stay in its folder, got {ascii(str(name))[:200]}"
+        )
+    if stat.S_ISLNK(entry.external_attr >> 16):
+        raise DataError(f"{archive}: ZIP: expected files, got a link: {ascii(str(name))[:200]}")
+    return name
+
+
+def _decoded(entry: zipfile.ZipInfo) -> str:
+    """The entry's name: many programs write UTF-8 without saying so, which is read as code page 437."""
+    if entry.flag_bits & 0x800:
+        return entry.filename
+    try:
+        return entry.filename.encode("cp437").decode("utf-8")
+    except UnicodeError:
+        return entry.filename
+
+
+def _unpack_one(archive: Path, file: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    left = entry.file_size
+    with file.open(entry) as source, target.open("xb") as copy:
+        while block := source.read(_AT_ONCE):
+            left -= len(block)
+            if left < 0:
+                raise DataError(f"{archive}: ZIP: {target.name}: expected {entry.file_size} bytes, got more")
+            copy.write(block)
+
+
+def _twice(names: list[str]) -> str:
+    seen: set[str] = set()
+    return next(name for name in names if name in seen or seen.add(name))
+
+
+def _inner(folder: Path) -> Path:
+    """The folder itself, or the only one in it, and so on: phones pack a folder and not what is in it."""
+    while True:
+        inside = list(folder.iterdir())
+        if len(inside) != 1 or not inside[0].is_dir() or inside[0].name == "images":
+            return folder
+        folder = inside[0]
