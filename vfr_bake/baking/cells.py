@@ -35,6 +35,9 @@ is taken, and where none does, nothing is left out."""
 HITS, CONTRACTED_HITS = 8, 24
 """Rays that meet a surface cell of a box, and a block of cells at the unit sphere of an unbounded scene, over
 all views, on average. The cells of a box that still escape are gaps to be closed."""
+MOST_SEEING = 2_000_000
+"""Rays that look for the cells of an unbounded scene, at most: so its minutes are bounded, however many views
+there are and wherever they stand. Fox needs 1.2 million for as many hits."""
 VIEWS_OF_A_CELL = 0.4
 """Share of the training views that see a given piece of surface, roughly."""
 BLOCK = 2
@@ -336,8 +339,9 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     and BETWEEN times as many between them.
 
     `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met
-    CONTRACTED_HITS times over all views. Pictures are taken a little wider than they are: another camera of
-    the scene sees beyond their border, where the model goes on. Raises TrainingError when nothing is seen.
+    CONTRACTED_HITS times over all views, but no more than MOST_SEEING. Pictures are taken a little wider than
+    they are: another camera of the scene sees beyond their border, where the model goes on. Raises
+    TrainingError when nothing is seen.
     """
     assert isinstance(model.sampler, ProposalSampler)
     n_blocks = resolution // BLOCK
@@ -361,14 +365,18 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
 
 def rays_of_contracted_views(model: Model, resolution: int) -> float:
     """Rays that `weighty_cells` sends out."""
+    return _share_of_pixels(model, resolution) * _pixels_of_contracted_views(model)
+
+
+def _pixels_of_contracted_views(model: Model) -> float:
     n_pixels = (1 + 2 * MARGIN) ** 2 * sum(camera.width * camera.height for camera in model.cameras)
-    return (1 + BETWEEN) * _share_of_pixels(model, resolution) * n_pixels
+    return (1 + BETWEEN) * n_pixels
 
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
     footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
     hits = VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))
-    return min(CONTRACTED_HITS / hits, 1.0)
+    return min(CONTRACTED_HITS / hits, MOST_SEEING / _pixels_of_contracted_views(model), 1.0)
 
 
 @torch.no_grad()

@@ -287,3 +287,33 @@ def encode_features(codes: np.ndarray) -> np.ndarray:
         rows = slice(first, first + ROWS_AT_ONCE)
         whole[rows] = np.clip(np.rint(codes[rows]), -127, 127)
     return whole
+
+
+REMAINDER_STEPS = 256
+"""Steps of a code in which remainders are kept: they are at most half a code."""
+
+
+def remainders(codes: np.ndarray) -> np.ndarray:
+    """What `encode_features` rounds away of codes within -127..127, [n_vertices, n_stored], as signed bytes:
+    a quarter of the memory that a copy of the codes would take.
+
+    >>> codes = np.array([[1.25, -3.5]], np.float32)
+    >>> restore(codes + 9, encode_features(codes), remainders(codes)).round(2).tolist()
+    [[1.25, -3.5]]
+    """
+    out = np.empty(codes.shape, np.int8)
+    for first in range(0, len(codes), ROWS_AT_ONCE):
+        some = codes[first : first + ROWS_AT_ONCE]
+        steps = np.rint((some - np.rint(some)) * REMAINDER_STEPS)
+        out[first : first + ROWS_AT_ONCE] = np.clip(steps, -127, 127)  # less than half: rounded as before
+    return out
+
+
+def restore(codes: np.ndarray, whole: np.ndarray, left: np.ndarray, share: float = 1.0) -> np.ndarray:
+    """Move `codes` [n_vertices, n_stored] float32, in place, by `share` of the way back to what they were
+    when `encode_features` made `whole` of them and `remainders` made `left`. Returns `codes`."""
+    for first in range(0, len(codes), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        before = whole[rows] + left[rows] * np.float32(1 / REMAINDER_STEPS)
+        codes[rows] += np.float32(share) * (before - codes[rows])
+    return codes

@@ -42,9 +42,9 @@ RAY_BYTES = {False: 300, True: 1_900}
 """Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
 20 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all rays
 of an unbounded scene do, at 33. While the samples are put together they are there twice."""
-CHANNEL_BYTES = 6
-"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
-the code that is played."""
+CHANNEL_BYTES = 7
+"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, the
+code that is played, and what was rounded away of it, should training lose more than it gains."""
 DENSITY_BYTES = 40
 """Bytes that a density takes; a cell of the features holds as many densities as finer cells."""
 REFINED_BY = 0.8

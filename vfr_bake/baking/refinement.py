@@ -27,7 +27,7 @@ from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
-from vfr_bake.baking.grids import Layout, encode_features
+from vfr_bake.baking.grids import Layout, encode_features, remainders, restore
 from vfr_bake.baking.head import FoldedHead, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
@@ -151,6 +151,7 @@ class Tuning:
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
+        left = remainders(stored.features)
         with self._steps("refinement", refined_steps(self._config, choice, len(rays))) as steps:
             tuned = refine(stored, rays, steps, layout.density_range, head_rate, code_rate)
         del rays, densities  # they hold on to rows of a grid, for two of which there may be no room
@@ -159,7 +160,7 @@ class Tuning:
         if self._gained("refinement", before, after):
             stored = tuned
         else:
-            stored.features[:] = played
+            restore(stored.features, played, left)
             del grid
             grid = layout.grid(stored.density, stored.features)
         every = self._held_out.look("all", grid, runner(stored.head), 0)
@@ -188,7 +189,7 @@ class Tuning:
         """Head and features adapted to the lookups and bits that are played, if that gains anything. Changes
         the features of `stored` in place."""
         rays = collect_training_rays(teacher, grid, self.n_fetches)
-        asked = refined_steps(self._config, self._choice, len(rays))
+        asked, left = refined_steps(self._config, self._choice, len(rays)), remainders(stored.features)
         with self._steps("refinement at k", asked) as steps:
             tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)
         played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
@@ -196,7 +197,7 @@ class Tuning:
         after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
         if self._gained("refinement at k", before, after):
             return tuned
-        stored.features[:] = played
+        restore(stored.features, played, left)
         return stored
 
     @contextmanager

@@ -19,7 +19,7 @@ from player.march.contraction import contract
 from player.render import render
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.baking.bake import _Bake, bake
-from vfr_bake.baking.cells import lattice_step, weighty_cells
+from vfr_bake.baking.cells import lattice_step, rays_of_contracted_views, weighty_cells
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import unit_points
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
@@ -113,6 +113,16 @@ def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
     camera = model.model_cameras()[0].c2w[:3, 3]
     x, y, z = ((contract(camera) + 2) * 8).astype(int)  # of the 32 blocks in 4 units
     assert not cells[x, y, z], "a camera stands in empty space"
+
+
+def test_many_views_take_no_more_rays_than_there_is_time_for(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = rays_of_contracted_views(model, 64)
+    monkeypatch.setattr("vfr_bake.baking.cells.MOST_SEEING", few / 2)
+    assert rays_of_contracted_views(model, 64) == pytest.approx(few / 2)
+    many = replace(model, cameras=[camera.resized(800, 533) for camera in model.cameras] * 18)
+    assert rays_of_contracted_views(many, 64) == pytest.approx(few / 2)
 
 
 def depth_at_the_mean_angle(model: Model, asset: Asset, camera: Camera) -> np.ndarray:
