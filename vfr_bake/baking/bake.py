@@ -283,7 +283,7 @@ class _Bake:
         matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
         refined = held_out.look("refined", grid, head, self.n_fetches)
         del grid
-        prices = Prices(needed, matters)
+        prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
 

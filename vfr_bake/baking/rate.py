@@ -38,7 +38,6 @@ from player.asset.pyramid import Pyramid, PyramidValues, places_between
 from player.asset.sections import Grid
 from player.asset.structure import encode_structure
 from player.asset.symbols import N_CLASSES, LevelRows, level_rows
-from vfr_bake.baking.detail.detail import Needed
 from vfr_bake.baking.detail.shown import Wanted
 from vfr_bake.baking.distillation import TeacherRays, collect_training_rays
 from vfr_bake.baking.grids import Layout
@@ -292,26 +291,30 @@ def importance_of_levels(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -
 class Prices:
     """Refined values, and what is stored of them at each price."""
 
-    def __init__(self, needed: Needed, matters: Importance) -> None:
-        layout = needed.layout
+    def __init__(self, layout: Layout, densities: Wanted, features: Wanted, matters: Importance) -> None:
+        """
+        Args:
+            layout: the finest level.
+            densities, features: what of it is shown, and what it should be.
+            matters: how much the finest level's values matter.
+        """
+        pyramids = layout.pyramids
         self._densities = Choices(
             "densities",
-            needed.wanted_densities,
-            _shown_importance(
-                "densities", needed.wanted_densities, layout.pyramids.densities, matters.densities
-            ),
+            densities,
+            _shown_importance("densities", densities, pyramids.densities, matters.densities),
             np.ones(1),
             layout.density_step,
         )
         self._features = Choices(
             "features",
-            needed.wanted_features,
-            _shown_importance("features", needed.wanted_features, layout.pyramids.features, matters.features),
+            features,
+            _shown_importance("features", features, pyramids.features, matters.features),
             matters.channels,
         )
         self._structure_bytes = sum(
             len(encode_structure(wanted.pyramid, level))
-            for wanted in (needed.wanted_densities, needed.wanted_features)
+            for wanted in (densities, features)
             for level in range(len(wanted.pyramid.levels))
         )
 

@@ -24,8 +24,15 @@ from vfr_bake.baking.detail.errors import (
     levels_of_features,
 )
 from vfr_bake.baking.detail.search import largest
-from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, live_of_blocks, take_rows, thinned
-from vfr_bake.baking.detail.shown import COARSEST_SHOWN, Choice, Wanted, mean_values, wanted_values
+from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, live_of_blocks, thinned
+from vfr_bake.baking.detail.shown import (
+    COARSEST_SHOWN,
+    Choice,
+    Wanted,
+    mean_values,
+    take_rows,
+    wanted_values,
+)
 from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout, encode_features
 from vfr_bake.baking.held_out import Head, HeldOut, Shown
@@ -47,6 +54,17 @@ they are 2^l at most, as many as its cells are wide."""
 
 
 @dataclass(frozen=True, eq=False)
+class Levels:
+    """Which levels show a pyramid, and the values of all of them."""
+
+    choice: Choice
+    dropped: list[np.ndarray]
+    """The bricks of each level that are dropped, as in `Choice.dropped`."""
+    values: list[np.ndarray]
+    """For each level [n_vertices, n_channels] float32, the finest first."""
+
+
+@dataclass(frozen=True, eq=False)
 class Needed:
     """What is to be stored of refined values."""
 
@@ -57,8 +75,15 @@ class Needed:
     features: np.ndarray
     """[n_features, n_channels] float32, the same."""
     wanted_densities: Wanted
-    wanted_features: Wanted
-    """What is shown, and what of it."""
+    """What of the densities is shown, and what it should be."""
+    levels_of_features: Levels
+
+    def take_features(self) -> Wanted:
+        """The same of the features. It takes the place of `features`, because there may be no room for both:
+        they are not what they were after that."""
+        levels = self.levels_of_features
+        shown = levels.choice.shown(levels.dropped)
+        return wanted_values(levels.choice, levels.values, shown, sampled=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +188,8 @@ class Detail:
         shown = wanted_values(choice, values, choice.shown(dropped), sampled=True)
         return shown, levels.at(choice.levels(dropped))
 
-    def _features(self, layout: Layout, features: np.ndarray, grid: SparseGrid, rays: TeacherRays) -> Wanted:
-        """The same of the features; a vertex counts in the means as much as it is seen."""
+    def _features(self, layout: Layout, features: np.ndarray, grid: SparseGrid, rays: TeacherRays) -> Levels:
+        """Which levels show the features; a vertex counts in the means as much as it is seen."""
         pyramid, codes = layout.pyramids.features, encode_features(features)
         heavy = heavy_vertices(levels_of_features(grid, pyramid, [codes]), len(codes), rays)
         values = mean_values(pyramid, features, heavy)
@@ -172,8 +197,7 @@ class Detail:
             grid, pyramid, [codes, *(encode_features(mean) for mean in values[1 : COARSEST_SHOWN + 1])]
         )
         choice = Choice(pyramid, tuple(feature_errors(levels, rays)))
-        dropped = self._shown(choice, levels, FEATURE_LOSS, "features' detail")
-        return wanted_values(choice, values, choice.shown(dropped), sampled=False)
+        return Levels(choice, self._shown(choice, levels, FEATURE_LOSS, "features' detail"), values)
 
     def _shown(
         self, choice: Choice, levels: LevelsOfDensities | LevelsOfFeatures, share: float, name: str

@@ -33,7 +33,6 @@ N_RAYS = 4_000_000
 """Rays whose weights are summed, roughly, where the views have as many pixels."""
 RAYS_AT_ONCE = 1 << 16
 BRICKS_AT_ONCE = 1 << 12
-ROWS_AT_ONCE = 1 << 18
 
 
 def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress: Progress) -> np.ndarray:
@@ -158,15 +157,3 @@ def thinned(layout: Layout, blocks: np.ndarray) -> Thinned:
         features = corners_within(layout.features, overlapping(cells, fine, others, coarse))
     left = replace(layout, densities=densities.vertices, features=features.vertices)
     return Thinned(left, densities.rows, features.rows)
-
-
-def take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """`values[rows]` of ascending rows, in the place of `values`: there may be no room for them twice.
-
-    >>> take_rows(np.arange(8), np.array([1, 4, 7])).tolist()
-    [1, 4, 7]
-    """
-    for first in range(0, len(rows), ROWS_AT_ONCE):
-        some = rows[first : first + ROWS_AT_ONCE]
-        values[first : first + len(some)] = values[some]
-    return values[: len(rows)]

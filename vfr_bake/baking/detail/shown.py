@@ -176,13 +176,25 @@ class Wanted(NamedTuple):
 
 def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, sampled: bool) -> Wanted:
     """The values where `shown` is left of the pyramid of `choice`, from those of all levels of the whole
-    pyramid, as `mean_values` finds them. If they are `sampled`, a coarser vertex that has a finer one at its
-    place has the value of that."""
+    pyramid, as `mean_values` finds them; they are changed. If they are `sampled`, a coarser vertex that has a
+    finer one at its place has the value of that."""
     found: list[np.ndarray] = []
     for level, (whole, left) in enumerate(zip(choice.pyramid.vertices, shown.vertices, strict=True)):
-        of_level = values[level][whole.rows(left.index)]
+        of_level = take_rows(values[level], whole.rows(left.index))
         if sampled and level:
             finer = shown.vertices[level - 1].rows(left.index * 2)
             of_level[finer >= 0] = found[-1][finer[finer >= 0]]
         found.append(of_level)
     return Wanted(shown, found)
+
+
+def take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """`values[rows]` of ascending rows, in the place of `values`: there may be no room for them twice.
+
+    >>> take_rows(np.arange(8), np.array([1, 4, 7])).tolist()
+    [1, 4, 7]
+    """
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        some = rows[first : first + ROWS_AT_ONCE]
+        values[first : first + len(some)] = values[some]
+    return values[: len(rows)]

@@ -9,7 +9,8 @@ from player.asset.bricks import stored_bits
 from player.cameras.camera import Camera
 from player.march.march import sample_rays
 from vfr_bake.baking.cells import Resolutions
-from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, take_rows, thinned
+from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, thinned
+from vfr_bake.baking.detail.shown import take_rows
 from vfr_bake.baking.grids import Layout, make_layout
 from vfr_bake.data.demo import demo_cameras
 

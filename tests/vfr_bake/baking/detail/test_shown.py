@@ -156,7 +156,10 @@ def test_what_is_stored_shows_each_place_by_the_level_that_was_chosen(seed: int)
     for share in (0.0, 0.3, 0.7, 0.95, 1.0):
         dropped = choice.dropped(choice.worth(share))
         levels, shown = choice.levels(dropped), choice.shown(dropped)
-        stored = stored_of(wanted_values(choice, values, shown, True), "densities", 3)
+        for whole, left in zip(pyramid.vertices, shown.vertices, strict=True):
+            assert (np.diff(whole.rows(left.index)) > 0).all(), "so rows are taken in their place"
+        wanted = wanted_values(choice, [of_level.copy() for of_level in values], shown, True)
+        stored = stored_of(wanted, "densities", 3)
         own = PyramidValues(shown, tuple(np.zeros((v.n, 1), np.int8) for v in shown.vertices))
         box = np.array(layout.aabb)
         built = build_grid(stored, own, box, layout.step, (1,) * len(shown.levels), layout.density_range)
