@@ -92,6 +92,7 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "n_channels": 24,
         "channel_loss_db": 0.03,
         "sample_loss_db": 0.02,
+        "code_loss_db": 0.02,
         "code_levels": 64,
         "head_bands": 5,
         "target_loss_db": 0.5,

@@ -41,7 +41,7 @@ from vfr_bake.baking.grids import (
     project,
 )
 from vfr_bake.baking.head import fold_head, runner, small_head
-from vfr_bake.baking.held_out import BETWEEN, HeldOut, views_between
+from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
 from vfr_bake.baking.limits import (
     MANIFEST_BYTES,
     cells_that_fit,
@@ -52,7 +52,7 @@ from vfr_bake.baking.limits import (
     unwritten_asset,
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
-from vfr_bake.baking.plan import REFINED_BY, make_plan
+from vfr_bake.baking.plan import make_plan, refinement_seconds
 from vfr_bake.baking.rate import FIRST_PRICE, PRICES_TRIED, RAISED, Prices, Spent, importance, turning_point
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
@@ -64,9 +64,8 @@ from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
-LEAST_REFINED = 0.4
-"""Share of a bake's minutes that refinement may take however long everything before it took: a small head
-that is hardly trained is worse than a bake that takes longer."""
+SPARING = 0.25
+"""Factor of what choices may lose where the asset has already lost what its preset aims at."""
 N_SENSITIVITY = 50_000
 """Rays that decide which directions of the features the colours depend on."""
 
@@ -132,15 +131,15 @@ class _Bake:
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
-        seconds = 60 * self.choice.minutes
-        left = max(REFINED_BY * seconds - (time.monotonic() - self._begun), LEAST_REFINED * seconds)
+        left = refinement_seconds(self.choice, time.monotonic() - self._begun)
         tuning = Tuning(self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, teacher)
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
-        most_db, played = self.choice.culled_loss_db, runner(stored.head, tuning.ranges)
+        most_db = self._allowed(self.choice.culled_loss_db, self.held_out.stages[-1])
+        played = runner(stored.head, tuning.ranges)
         detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
         with self._part("detail"):
             needed = self._needed(detail, layout, stored, teacher)
@@ -253,6 +252,11 @@ class _Bake:
         cameras += views_between(self.model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
         return detail.needed(layout, stored.density, stored.features, cameras, teacher)
 
+    def _allowed(self, most_db: float, now: Stage) -> float:
+        """What a choice may lose by what it takes away, dB: `most_db`, or less where the asset as it is `now`
+        has already lost what the preset aims at."""
+        return most_db if now.loss.db + most_db <= self.choice.target_loss_db else SPARING * most_db
+
     def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
@@ -282,6 +286,7 @@ class _Bake:
         grid = layout.grid(stored.density, stored.features)
         matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
         refined = held_out.look("refined", grid, head, self.n_fetches)
+        allowed = self._allowed(self.choice.code_loss_db, refined)
         del grid
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
@@ -297,7 +302,7 @@ class _Bake:
             after = held_out.look("codes", grid, head, self.n_fetches)
             if config.max_loss_db is not None:
                 return after.loss.db <= config.max_loss_db
-            return held_out.lost(refined.shown, after.shown).most <= self.choice.code_loss_db
+            return held_out.lost(refined.shown, after.shown).worst <= allowed
 
         def is_too_large(price: float) -> bool:
             n_bytes = others + at(price).n_bytes

@@ -26,6 +26,7 @@ from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
+from vfr_bake.presets import BakeChoice
 from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
@@ -50,6 +51,9 @@ DENSITY_BYTES = 40
 REFINED_BY = 0.8
 """Share of a bake's time after which refinement ends: then the mesh is made, and the written files are
 played."""
+LEAST_REFINED = 0.4
+"""Share of a bake's minutes that refinement may take however long everything before it took: a small head
+that is hardly trained is worse than a bake that takes longer."""
 VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
@@ -65,6 +69,8 @@ OWN_HEAD = 4
 REST_COST = {False: 2_700_000, True: 1_200_000}
 """Time of all else, which hardly depends on the scene, in the same unit: what is measured, the mesh, the
 files."""
+CHOSEN_COST = {False: 3_300_000, True: 1_600_000}
+"""Time in which it is chosen what is stored of refined values, detail and codes, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -181,5 +187,16 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)
     if config.refine_steps is None:
-        refinement = min(refinement, max(60 * REFINED_BY * choice.minutes - before, 0.0))
-    return before + refinement + ray_seconds * REST_COST[unbounded]
+        refinement = min(refinement, refinement_seconds(choice, before))
+    return before + refinement + ray_seconds * (CHOSEN_COST[unbounded] + REST_COST[unbounded])
+
+
+def refinement_seconds(choice: BakeChoice, before: float) -> float:
+    """Seconds that all rounds of refinement may take, where everything before them took so many.
+
+    >>> from vfr_bake.presets import PRESETS
+    >>> refinement_seconds(PRESETS["balanced"], 100.0), refinement_seconds(PRESETS["balanced"], 1000.0)
+    (284.0, 192.0)
+    """
+    seconds = 60 * choice.minutes
+    return max(REFINED_BY * seconds - before, LEAST_REFINED * seconds)

@@ -44,6 +44,11 @@ class Loss(NamedTuple):
         return self.db + (self.spread or 0.0)
 
     @property
+    def worst(self) -> float:
+        """The loss in dB that is hardly exceeded: two standard errors above what was measured."""
+        return self.db + 2 * (self.spread or 0.0)
+
+    @property
     def least(self) -> float:
         """The loss in dB that the photographs show: one standard error below what was measured."""
         return self.db - (self.spread or 0.0)

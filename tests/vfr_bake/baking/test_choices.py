@@ -12,7 +12,7 @@ import pytest
 from player.asset.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
-from vfr_bake.baking.bake import bake
+from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.baking.witness_loss import Loss
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
@@ -93,3 +93,13 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
     )
     assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
     assert set(tuning.lookups.values()) == {0.0}
+
+
+def test_an_asset_that_has_lost_what_is_aimed_at_gives_up_less(models: dict[str, Model]) -> None:
+    work = _Bake(models["matte"], BakeConfig(check_views=1), quiet)
+    aimed = work.choice.target_loss_db
+
+    def allowed(lost: float) -> float:
+        return work._allowed(0.04, SimpleNamespace(loss=Loss(lost, 0.1)))  # type: ignore[arg-type]
+
+    assert [allowed(lost) for lost in (-1.0, aimed - 0.05, aimed - 0.03, 5.0)] == [0.04, 0.04, 0.01, 0.01]

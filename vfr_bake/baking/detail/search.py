@@ -20,8 +20,8 @@ class Amount(NamedTuple):
 
 
 def largest(lost: Callable[[float], Loss], low: float, high: float, most_db: float) -> Amount | None:
-    """The largest amount between `low` and `high` that loses no more than `most_db`, with one standard error
-    to spare, to a 64th of the range; None where even `low` loses more.
+    """The largest amount between `low` and `high` that loses no more than `most_db`, with two standard
+    errors to spare, to a 64th of the range; None where even `low` loses more.
 
     `lost` tells what an amount loses. It is asked for some of them, and is taken to rise.
 
@@ -29,13 +29,13 @@ def largest(lost: Callable[[float], Loss], low: float, high: float, most_db: flo
     0.5
     """
     tried = Amount(low, lost(low))
-    if tried.loss.most > most_db:
+    if tried.loss.worst > most_db:
         return None
     found = tried
     for _ in range(N_TRIES):
         middle = (low + high) / 2
         tried = Amount(middle, lost(middle))
-        if tried.loss.most <= most_db:
+        if tried.loss.worst <= most_db:
             low, found = middle, tried
         else:
             high = middle

@@ -189,7 +189,7 @@ def test_nothing_is_dropped_for_nothing() -> None:
         return Loss(amount, 0.01)
 
     found = largest(lost, 0.0, 1.0, 0.3)
-    assert found is not None and found.loss.most <= 0.3 < found.loss.most + 1 / 32
+    assert found is not None and found.loss.worst <= 0.3 < found.loss.worst + 1 / 32
     assert len(tried) == 7
     assert largest(lost, 0.5, 1.0, 0.3) is None
 

@@ -80,6 +80,7 @@ def test_loss_and_spread_are_those_written_out(counts: list[int], whole: list[in
         assert found.db == pytest.approx(loss, abs=1e-9)
         assert found.spread == pytest.approx(spread, abs=1e-9)
         assert (found.most, found.least) == pytest.approx((loss + spread, loss - spread))
+        assert found.worst == pytest.approx(loss + 2 * spread)
 
 
 def test_errors_are_between_8_bit_pictures_over_the_background() -> None:
