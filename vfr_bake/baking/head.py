@@ -9,6 +9,7 @@ trained as if they were not (straight through).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -183,3 +184,15 @@ def runner(
         return rgb
 
     return colours
+
+
+def between(first: HeadWeights, second: HeadWeights, share: float) -> HeadWeights:
+    """The head whose weights lie a `share` of the way from those of `first` to those of `second`, which has
+    layers of the same sizes."""
+
+    def mixed(a: Any, b: Any) -> Any:
+        if isinstance(a, tuple):
+            return tuple(mixed(*two) for two in zip(a, b, strict=True))
+        return a + share * (b - a) if isinstance(a, np.ndarray) else a
+
+    return HeadWeights(**{name: mixed(value, vars(second)[name]) for name, value in vars(first).items()})

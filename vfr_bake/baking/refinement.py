@@ -28,7 +28,7 @@ from player.march.march import MAX_TAU
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import Layout, encode_features, remainders, restore
-from vfr_bake.baking.head import FoldedHead, runner, small_head
+from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
 from vfr_bake.config import BakeConfig
@@ -160,9 +160,18 @@ class Tuning:
         if self._gained("refinement", before, after):
             stored = tuned
         else:
-            restore(stored.features, played, left)
             del grid
-            grid = layout.grid(stored.density, stored.features)
+            half = between(stored.head, tuned.head, 0.5), (stored.density + tuned.density) / 2
+            tuned = Stored(half[0], restore(stored.features, played, left, 0.5), half[1])
+            grid = layout.grid(tuned.density, tuned.features)
+            after = self._held_out.measure("half refined", grid, runner(tuned.head), 0)
+            if self._gained("refinement", before, after):
+                self.left_out["refinement"] = "half of the way: all of it lost more on what it has not seen"
+                stored = tuned
+            else:
+                restore(stored.features, played, left)
+                del grid
+                grid = layout.grid(stored.density, stored.features)
         every = self._held_out.look("all", grid, runner(stored.head), 0)
         before = self._choose_lookups_and_bits(stored, grid, teacher)
         lost = self._held_out.lost(every.shown, before.shown).most

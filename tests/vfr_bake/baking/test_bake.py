@@ -196,6 +196,32 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
     assert left.head is stored.head
 
 
+def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=32, k=4, refine_steps=20)
+    work = _Bake(model, config, quiet)
+    layout, _ = work._cells()
+    stored, teacher = work._store(layout, 20_000)
+    density, features = stored.density.copy(), stored.features.copy()
+
+    def moved(stored: Stored, *_: object) -> Stored:
+        stored.features[:] = np.clip(features + 2, -127, 127)
+        output, bias = stored.head.output
+        return Stored(replace(stored.head, output=(output, bias + 1)), stored.features, density + 4)
+
+    answers = iter([False, True])
+    monkeypatch.setattr("vfr_bake.baking.refinement.refine", moved)
+    monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: next(answers, False))
+    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    before = stored.head
+    left = tuning.run(stored, layout, teacher)
+    assert "half" in tuning.left_out["refinement"]
+    np.testing.assert_allclose(left.density, density + 2)
+    expected = (features + np.clip(features + 2, -127, 127)) / 2
+    assert np.abs(left.features - expected).max() < 0.01
+    np.testing.assert_allclose(left.head.output[1], before.output[1] + 0.5)
+    np.testing.assert_array_equal(left.head.spatial[0][0], before.spatial[0][0])
+
+
 def test_a_round_takes_fewer_steps_where_there_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("vfr_bake.baking.refinement.time", SimpleNamespace(monotonic=lambda: now))
