@@ -53,7 +53,16 @@ from vfr_bake.baking.limits import (
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, refinement_seconds
-from vfr_bake.baking.rate import FIRST_PRICE, PRICES_TRIED, RAISED, Prices, Spent, importance, turning_point
+from vfr_bake.baking.rate import (
+    FIRST_PRICE,
+    LOWEST_PRICE,
+    PRICES_TRIED,
+    RAISED,
+    Prices,
+    Spent,
+    importance,
+    turning_point,
+)
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.baking.witness_loss import Loss
@@ -291,6 +300,8 @@ class _Bake:
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
+        kept: dict[float, GridArrays] = {}
+        """What is stored at the last price that lost little, which need not be found again."""
 
         def at(price: float) -> Spent:
             tried.append(price)
@@ -298,20 +309,26 @@ class _Bake:
             return prices.at(price)
 
         def loses_little(price: float) -> bool:
-            grid = layout.played(at(price).arrays)
-            after = held_out.look("codes", grid, head, self.n_fetches)
+            arrays = at(price).arrays
+            after = held_out.look("codes", layout.played(arrays), head, self.n_fetches)
             if config.max_loss_db is not None:
-                return after.loss.db <= config.max_loss_db
-            return held_out.lost(refined.shown, after.shown).worst <= allowed
+                loses = after.loss.db > config.max_loss_db
+            else:
+                loses = held_out.lost(refined.shown, after.shown).worst > allowed
+            if not loses:
+                kept.clear()
+                kept[price] = arrays
+            return not loses
 
         def is_too_large(price: float) -> bool:
             n_bytes = others + at(price).n_bytes
             return n_bytes + mesh_bytes(round(n_bytes), None) > 1e6 * (config.max_mb or np.inf)
 
-        price, _ = turning_point(loses_little, FIRST_PRICE * held_out.model_error)
+        first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
+        price, _ = turning_point(loses_little, first, lowest if config.max_loss_db is None else 0.0)
         if config.max_mb is not None and is_too_large(price):
             _, price = turning_point(is_too_large, RAISED * price)
-        return prices.at(price).arrays
+        return kept[price] if price in kept else prices.at(price).arrays
 
     def _other_bytes(self, max_mb: float) -> int:
         """What the files of an asset of `max_mb` megabytes take beside the stored values and the
