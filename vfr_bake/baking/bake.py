@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,10 +33,12 @@ from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
     Layout,
+    Parts,
     Projection,
     code_step,
     evaluate_densities,
     evaluate_features,
+    features_of_field,
     head_sensitivity,
     make_layout,
     project,
@@ -136,14 +139,14 @@ class _Bake:
 
     def run(self, folder: Path, force: bool) -> BakeResult:
         layout, n_rays = self._cells()
-        stored, teacher = self._store(layout, n_rays)
+        stored, teacher, again = self._store(layout, n_rays)
         if self.config.target_ms is not None:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
         left = refinement_seconds(self.choice, time.monotonic() - self._begun)
         tuning = Tuning(self.config, self.choice, self.held_out, self._progress, left)
         with self._part("refinement"):
-            stored = tuning.run(stored, layout, teacher)
+            stored = tuning.run(stored, layout, teacher, again)
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
@@ -227,8 +230,9 @@ class _Bake:
             self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
         return mesh, removed
 
-    def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays]:
-        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them."""
+    def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays, Callable[[], Parts]]:
+        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them; what
+        refinement learns from; and what finds the codes again once they are refined."""
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
@@ -253,7 +257,8 @@ class _Bake:
             f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
             "than that after 'grid', before refinement"
         )
-        return Stored(head, features, density), teacher
+        again = partial(features_of_field, model, layout, projection.matrix / step)
+        return Stored(head, features, density), teacher, again
 
     def _needed(self, detail: Detail, layout: Layout, stored: Stored, teacher: TeacherRays) -> Needed:
         """No more detail of the refined values than the pictures need. Changes the features of `stored`."""

@@ -14,7 +14,7 @@ S = M^(1/2) and U holds the first r eigenvectors of S G S (Eckart-Young).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -47,6 +47,10 @@ ROWS_AT_ONCE = 1 << 18
 """Vertices whose codes are rounded at once."""
 LEAST_SENSITIVITY = 1e-6
 """Every eigenvalue of M is at least this share of their mean, so that S has an inverse."""
+
+
+Parts = Iterable[tuple[slice, np.ndarray]]
+"""Rows of a table, and what they hold [n, n_columns], part after part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +183,18 @@ def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.n
 
 def evaluate_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
     """The field's features times `matrix` [n_stored, n_channels]: [n_features, n_stored] float32."""
-    vertices, back = layout.features, matrix.T.astype(np.float32)
-    features = table(len(vertices), len(matrix))
-    for rows, points in _chunks(vertices, layout.contracted):
-        np.matmul(model.field.features(points), back, out=features[rows])
-        progress(rows.stop, len(vertices))
+    features = table(len(layout.features), len(matrix))
+    for rows, values in features_of_field(model, layout, matrix):
+        features[rows] = values
+        progress(rows.stop, len(features))
     return features
+
+
+def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts:
+    """The same a part at a time."""
+    back = matrix.T.astype(np.float32)
+    for rows, points in _chunks(layout.features, layout.contracted):
+        yield rows, model.field.features(points) @ back
 
 
 def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
@@ -295,12 +305,7 @@ REMAINDER_STEPS = 256
 
 def remainders(codes: np.ndarray) -> np.ndarray:
     """What `encode_features` rounds away of codes within -127..127, [n_vertices, n_stored], as signed bytes:
-    a quarter of the memory that a copy of the codes would take.
-
-    >>> codes = np.array([[1.25, -3.5]], np.float32)
-    >>> restore(codes + 9, encode_features(codes), remainders(codes)).round(2).tolist()
-    [[1.25, -3.5]]
-    """
+    a quarter of the memory that a copy of the codes would take."""
     out = np.empty(codes.shape, np.int8)
     for first in range(0, len(codes), ROWS_AT_ONCE):
         some = codes[first : first + ROWS_AT_ONCE]
@@ -309,11 +314,26 @@ def remainders(codes: np.ndarray) -> np.ndarray:
     return out
 
 
-def restore(codes: np.ndarray, whole: np.ndarray, left: np.ndarray, share: float = 1.0) -> np.ndarray:
-    """Move `codes` [n_vertices, n_stored] float32, in place, by `share` of the way back to what they were
-    when `encode_features` made `whole` of them and `remainders` made `left`. Returns `codes`."""
-    for first in range(0, len(codes), ROWS_AT_ONCE):
+def unrounded(whole: np.ndarray, left: np.ndarray) -> Parts:
+    """The codes of which `encode_features` made `whole` and `remainders` made `left`, a part at a time.
+
+    >>> codes = np.array([[1.25, -3.5]], np.float32)
+    >>> [part.round(2).tolist() for _, part in unrounded(encode_features(codes), remainders(codes))]
+    [[[1.25, -3.5]]]
+    """
+    for first in range(0, len(whole), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
-        before = whole[rows] + left[rows] * np.float32(1 / REMAINDER_STEPS)
-        codes[rows] += np.float32(share) * (before - codes[rows])
-    return codes
+        yield rows, whole[rows] + left[rows] * np.float32(1 / REMAINDER_STEPS)
+
+
+def move_towards(codes: np.ndarray, others: Parts, share: float) -> None:
+    """Move `codes` [n_vertices, n_stored] float32, in place, by a `share` of the way to `others`, which are
+    given a part at a time: there may be no room for both.
+
+    >>> codes = np.zeros((3, 1), np.float32)
+    >>> move_towards(codes, [(slice(0, 2), np.ones((2, 1)))], 0.25)
+    >>> codes[:, 0].tolist()
+    [0.25, 0.25, 0.0]
+    """
+    for rows, values in others:
+        codes[rows] += np.float32(share) * (values - codes[rows])

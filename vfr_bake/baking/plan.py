@@ -7,7 +7,7 @@ answers rays on this machine.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,10 @@ N_RAYS = 2_000_000
 """Rays that head and stored values are trained on, where there is memory for them."""
 UNBOUNDED_RAYS = 500_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
+RAYS_SHARE = 0.3
+"""Share of the memory for cells and rays that rays may take at least, if they need it. Finer grids took so
+much of it that a scene of 71 phone photographs was taught by a fifth of the rays, and its refinement lost
+more than it gained."""
 FEWEST_RAYS = 100_000
 RAYS_OF_CELL = 0.8
 """Training rays for each stored cell of the features' grid: as many as teach all of lego's. A third of them
@@ -43,9 +47,9 @@ RAY_BYTES = {False: 300, True: 1_900}
 """Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
 20 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all rays
 of an unbounded scene do, at 33. While the samples are put together they are there twice."""
-CHANNEL_BYTES = 7
-"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, the
-code that is played, and what was rounded away of it, should training lose more than it gains."""
+CHANNEL_BYTES = 6
+"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
+the code that is played."""
 DENSITY_BYTES = 40
 """Bytes that a density takes; a cell of the features holds as many densities as finer cells."""
 REFINED_BY = 0.8
@@ -94,8 +98,11 @@ class Plan:
 
     @property
     def most_cells(self) -> int:
-        """The number of cells that fit beside the fewest rays."""
-        return int((self.room - FEWEST_RAYS * self.ray_bytes) / self.cell_bytes)
+        """The number of cells that fit beside the rays that teach them. Where there is no room for all rays,
+        they have a share of it: what few rays have refined shows other rays less than it did before."""
+        every = (UNBOUNDED_RAYS if self.unbounded else N_RAYS) * self.ray_bytes
+        rays = max(min(every, RAYS_SHARE * self.room), FEWEST_RAYS * self.ray_bytes)
+        return int((self.room - rays) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
         """Training rays for so many cells, as many as they need and for which there is room beside them."""
@@ -123,6 +130,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
+    plan = replace(plan, n_cells=min(plan.n_cells, float(max(plan.most_cells, 0))))
     if plan.most_cells <= 0 or marks > room:
         least = max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(

@@ -27,7 +27,7 @@ from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
-from vfr_bake.baking.grids import Layout, encode_features, remainders, restore
+from vfr_bake.baking.grids import Layout, Parts, encode_features, move_towards, remainders, unrounded
 from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
@@ -132,9 +132,9 @@ class Tuning:
         self._held_out, self._progress = held_out, progress
         self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
 
-    def run(self, stored: Stored, layout: Layout, teacher: TeacherRays) -> Stored:
+    def run(self, stored: Stored, layout: Layout, teacher: TeacherRays, again: Callable[[], Parts]) -> Stored:
         """Head and stored values adapted to each other: at every sample, then at the k lookups that are
-        played. Changes the features of `stored` in place."""
+        played. Changes the features of `stored` in place; `again` finds what they were, should that lose."""
         choice = self._choice
         grid = layout.grid(stored.density, stored.features)
         if choice.refine_steps == 0:
@@ -151,25 +151,25 @@ class Tuning:
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-        left = remainders(stored.features)
         with self._steps("refinement", refined_steps(self._config, choice, len(rays))) as steps:
             tuned = refine(stored, rays, steps, layout.density_range, head_rate, code_rate)
         del rays, densities  # they hold on to rows of a grid, for two of which there may be no room
-        played, grid = grid.features, layout.grid(tuned.density, tuned.features)
+        grid = layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
         if self._gained("refinement", before, after):
             stored = tuned
         else:
             del grid
-            half = between(stored.head, tuned.head, 0.5), (stored.density + tuned.density) / 2
-            tuned = Stored(half[0], restore(stored.features, played, left, 0.5), half[1])
+            move_towards(stored.features, again(), 0.5)
+            head, density = between(stored.head, tuned.head, 0.5), (stored.density + tuned.density) / 2
+            tuned = Stored(head, stored.features, density)
             grid = layout.grid(tuned.density, tuned.features)
             after = self._held_out.measure("half refined", grid, runner(tuned.head), 0)
             if self._gained("refinement", before, after):
                 self.left_out["refinement"] = "half of the way: all of it lost more on what it has not seen"
                 stored = tuned
             else:
-                restore(stored.features, played, left)
+                move_towards(stored.features, again(), 1.0)
                 del grid
                 grid = layout.grid(stored.density, stored.features)
         every = self._held_out.look("all", grid, runner(stored.head), 0)
@@ -206,7 +206,7 @@ class Tuning:
         after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
         if self._gained("refinement at k", before, after):
             return tuned
-        restore(stored.features, played, left)
+        move_towards(stored.features, unrounded(played, left), 1.0)
         return stored
 
     @contextmanager

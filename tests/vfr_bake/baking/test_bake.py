@@ -184,12 +184,12 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
     config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=32, k=4, refine_steps=20)
     work = _Bake(model, config, quiet)
     layout, _ = work._cells()
-    stored, teacher = work._store(layout, 20_000)
+    stored, teacher, again = work._store(layout, 20_000)
     density, features = stored.density.copy(), stored.features.copy()
     assert np.abs(features - np.rint(features)).max() > 0.4, "codes that are not whole yet"
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: False)
     tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
-    left = tuning.run(stored, layout, teacher)
+    left = tuning.run(stored, layout, teacher, again)
     np.testing.assert_array_equal(left.density, density)
     np.testing.assert_array_equal(encode_features(left.features), encode_features(features))
     assert np.abs(left.features - features).max() < 0.005, "a 256th of a code, and float32"
@@ -200,7 +200,7 @@ def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: p
     config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=32, k=4, refine_steps=20)
     work = _Bake(model, config, quiet)
     layout, _ = work._cells()
-    stored, teacher = work._store(layout, 20_000)
+    stored, teacher, again = work._store(layout, 20_000)
     density, features = stored.density.copy(), stored.features.copy()
 
     def moved(stored: Stored, *_: object) -> Stored:
@@ -213,7 +213,7 @@ def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: p
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: next(answers, False))
     tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
     before = stored.head
-    left = tuning.run(stored, layout, teacher)
+    left = tuning.run(stored, layout, teacher, again)
     assert "half" in tuning.left_out["refinement"]
     np.testing.assert_allclose(left.density, density + 2)
     expected = (features + np.clip(features + 2, -127, 127)) / 2
@@ -242,7 +242,7 @@ def test_a_round_takes_fewer_steps_where_there_is_no_time(monkeypatch: pytest.Mo
 def test_a_training_ray_composes_what_the_player_composes(model: Model, n_fetches: int) -> None:
     work = _Bake(model, BakeConfig(resolution=48, refine_steps=0, check_views=1), quiet)
     layout, _ = work._cells()
-    stored, _ = work._store(layout, 20_000)
+    stored, *_ = work._store(layout, 20_000)
     grid = layout.grid(stored.density, stored.features)
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_fetches)

@@ -16,7 +16,14 @@ from player.errors import TrainingError
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.limits import file_sizes, keep_to_time
-from vfr_bake.baking.plan import FEWEST_RAYS, N_RAYS, RAYS_OF_CELL, expected_seconds, make_plan
+from vfr_bake.baking.plan import (
+    FEWEST_RAYS,
+    N_RAYS,
+    RAYS_OF_CELL,
+    UNBOUNDED_RAYS,
+    expected_seconds,
+    make_plan,
+)
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
@@ -88,6 +95,16 @@ def test_less_memory_means_fewer_rays(model: Model) -> None:
     assert rays[0] < rays[1] < rays[2] == N_RAYS
     assert plans[1].n_rays(plans[1].most_cells) < rays[1]  # the more cells, the less room
     assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, sizes, strict=True))
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_as_many_cells_as_fit_leave_room_for_the_rays_that_teach_them(unbounded: bool, model: Model) -> None:
+    plan = replace(make_plan(model, BakeConfig(resolution=48)), unbounded=unbounded, cell_bytes=244.0)
+    enough = UNBOUNDED_RAYS if unbounded else N_RAYS
+    for gigabytes in (1.0, 3.2, 12.0):
+        room = replace(plan, room=1e9 * gigabytes)
+        assert room.n_rays(room.most_cells) >= min(0.299e9 * gigabytes / room.ray_bytes, 0.999 * enough)
+        assert room.most_cells * room.cell_bytes > 0.69 * room.room
 
 
 def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:

@@ -169,7 +169,7 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, k: int) 
     """In the grid of one level that refinement learns from."""
     work = _Bake(model, SETTINGS, quiet)
     layout, n_rays = work._cells()
-    stored, _ = work._store(layout, n_rays)
+    stored, *_ = work._store(layout, n_rays)
     grid = layout.grid(stored.density, stored.features)
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march_compiled.march(grid, rays_o, rays_d, k)

@@ -212,7 +212,7 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
     config = BakeConfig(resolution=40, feature_resolution=32, n_channels=6, check_views=1)
     work = bake._Bake(model, config, lambda *_: None)
     layout, _ = work._cells()
-    stored, teacher = work._store(layout, 40_000)
+    stored, teacher, _ = work._store(layout, 40_000)
     grid = layout.grid(stored.density, stored.features)
     found = importance(stored, layout, grid, teacher, None, model.background)
     assert found.channels.sum() == pytest.approx(1) and (found.channels > 0).all()
