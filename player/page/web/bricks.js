@@ -3,6 +3,7 @@
 
 // A coordinate of three components from 0 to 511 as one integer, which rises with (x, y, z).
 export const keyOf = (x, y, z) => (x << 18) | (y << 9) | z;
+export const coordOf = (key) => [key >> 18, (key >> 9) & 511, key & 511];
 
 export function popcount(word) {
   word -= (word >>> 1) & 0x55555555;

@@ -10,7 +10,7 @@
 //   the row of its first stored vertex, and which are stored: bits 0 to 8, and above them how many rows behind the first
 //   the vertex z = 8 is, which is in the next brick;
 // - features [rows * words * 4] the codes of each row, four channels a word.
-import { bitCount, BrickIndex, cornersOf } from "./corners.js";
+import { coordOf, popcount } from "./bricks.js";
 
 const MOST_DISTANCE = 31;
 const HALF_COLUMNS = 162; // of a brick with an apron
@@ -25,53 +25,56 @@ export function featureWords(nChannels) {
   return words < 3 ? words : words + (words & 1);
 }
 
-export function arrangeGrid(scene) {
-  const { manifest, densities, features } = scene;
-  const resolution = manifest.resolution, featureResolution = manifest.feature_resolution;
-  const shown = shownBricks(densities.levels, resolution);
-  const nb = bricksAlong(resolution);
-  const held = heldBricks(features, featureResolution);
-  const words = featureWords(features.n_channels);
+// Nothing anywhere: what is shown before a scene is.
+export const NO_GRID = {
+  resolution: 1, nb: 1, nSlots: 0, table: Int32Array.of(-1), density: new Uint32Array(0),
+  featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Int32Array.of(-1), columns: new Uint32Array(0), features: new Uint32Array(0),
+};
+
+// What the densities `{ levels, vertices, values, firstRows }` of parts.js become: { resolution, nb, nSlots, table, density }.
+export function arrangeDensities({ resolution, level_steps: levelSteps }, densities) {
+  const shown = shownBricks(densities.levels, resolution), nb = bricksAlong(resolution);
   return {
     resolution, nb, nSlots: shown.count,
-    table: tableOf(shown.levels, densities.levels, nb, manifest.level_steps),
-    density: densityTexels(densities, shown, resolution),
-    featureResolution, nf: held.n, nHeld: held.count,
-    owners: held.owners, columns: columnTexels(held),
-    words, features: featureTexels(features, words),
-    nRows: features.values.length / features.n_channels,
+    table: tableOf(shown.levels, nb, levelSteps),
+    density: densityTexels(densities, shown.levels, shown.count),
   };
 }
 
-// The bricks of each level that finer ones do not hide wholly: { levels: [{ level, first, coords, numbers }], count }.
+// What the features become: { featureResolution, nf, nHeld, nRows, owners, columns, features }.
+export function arrangeFeatures({ feature_resolution: featureResolution }, features) {
+  const held = heldBricks(features, featureResolution);
+  return {
+    featureResolution, nf: held.n, nHeld: held.count, nRows: features.values.length / features.n_channels,
+    owners: held.owners, columns: columnTexels(held), features: featureTexels(features, featureWords(features.n_channels)),
+  };
+}
+
+// The bricks of each level that finer ones do not hide wholly, [{ level, first, bricks, numbers }], in `bricks` of the level
+// those with the `numbers`; `count` of all levels.
 function shownBricks(levels, resolution) {
   const found = [];
   let first = 0;
-  levels.forEach(({ coords }, level) => {
-    const n = coords.length / 3;
-    let numbers = Uint32Array.from({ length: n }, (_, i) => i);
+  levels.forEach((bricks, level) => {
+    let numbers = Uint32Array.from({ length: bricks.n }, (_, i) => i);
     if (level) {
-      const finer = levels[level - 1].coords;
-      const nFiner = bricksAlong(Math.ceil(resolution / 2 ** (level - 1)));
-      const index = new BrickIndex(bricksAlong(Math.ceil(resolution / 2 ** level)), coords);
-      const hidden = new Uint8Array(n);
-      for (let i = 0; i < finer.length; i += 3) {
-        const owner = index.at(finer[i] >> 1, finer[i + 1] >> 1, finer[i + 2] >> 1);
+      const finer = levels[level - 1], nFiner = bricksAlong(Math.ceil(resolution / 2 ** (level - 1)));
+      const hidden = new Uint8Array(bricks.n);
+      for (let i = 0; i < finer.n; i++) {
+        const [x, y, z] = coordOf(finer.keys[i]), owner = bricks.find(x >> 1, y >> 1, z >> 1);
         if (owner >= 0) hidden[owner]++;
       }
       const halves = (c) => (2 * c + 1 < nFiner ? 2 : 1);
-      numbers = numbers.filter((i) => hidden[i] < halves(coords[3 * i]) * halves(coords[3 * i + 1]) * halves(coords[3 * i + 2]));
+      numbers = numbers.filter((i) => hidden[i] < coordOf(bricks.keys[i]).reduce((product, c) => product * halves(c), 1));
     }
-    const own = new Uint16Array(3 * numbers.length);
-    numbers.forEach((i, at) => own.set(coords.subarray(3 * i, 3 * i + 3), 3 * at));
-    found.push({ level, first, coords: own, numbers });
+    found.push({ level, first, bricks, numbers });
     first += numbers.length;
   });
   return { levels: found, count: first };
 }
 
-// Calls paint(place, i, j, k) for all places of the finest level in a brick of a level.
-function eachPlace(n, level, x, y, z, paint) {
+// Calls paint(place, i, j, k) for all places of the finest level in the brick at (x, y, z) of a level.
+function eachPlace(n, level, [x, y, z], paint) {
   const end = (c) => Math.min((c + 1) << level, n);
   for (let i = x << level; i < end(x); i++) {
     for (let j = y << level; j < end(y); j++) {
@@ -82,16 +85,16 @@ function eachPlace(n, level, x, y, z, paint) {
 
 // A place in a coarse brick none of whose cells there is live is as empty as one without a brick, unless a sample that
 // begins there may stand for several steps.
-function tableOf(levels, cells, n, levelSteps) {
+function tableOf(shown, n, levelSteps) {
   const table = new Int32Array(n ** 3).fill(-1);
-  for (const { level, first, coords, numbers } of [...levels].reverse()) {
-    for (let i = 0; i < coords.length / 3; i++) {
-      const entry = ((first + i) << 3) | level, own = cells[level].cells.subarray(16 * numbers[i], 16 * numbers[i] + 16);
+  for (const { level, first, bricks, numbers } of [...shown].reverse()) {
+    numbers.forEach((number, i) => {
+      const entry = ((first + i) << 3) | level, own = bricks.masks.subarray(16 * number, 16 * number + 16);
       const whole = level === 0 || levelSteps[level] > 1;
-      eachPlace(n, level, coords[3 * i], coords[3 * i + 1], coords[3 * i + 2], (place, x, y, z) => {
+      eachPlace(n, level, coordOf(bricks.keys[number]), (place, x, y, z) => {
         table[place] = whole || someLive(own, level, x, y, z) ? entry : -1;
       });
-    }
+    });
   }
   addDistances(table, n);
   return table;
@@ -139,16 +142,14 @@ function addDistances(table, n) {
   }
 }
 
-function densityTexels({ levels, values, firstRows }, shown, resolution) {
-  const texels = new Uint32Array(2 * HALF_COLUMNS * shown.count);
+function densityTexels({ vertices, values, firstRows }, shown, count) {
+  const texels = new Uint32Array(2 * HALF_COLUMNS * count);
   const column = new Uint8Array(9);
-  for (const { level, first, coords, numbers } of shown.levels) {
-    if (!numbers.length) continue;
-    const vertices = cornersOf(levels[level], bricksAlong(Math.ceil(resolution / 2 ** level)));
-    const read = new ColumnReader(vertices, firstRows[level]);
+  for (const { level, first, bricks, numbers } of shown) {
+    const read = new ColumnReader(vertices[level], firstRows[level]);
     for (let i = 0; i < numbers.length; i++) {
-      read.moveTo(coords[3 * i], coords[3 * i + 1], coords[3 * i + 2]);
-      const cells = levels[level].cells.subarray(16 * numbers[i], 16 * numbers[i] + 16);
+      read.moveTo(...coordOf(bricks.keys[numbers[i]]));
+      const cells = bricks.masks.subarray(16 * numbers[i], 16 * numbers[i] + 16);
       let at = 2 * HALF_COLUMNS * (first + i);
       for (let x = 0; x < 9; x++) {
         for (let y = 0; y < 9; y++, at += 4) {
@@ -171,16 +172,16 @@ function densityTexels({ levels, values, firstRows }, shown, resolution) {
 // Reads the columns along z of one brick with its apron: `mask` has a bit for each stored vertex z = 0..8, `row` is
 // the row of the first of z = 0..7, `row8` that of z = 8.
 class ColumnReader {
-  constructor(vertices, firstRow) {
-    Object.assign(this, { vertices, firstRow, bricks: new Int32Array(8), mask: 0, row: 0, row8: 0 });
+  constructor({ bricks, ranks }, firstRow) {
+    Object.assign(this, { vertices: bricks, firstRows: ranks.first, firstRow, bricks: new Int32Array(8), mask: 0, row: 0, row8: 0 });
   }
 
   moveTo(x, y, z) {
-    for (let o = 0; o < 8; o++) this.bricks[o] = this.vertices.index.at(x + (o >> 2), y + ((o >> 1) & 1), z + (o & 1));
+    for (let o = 0; o < 8; o++) this.bricks[o] = this.vertices.find(x + (o >> 2), y + ((o >> 1) & 1), z + (o & 1));
   }
 
   column(x, y) {
-    const { masks, firstRows } = this.vertices;
+    const { firstRows, vertices: { masks } } = this;
     const corner = ((x >> 3) << 2) | ((y >> 3) << 1);
     const word = 2 * (x & 7) + ((y & 7) >> 2), shift = 8 * (y & 3);
     const brick = this.bricks[corner], next = this.bricks[corner | 1];
@@ -188,46 +189,47 @@ class ColumnReader {
     if (brick >= 0) {
       const bits = masks[16 * brick + word];
       this.mask = (bits >>> shift) & 255;
-      this.row = this.firstRow + firstRows[16 * brick + word] + bitCount(bits & ((1 << shift) - 1));
+      this.row = this.firstRow + firstRows[16 * brick + word] + popcount(bits & ((1 << shift) - 1));
     }
     if (next >= 0) {
       const bits = masks[16 * next + word];
       this.mask |= ((bits >>> shift) & 1) << 8;
-      this.row8 = this.firstRow + firstRows[16 * next + word] + bitCount(bits & ((1 << shift) - 1));
+      this.row8 = this.firstRow + firstRows[16 * next + word] + popcount(bits & ((1 << shift) - 1));
     }
   }
 }
 
 // Which bricks hold the features' vertices, as `vertex_rows` in player/asset/grid.py says.
-function heldBricks({ levels, firstRows }, resolution) {
+function heldBricks({ levels, vertices, firstRows }, resolution) {
   const n = bricksAlong(resolution);
   const owners = new Int32Array(n ** 3).fill(-1); // -2 - number << 3 | level: a corner is stored, but no brick
   const shown = shownBricks(levels, resolution).levels;
   const held = [];
   let count = 0;
   for (let level = levels.length - 1; level >= 0; level--) {
-    const nHere = bricksAlong(Math.ceil(resolution / 2 ** level));
-    const vertices = cornersOf(levels[level], nHere);
-    const own = shown[level].coords;
-    const hold = (coords, at, code) => {
-      const entry = code((count++ << 3) | level);
-      eachPlace(n, level, coords[at], coords[at + 1], coords[at + 2], (place) => (owners[place] = entry));
+    const { bricks, numbers } = shown[level];
+    const hold = (coords, code) => {
+      for (const coord of coords) {
+        const entry = code((count++ << 3) | level);
+        eachPlace(n, level, coord, (place) => (owners[place] = entry));
+      }
+      held.push({ vertices: vertices[level], coords, firstRow: firstRows[level] });
     };
-    for (let i = 0; i < own.length; i += 3) hold(own, i, (entry) => entry);
-    const beside = withCorners(vertices, nHere, (x, y, z) => owners[((x << level) * n + (y << level)) * n + (z << level)] < 0);
-    for (let i = 0; i < beside.length; i += 3) hold(beside, i, (entry) => -2 - entry);
-    held.push({ vertices, coords: [own, beside], firstRow: firstRows[level] });
+    hold(Array.from(numbers, (number) => coordOf(bricks.keys[number])), (entry) => entry);
+    const isFree = (x, y, z) => owners[((x << level) * n + (y << level)) * n + (z << level)] < 0;
+    hold(withCorners(vertices[level].bricks, bricksAlong(Math.ceil(resolution / 2 ** level)), isFree), (entry) => -2 - entry);
   }
   for (let i = 0; i < owners.length; i++) if (owners[i] < -1) owners[i] = -2 - owners[i];
   return { n, owners, held, count };
 }
 
 // Coordinates, sorted, of the bricks in which a cell has a stored corner, there or in the next brick, where `wanted`.
-function withCorners({ coords, masks }, n, wanted) {
-  const marked = new Uint8Array(n ** 3);
-  for (let i = 0; i < coords.length / 3; i++) {
+function withCorners({ keys, masks }, n, wanted) {
+  const marked = new Uint8Array(n ** 3), found = [];
+  keys.forEach((key, i) => {
+    const coord = coordOf(key);
     for (let o = 0; o < 8; o++) {
-      const [x, y, z] = [coords[3 * i] - (o >> 2), coords[3 * i + 1] - ((o >> 1) & 1), coords[3 * i + 2] - (o & 1)];
+      const [x, y, z] = [coord[0] - (o >> 2), coord[1] - ((o >> 1) & 1), coord[2] - (o & 1)];
       if (x < 0 || y < 0 || z < 0 || x >= n || y >= n || z >= n) continue;
       let some = 0;
       for (let w = 0; w < (o & 4 ? 2 : 16); w++) {
@@ -235,9 +237,8 @@ function withCorners({ coords, masks }, n, wanted) {
       }
       if (some && wanted(x, y, z)) marked[(x * n + y) * n + z] = 1;
     }
-  }
-  const found = [];
-  marked.forEach((mark, i) => mark && found.push(Math.floor(i / (n * n)), Math.floor(i / n) % n, i % n));
+  });
+  marked.forEach((mark, i) => mark && found.push([Math.floor(i / (n * n)), Math.floor(i / n) % n, i % n]));
   return found;
 }
 
@@ -246,16 +247,14 @@ function columnTexels({ held, count }) {
   let at = 0;
   for (const { vertices, coords, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
-    for (const some of coords) {
-      for (let i = 0; i < some.length; i += 3) {
-        read.moveTo(some[i], some[i + 1], some[i + 2]);
-        for (let x = 0; x < 9; x++) {
-          for (let y = 0; y < 9; y++, at += 2) {
-            read.column(x, y);
-            const first = read.mask & 255 ? read.row : read.row8;
-            texels[at] = read.mask ? first : 0;
-            texels[at + 1] = read.mask | (read.mask & 256 ? (read.row8 - first) << 9 : 0);
-          }
+    for (const coord of coords) {
+      read.moveTo(...coord);
+      for (let x = 0; x < 9; x++) {
+        for (let y = 0; y < 9; y++, at += 2) {
+          read.column(x, y);
+          const first = read.mask & 255 ? read.row : read.row8;
+          texels[at] = read.mask ? first : 0;
+          texels[at + 1] = read.mask | (read.mask & 256 ? (read.row8 - first) << 9 : 0);
         }
       }
     }

@@ -1,10 +1,10 @@
-// Finds the files of a scene, in the page or beside it, has them decoded in a worker, and yields what is known:
+// Finds the files of a scene, in the page or beside it, has them decoded in workers, and yields what is known:
 //
 //     for await (const scene of loadScene(onProgress)) ...
 //
-// yields after the first part, and after later ones. A scene is
+// yields at once, when `grid` is null, then after the first part, and after later ones. A scene is
 //
-//     { manifest, cameras, head, densities, features, n_parts, problem }
+//     { manifest, cameras, head, grid, n_parts, problem }
 //
 // - manifest: the asset's manifest (docs/format.md), without its provenance;
 // - cameras: [{ name, width, height, fx, fy, cx, cy, c2w: [16], row-major, OpenGL axes, world frame }, ...];
@@ -14,10 +14,7 @@
 //   weight [n_in * n_out] row-major, bias [n_out] (null for from_sh), scale [n_out] or null: Float32Array, or in 8 bits
 //   weight an Int8Array and bias an Int32Array. A monomial is the product of an earlier one (its place in the list, -1
 //   for 1) and the axis 0 to 2 of the direction;
-// - densities, features: { n_channels, levels: [{ coords: Uint16Array [3 n], cells: Uint32Array [16 n] }, ...], values,
-//   firstRows: [n_levels + 1] }: the finest level first; cells are the 512 bits of each brick, bit b in word b >> 5;
-//   values [n_rows * n_channels] Uint8Array for densities, Int8Array for features, a row for each vertex of each
-//   level, the border's too, levels one after the other, in a level by brick of vertices and then by bit;
+// - grid: the arrays of grid.js;
 // - n_parts: how many parts are read; problem: a sentence about a part that could not be, or null.
 //
 // onProgress({ done, total }) tells how far it is, half of it for bytes that are there and half for those decoded.
@@ -25,6 +22,7 @@
 import { SceneReader, checkedFile } from "./scene_reader.js";
 
 const MANIFEST = "manifest.json";
+const GRIDS = ["densities", "features"];
 
 export async function* loadScene(onProgress) {
   const isFile = document.querySelector("script[data-file]") !== null;
@@ -40,41 +38,48 @@ export async function* loadScene(onProgress) {
   const small = async (name) => checkedFile(name, await get(name), manifest.files[name]);
   const cameras = JSON.parse(new TextDecoder().decode(await small("cameras.json")));
   const head = headOf(JSON.parse(new TextDecoder().decode(await small("head.json"))), await small("head.bin"));
-  const reader = await startReader(manifest);
-  let scene = null;
-  let problem = null;
+  const readers = await startReaders(manifest);
+  let scene = { manifest, cameras, head, grid: null, n_parts: 0, problem: null };
+  const read = (file) => readers.read(file, (n) => {
+    done.decoded += n;
+    tell();
+  });
   try {
     let next = get(manifest.parts[0].file);
-    for (let part = 0; part < nParts && problem === null; part++) {
-      let read = 0;
+    let reading = next.then(read);
+    reading.catch(() => {}); // told when it is its turn, as what follows
+    yield scene;
+    for (let part = 0, problem = null; part < nParts && problem === null; part++) {
+      let isRead = 1;
       try {
-        const file = await next;
         if (part + 1 < nParts) {
           next = get(manifest.parts[part + 1].file);
-          next.catch(() => {}); // told when it is its turn
+          next.catch(() => {});
         }
-        await reader.read(file, (n) => {
-          done.decoded += n;
-          tell();
-        });
-        read = 1;
+        await reading;
       } catch (error) {
         if (part === 0) throw error;
+        isRead = 0;
         problem = `${error.message}: shown as the first ${part} of ${nParts} parts have it`;
-        if (!reader.isWhole) {
+        if (!readers.areWhole) {
           yield { ...scene, problem };
           return;
         }
       }
       const isLast = problem !== null || part + 1 === nParts;
-      if (isLast || part === 0 || !isFile) { // what a page holds is there at once: one picture, and the whole
-        const values = await reader.values(isLast);
-        scene = { manifest, cameras, head, ...values, n_parts: part + read, problem };
+      const isShown = isLast || part === 0 || !isFile; // what a page holds is there at once: one picture, and the whole
+      const arranged = isShown && readers.grid(isLast);
+      if (!isLast) {
+        reading = next.then(read);
+        reading.catch(() => {});
+      }
+      if (isShown) {
+        scene = { ...scene, grid: await arranged, n_parts: part + isRead, problem };
         yield scene;
       }
     }
   } finally {
-    reader.close();
+    readers.close();
   }
 }
 
@@ -128,25 +133,51 @@ function headOf(description, data) {
   return head;
 }
 
-// A SceneReader in a worker; in the page itself where no worker can be had.
-async function startReader(manifest) {
+// SceneReaders that share the grids of a scene.
+class Readers {
+  constructor(readers) {
+    this.readers = readers;
+  }
+
+  get areWhole() {
+    return this.readers.every((reader) => reader.isWhole);
+  }
+
+  async read(file, onProgress) {
+    const done = await Promise.allSettled(this.readers.map((reader) => reader.read(file, onProgress)));
+    for (const { reason } of done) if (reason) throw reason;
+  }
+
+  async grid(isLast) {
+    return Object.assign({}, ...await Promise.all(this.readers.map((reader) => reader.grid(isLast))));
+  }
+
+  close() {
+    for (const reader of this.readers) reader.close();
+  }
+}
+
+// A worker for each grid; one reader in the page itself where no workers can be had.
+async function startReaders(manifest) {
+  const workers = [];
   try {
-    const reader = new WorkerReader();
-    await reader.isReady;
-    await reader.ask("open", manifest);
-    return reader;
+    for (const grid of GRIDS) workers.push(new WorkerReader(manifest, [grid]));
+    await Promise.all(workers.map((worker) => worker.isReady));
+    return new Readers(workers);
   } catch (error) {
+    for (const worker of workers) worker.close();
     if (error instanceof SceneError) throw error;
     const pause = () => new Promise((resolve) => { setTimeout(resolve); });
-    return Object.assign(new SceneReader(manifest, pause), { close() {} });
+    return new Readers([Object.assign(new SceneReader(manifest, GRIDS, pause), { close() {} })]);
   }
 }
 
 // What is wrong with a scene, where the worker is not to blame.
 class SceneError extends Error {}
 
+// A SceneReader in a worker.
 class WorkerReader {
-  constructor() {
+  constructor(manifest, grids) {
     const own = document.getElementById("script").textContent; // of a page in one file
     const address = own && URL.createObjectURL(new Blob([own], { type: "text/javascript" }));
     this.worker = own ? new Worker(address) : new Worker("worker.js", { type: "module" });
@@ -166,7 +197,7 @@ class WorkerReader {
         else if (data.progress !== undefined) this.onProgress(data.progress);
         else this.take(data);
       };
-    }).finally(() => URL.revokeObjectURL(address));
+    }).finally(() => URL.revokeObjectURL(address)).then(() => this.ask("open", manifest, grids));
   }
 
   take({ id, result, error, isWhole }) {
@@ -192,8 +223,8 @@ class WorkerReader {
     return this.ask("read", file);
   }
 
-  values(isLast) {
-    return this.ask("values", isLast);
+  grid(isLast) {
+    return this.ask("grid", isLast);
   }
 
   close() {

@@ -22,13 +22,15 @@ async function show() {
   try {
     for await (const scene of loadScene(({ done, total }) => panel.progress(done / total))) {
       problem = scene.problem;
+      advice = INSTEAD;
+      renderer ??= await Renderer.create(canvas, scene); // its shaders are compiled while the scene is unpacked
+      if (scene.grid) renderer.replace(scene);
+      advice = ANEW;
+      if (!scene.grid) continue;
       if (viewer) {
-        renderer.replace(scene);
         viewer.refresh();
         continue;
       }
-      advice = INSTEAD;
-      renderer = await Renderer.create(canvas, scene);
       viewer = new Viewer(canvas, renderer, scene.cameras, options, calm, scene.manifest.background);
       panel.connect(viewer, new Controls(viewer), scene.cameras);
       renderer.onlost = () => {

@@ -87,16 +87,18 @@ class PyramidReader {
     const known = this.all.subarray(first * nChannels);
     return {
       n_channels: nChannels,
-      levels: pyramid.levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks.slice() })),
+      levels: pyramid.levels,
+      vertices: pyramid.vertices,
       values: isLast && first === 0 ? this.all : known.slice(),
       firstRows: this.firstRows.map((row) => Math.max(0, row - first)),
     };
   }
 }
 
+// Reads the sections of some `grids`, "densities" and "features", and passes over those of others.
 export class PartsReader {
   // `manifest`: that of the page, which Python has checked. Throws an Error if the scene takes more memory than it may.
-  constructor(manifest) {
+  constructor(manifest, grids) {
     this.manifest = manifest;
     const structures = manifest.parts.flatMap((part) => part.sections).filter((s) => s.kind === "structure");
     const nBytes = structures.reduce((sum, s) => sum + neededBytes(s, manifest), 0);
@@ -104,7 +106,7 @@ export class PartsReader {
       throw new Error(`the scene takes ${Math.ceil(nBytes / 1e6)} MB of memory: expected at most 3200 MB`);
     }
     this.grids = {};
-    for (const grid of ["densities", "features"]) {
+    for (const grid of grids) {
       this.grids[grid] = new PyramidReader(grid, manifest, structures.filter((s) => s.grid === grid));
     }
     this.nRead = 0;
@@ -121,6 +123,7 @@ export class PartsReader {
       at += section.bytes;
       const where = `${part.file}: ${section.grid}, level ${section.level}, ${section.kind}`;
       const grid = this.grids[section.grid];
+      if (!grid) continue;
       if (section.kind === "structure") await grid.readStructure(section, bytes, where);
       else await grid.readSymbols(section, bytes, where, pause);
       onProgress(section.bytes);
@@ -128,10 +131,12 @@ export class PartsReader {
     this.nRead++;
   }
 
-  // The scene's densities and features as loader.js describes them.
+  // What is known of each grid: { n_channels, levels, vertices, values, firstRows }. `levels` are the Bricks of each level,
+  // the finest first, `vertices` its Vertices; `values` [n_rows * n_channels] Uint8Array for densities, Int8Array for
+  // features, has a row for each vertex of each level, the border's too, levels one after the other, in a level by brick
+  // of vertices and then by bit; `firstRows` [n_levels + 1].
   values(isLast) {
-    const { densities, features } = this.grids;
-    return { densities: densities.values(isLast), features: features.values(isLast) };
+    return Object.fromEntries(Object.entries(this.grids).map(([name, grid]) => [name, grid.values(isLast)]));
   }
 }
 

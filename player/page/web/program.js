@@ -60,7 +60,7 @@ function filled(text, texts) {
 
 // The fragment shader of a layer; of the colour, what the head is to know. `mostSteps`: base steps that a ray can have.
 export function marchSource(scene, { layer, counting, mostSteps }) {
-  const { manifest } = scene, nChannels = scene.features.n_channels;
+  const { manifest } = scene, nChannels = manifest.n_channels;
   const defines = {
     LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, WIDTH_BITS,
     ...(layer === "normals" ? { NORMALS: 1 } : {}), ...(counting ? { COUNTING: 1 } : {}),
@@ -75,18 +75,19 @@ export function marchSource(scene, { layer, counting, mostSteps }) {
 // The fragment shader of the head: { source, weights }.
 export function headSource(scene) {
   const { code, weights } = headCode(scene.head);
-  const text = filled(shaders["head.glsl"], { ...featureTexts(scene.features.n_channels), HEAD_CODE: code });
+  const text = filled(shaders["head.glsl"], { ...featureTexts(scene.manifest.n_channels), HEAD_CODE: code });
   return { source: BEGIN + PRECISION + shaders["rays.glsl"] + text, weights };
 }
 
 export const compositeSource = () => BEGIN + PRECISION + shaders["composite.glsl"];
 
-// A linked program with the places of its uniforms; throws an Error with the driver's words.
+// A program, which the driver compiles and links while other things are done.
 export class Program {
   constructor(gl, fragment) {
     this.gl = gl;
+    this.uniforms = null; // the places of its uniforms, when it is linked
     this.program = gl.createProgram();
-    const shaders = [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragment]].map(([kind, text]) => {
+    this.shaders = [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragment]].map(([kind, text]) => {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
@@ -94,16 +95,21 @@ export class Program {
       return shader;
     });
     gl.linkProgram(this.program);
-    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS) && !gl.isContextLost()) {
-      const said = [gl.getProgramInfoLog(this.program), ...shaders.map((shader) => gl.getShaderInfoLog(shader))];
+  }
+
+  // Waits until it is linked; throws an Error with the driver's words.
+  link() {
+    const { gl, program, shaders } = this;
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+      const said = [gl.getProgramInfoLog(program), ...shaders.map((shader) => gl.getShaderInfoLog(shader))];
       throw new Error(`shader: ${said.filter(Boolean).join(" ").slice(0, 500)}`);
     }
     for (const shader of shaders) gl.deleteShader(shader);
     this.uniforms = new Map();
-    const count = gl.getProgramParameter(this.program, gl.ACTIVE_UNIFORMS) ?? 0;
+    const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) ?? 0;
     for (let i = 0; i < count; i++) {
-      const { name, type } = gl.getActiveUniform(this.program, i);
-      this.uniforms.set(name.replace("[0]", ""), { place: gl.getUniformLocation(this.program, name), type });
+      const { name, type } = gl.getActiveUniform(program, i);
+      this.uniforms.set(name.replace("[0]", ""), { place: gl.getUniformLocation(program, name), type });
     }
   }
 
@@ -111,6 +117,7 @@ export class Program {
   // does not have are left out.
   use(values) {
     const { gl } = this;
+    if (!this.uniforms) this.link();
     gl.useProgram(this.program);
     let unit = 0;
     for (const [name, { place, type }] of this.uniforms) {

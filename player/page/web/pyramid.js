@@ -1,7 +1,7 @@
 // A pyramid: the vertices of its levels, and the values that follow from symbols (docs/format.md, "Pyramids"). The twin
 // of player/asset/pyramid.py and player/asset/symbols.py.
 
-import { Bricks, NO_BRICKS, Ranks, keyOf } from "./bricks.js";
+import { Bricks, coordOf, keyOf, NO_BRICKS, Ranks } from "./bricks.js";
 
 // The bricks of each level, the finest first, and their vertices.
 export class Pyramid {
@@ -65,8 +65,6 @@ export class Pyramid {
     }
   }
 }
-
-const coordOf = (key) => [key >> 18, (key >> 9) & 511, key & 511];
 
 // The keys of all places with components from `low` to `high` beside those of bricks and from 0 to `end` - 1, sorted.
 function neighbourhood(bricks, low, high, end) {

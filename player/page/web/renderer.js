@@ -6,7 +6,7 @@
 // a pixel; with `accumulate` the canvas shows the mean of the pictures drawn since the last one without it. `n_fetches`
 // overrides the quality's, 0 for all samples.
 import { raysOf } from "./camera.js";
-import { arrangeGrid } from "./grid.js";
+import { NO_GRID } from "./grid.js";
 import { multiplyAdds } from "./head.js";
 import { compositeSource, foundTextures, headSource, marchSource, Program } from "./program.js";
 import { deleteFramebuffer, framebufferOf, gpuBytes, rowBits, TILE, uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
@@ -26,9 +26,12 @@ void main() {
 `;
 
 export class Renderer {
-  // Throws an Error whose message says what is missing.
+  // A renderer of a scene, whose grid may be null: its shaders are compiled meanwhile. Throws an Error whose message says
+  // what is missing.
   static async create(canvas, scene) {
-    return new Renderer(canvas, scene);
+    const renderer = new Renderer(canvas, scene);
+    await renderer.warmUp();
+    return renderer;
   }
 
   constructor(canvas, scene) {
@@ -68,30 +71,36 @@ export class Renderer {
     this.sums = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
     this.sum = this.target = null;
     this.nSummed = 0;
-    this.programs = new Map(); // by their sources: a finer scene mostly needs the same
-    this.mean = this.programOf(MEAN);
+    this.programs = new Map(); // by their sources
+    this.layers = new Map(); // programs by what they draw
+    const { manifest } = this.scene, { source, weights } = headSource(this.scene);
+    const diagonal = Math.hypot(...manifest.aabb[0].map((x, i) => manifest.aabb[1][i] - x));
+    this.mostSteps = Math.floor((manifest.contracted ? Math.PI : diagonal) / manifest.step) + 3;
+    this.program("colour");
+    this.head = this.programOf(source);
     this.composite = this.programOf(compositeSource());
+    this.mean = this.programOf(MEAN);
+    this.tables = { uWeights: uploadFloats(gl, weights), ...(manifest.contracted && { uLattice: uploadLattice(gl, manifest.step) }) };
+    this.makeTile(manifest.n_channels);
     this.show(this.scene);
   }
 
+  // Drivers finish a shader when something is drawn with it: one pixel of what is shown so far, to both places.
+  async warmUp() {
+    const c2w = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+    const view = { c2w, fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
+    await this.done(); // the page is not held up while they are compiled
+    this.paint(view, null, { upwards: true, premultiplied: true });
+    await this.read(view);
+  }
+
   show(scene) {
-    const { gl } = this, { manifest } = scene;
-    const grid = arrangeGrid(scene);
+    const { gl } = this, { manifest } = scene, grid = scene.grid ?? NO_GRID;
     this.scene = scene;
     this.gpuBytes = gpuBytes(grid, manifest.n_channels);
     this.textures = uploadGrid(gl, grid, manifest.n_channels);
-    const diagonal = Math.hypot(...manifest.aabb[0].map((x, i) => manifest.aabb[1][i] - x));
-    this.mostSteps = Math.floor((manifest.contracted ? Math.PI : diagonal) / manifest.step) + 3;
-    if (manifest.contracted) this.textures.uLattice = uploadLattice(gl, manifest.step);
-    const { table, density, owners, columns, features, ...sizes } = grid; // the textures have what is left out
-    this.grid = sizes;
-    this.constant = this.constantUniforms(sizes);
-    this.layers = new Map(); // programs of this scene by what they draw
-    const { source, weights } = headSource(scene);
-    this.head = this.programOf(source);
-    this.textures.uWeights = uploadFloats(gl, weights);
-    this.makeTile(manifest.n_channels);
-    if (gl.getError() === gl.OUT_OF_MEMORY) throw new Error("memory of the GPU: expected more of it, got too little for this scene");
+    this.constant = this.constantUniforms(grid);
+    if (scene.grid && gl.getError() === gl.OUT_OF_MEMORY) throw new Error("memory of the GPU: expected more of it, got too little for this scene");
   }
 
   // Shows a finer scene from now on.
@@ -104,7 +113,6 @@ export class Renderer {
   forget() {
     const { gl } = this;
     for (const { texture } of Object.values(this.textures)) gl.deleteTexture(texture);
-    for (const tile of [this.found, this.colours]) deleteFramebuffer(gl, tile);
   }
 
   // What lies between the passes of a tile: what the march has found, and the head's colours of 2 x 2 pixels a texel.
@@ -121,10 +129,10 @@ export class Renderer {
   constantUniforms(grid) {
     const { manifest } = this.scene, [low, high] = manifest.aabb, [logLow, logHigh] = manifest.density_range;
     return {
-      ...this.textures,
+      ...this.textures, ...this.tables,
       uAabbMin: low, uCellsPerUnit: low.map((x, i) => manifest.resolution / (high[i] - x)),
       uStep: manifest.step, uMostLength: Math.fround((this.mostSteps - 1) * Math.fround(manifest.step)), uNear: manifest.near,
-      uResolution: manifest.resolution, uLatticeSize: this.textures.uLattice?.n ?? 0,
+      uResolution: manifest.resolution, uLatticeSize: this.tables.uLattice?.n ?? 0,
       uMostTau: OPAQUE_DEPTH, uDensityCode: [logLow, (logHigh - logLow) / 255],
       uBits: rowBits(grid, manifest.n_channels), uFeatureResolution: grid.featureResolution, uFeatureScale: grid.featureResolution / grid.resolution,
     };
@@ -178,7 +186,7 @@ export class Renderer {
         if (layer === "colour" && !counting) {
           pass(march, this.found.framebuffer, [0, 0, box[2], box[3]], { ...this.constant, uTile: [x, y] });
           const half = [Math.ceil(box[2] / 2), Math.ceil(box[3] / 2)];
-          pass(this.head, this.colours.framebuffer, [0, 0, ...half], { ...this.textures, ...this.passed, uTile: [x, y] });
+          pass(this.head, this.colours.framebuffer, [0, 0, ...half], { ...this.tables, ...this.passed, uTile: [x, y] });
           if (summed) gl.enable(gl.BLEND);
           pass(this.composite, target, box, { ...this.passed, uTile: [x, y] });
           gl.disable(gl.BLEND);
@@ -285,7 +293,8 @@ export class Renderer {
     const { gl } = this;
     for (const [name, listener] of Object.entries(this.listeners)) this.canvas.removeEventListener(name, listener);
     this.forget();
+    for (const { texture } of Object.values(this.tables)) gl.deleteTexture(texture);
     for (const program of this.programs.values()) program.dispose();
-    for (const target of [this.sum, this.target]) if (target) deleteFramebuffer(gl, target);
+    for (const target of [this.found, this.colours, this.sum, this.target]) if (target) deleteFramebuffer(gl, target);
   }
 }

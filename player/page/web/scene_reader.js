@@ -1,6 +1,7 @@
-// What decodes a scene, in a worker or in the page: files of the data are compared with the manifest, parts become
-// densities and features.
+// What decodes a scene, in workers or in the page: files of the data are compared with the manifest, parts become
+// densities and features, and these the arrays of grid.js.
 
+import { arrangeDensities, arrangeFeatures } from "./grid.js";
 import { PartsReader } from "./parts.js";
 import { bytesOf } from "./text_bytes.js";
 
@@ -21,12 +22,13 @@ export async function checkedFile(name, { text, bytes }, entry) {
 }
 
 export class SceneReader {
-  // `pause` is awaited now and then: where other work is to be done between.
-  constructor(manifest, pause) {
+  // `grids`: which of "densities" and "features" it is to read; `pause` is awaited now and then: where other work is to
+  // be done between.
+  constructor(manifest, grids, pause) {
     if (!globalThis.DecompressionStream) throw new Error("expected a browser with DecompressionStream, got an older one");
     this.manifest = manifest;
     this.pause = pause;
-    this.parts = new PartsReader(manifest);
+    this.parts = new PartsReader(manifest, grids);
     this.isWhole = true; // whether a part was not begun to be read that is broken
   }
 
@@ -40,8 +42,12 @@ export class SceneReader {
     this.isWhole = true;
   }
 
-  // Densities and features as far as they are read.
-  values(isLast) {
-    return this.parts.values(isLast);
+  // The arrays of its grids, as far as they are read.
+  grid(isLast) {
+    const { densities, features } = this.parts.values(isLast);
+    return {
+      ...(densities && arrangeDensities(this.manifest, densities)),
+      ...(features && arrangeFeatures(this.manifest, features)),
+    };
   }
 }

@@ -6,18 +6,18 @@ import { SceneReader } from "./scene_reader.js";
 let reader = null;
 
 const CALLS = {
-  open: (manifest) => {
-    reader = new SceneReader(manifest, async () => {});
+  open: (manifest, grids) => {
+    reader = new SceneReader(manifest, grids, async () => {});
   },
   read: (file) => reader.read(file, (progress) => postMessage({ progress })),
-  values: (isLast) => reader.values(isLast),
+  grid: (isLast) => reader.grid(isLast),
 };
 
 self.onmessage = async ({ data: { call, args, id } }) => {
   try {
     const result = await CALLS[call](...args);
-    const transfer = result ? [result.densities.values.buffer, result.features.values.buffer] : [];
-    postMessage({ id, result }, transfer);
+    const arrays = Object.values(result ?? {}).filter(ArrayBuffer.isView);
+    postMessage({ id, result }, arrays.map((array) => array.buffer));
   } catch (error) {
     postMessage({ id, error: error.message, isWhole: reader?.isWhole ?? false });
   }

@@ -35,8 +35,9 @@ globalThis.found = (async () => {
   let error = null, cameras = null, head = null;
   try {
     for await (const scene of loadScene(({ done, total }) => progress.push(done / total))) {
-      const [densities, features] = [await described(scene.densities), await described(scene.features)];
       ({ cameras, head } = scene);
+      if (!scene.grid) continue;
+      const [densities, features] = [await described(scene.grid.densities), await described(scene.grid.features)];
       scenes.push({ n_parts: scene.n_parts, problem: scene.problem, densities, features });
     }
   } catch (thrown) {
@@ -46,10 +47,19 @@ globalThis.found = (async () => {
 })();
 """
 
+ARRANGED = """
+const plain = ({ levels, n_channels, values, firstRows }) => ({
+  n_channels, values, firstRows, levels: levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks })),
+});
+export const arrangeDensities = (manifest, densities) => ({ densities: plain(densities) });
+export const arrangeFeatures = (manifest, features) => ({ features: plain(features) });
+"""
+"""In place of `grid.js`: what is decoded, as it is."""
+
 
 def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "") -> bytes:
     """A page with the data `files` that decodes them; `before` runs first, in the page and in its worker."""
-    modules = {**web_files(), "main.js": MAIN}
+    modules = {**web_files(), "main.js": MAIN, "grid.js": ARRANGED}
     text = before + page_script(modules)
     script = f'<script type="module" id="script">{text}</script>\n'
     return f"<!doctype html>{policy}{script}".encode() + data_elements(files)

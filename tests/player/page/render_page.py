@@ -16,7 +16,6 @@ from player.page.scene_files import scene_files
 
 MAIN = """
 import { installApi } from "./api.js";
-import { arrangeGrid } from "./grid.js";
 import { loadScene } from "./loader.js";
 import { compositeSource, headSource, LAYERS, marchSource } from "./program.js";
 import { Renderer } from "./renderer.js";
@@ -31,13 +30,15 @@ const base64 = (array) => {
 
 const times = (globalThis.times = {});
 async function made() {
-  const begin = performance.now();
-  let scene;
-  for await (const found of loadScene(() => {})) scene = found;
-  times.decoded = performance.now() - begin;
   const canvas = document.getElementById("canvas");
-  const renderer = await Renderer.create(canvas, scene);
-  times.arranged = performance.now() - begin;
+  let renderer = null;
+  for await (const scene of loadScene(() => {})) {
+    if (scene.grid) times.decoded = performance.now();
+    renderer ??= await Renderer.create(canvas, scene);
+    times.compiled ??= performance.now();
+    if (scene.grid) renderer.replace(scene);
+  }
+  times.uploaded = performance.now();
   return (globalThis.renderer = renderer);
 }
 
@@ -48,7 +49,7 @@ globalThis.counts = async (view) => {
   return { fetches: base64(fetches), nHits };
 };
 globalThis.arrays = () => {
-  const grid = arrangeGrid(renderer.scene);
+  const grid = { ...renderer.scene.grid };
   for (const name of ["table", "density", "owners", "columns", "features"]) grid[name] = base64(grid[name]);
   return grid;
 };

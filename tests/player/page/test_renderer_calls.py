@@ -117,8 +117,8 @@ def test_another_scene_takes_its_place(page: RenderPage, asset: Asset) -> None:
         """() => {
           const { scene } = renderer;
           globalThis.first = scene;
-          const values = scene.features.values.map((x) => -x);
-          renderer.replace({ ...scene, features: { ...scene.features, values } });
+          const features = new Uint32Array(new Int8Array(scene.grid.features.buffer).map((x) => -x).buffer);
+          renderer.replace({ ...scene, grid: { ...scene.grid, features } });
         }"""
     )
     other = page.picture(camera)
