@@ -1,27 +1,30 @@
 """How much graphics memory the page of an asset takes: the textures that `grid.js` and `textures.js` make.
 
-Letters: nb, nf bricks along an axis of the densities' and of the features' grid. A long array is a layered
-texture, 2048 texels wide, of at most 256 layers: `texture_bytes`.
+Letters: nb, nf bricks along an axis of the densities' and of the features' grid; n bricks of a kind.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from player.asset.asset import Asset
 from player.errors import FormatError
 
+DENSITY_BRICK = (8, 8, 10)
+"""Texels of a brick of densities: 8 x 8 columns of four vertices each, and which cells are live."""
+INDEX_BRICK = (8, 8, 9)
+"""Texels of a brick that finds rows of features."""
+MOST_LAYERS = 25
+"""Bricks above each other in a texture."""
+MOST_BRICKS = MOST_LAYERS * 256**2
 WIDTH = 2048
-"""Texels of a row of a layered texture."""
-MOST_HEIGHT = 2048
-LEAST_HEIGHT = 64
-MOST_LAYERS = 256
+"""Texels of a line of features, at most."""
+LINES_A_LAYER = 256
+MOST_ROWS = 2**24
 TILE = 256
 """Pixels along a side of what is drawn at a time."""
-HALF_COLUMNS = 162
-"""Texels of a brick of densities: two for each of 9 x 9 columns."""
-COLUMNS = 81
-"""Texels of a brick that finds rows of features."""
 
 
 def gpu_bytes(asset: Asset) -> int:
@@ -29,38 +32,38 @@ def gpu_bytes(asset: Asset) -> int:
 
     Raises FormatError: one of its arrays is larger than any texture.
     """
-    grid = asset.grid
-    words = feature_words(grid.n_channels)
-    wide = min(words, 4)
-    cubes = 4 * (grid.n_per_axis**3 + grid.rows.n_per_axis**3)
-    density = texture_bytes(HALF_COLUMNS * len(grid.slot_coords), 2)
-    columns = texture_bytes(COLUMNS * (len(grid.rows.rows) // 729), 2)
-    features = texture_bytes(-(-len(grid.features) * words // wide), wide)
+    grid, stored = asset.grid, asset.grid.rows.rows
+    cubes = 4 * grid.n_per_axis**3 + 8 * grid.rows.n_per_axis**3
+    density = 4 * block_texels(len(grid.slot_coords), DENSITY_BRICK)
+    indices = 8 * block_texels(len(stored) // 729, INDEX_BRICK)
+    features = feature_bytes(int(np.count_nonzero(stored >= 0)), grid.n_channels)
     tile = TILE * TILE * (16 * -(-grid.n_channels // 8) + 8 + 4)
-    return cubes + density + columns + features + tile
+    return cubes + density + indices + features + tile
 
 
-def texture_bytes(n: int, words: int) -> int:
-    """Bytes of a layered texture that holds `n` texels of so many words of 32 bits.
+def block_texels(n: int, brick: tuple[int, int, int]) -> int:
+    """Texels of a texture of `n` bricks, MOST_LAYERS above each other at most, and as wide as it is high.
 
-    >>> texture_bytes(2048 * 64 + 1, 2) == 2 * 2048 * 64 * 8
-    True
+    >>> block_texels(0, (8, 8, 10)), block_texels(25, (8, 8, 10)), block_texels(26, (8, 8, 10))
+    (640, 16000, 17920)
     """
-    rows = max(-(-n // WIDTH), 1)
-    height = min(1 << math.ceil(math.log2(rows)), LEAST_HEIGHT)
-    while rows > MOST_LAYERS * height:
-        height *= 2
-    if height > MOST_HEIGHT:
-        most = MOST_LAYERS * MOST_HEIGHT * WIDTH
-        raise FormatError(f"graphics memory: expected at most {most} texels of a kind, got {n}")
-    return -(-rows // height) * height * WIDTH * 4 * words
+    if n > MOST_BRICKS:
+        raise FormatError(f"graphics memory: expected at most {MOST_BRICKS} bricks, got {n}")
+    across = max(math.ceil(math.sqrt(n / MOST_LAYERS)), 1)
+    return across**2 * max(-(-n // across**2), 1) * math.prod(brick)
 
 
-def feature_words(n_channels: int) -> int:
-    """Words of 32 bits that a row of features takes: 1, 2 or an even number.
+def feature_bytes(n: int, n_channels: int) -> int:
+    """Bytes of a texture of `n` rows of features: four channels a texel, and in a line as many rows as fit,
+    a power of two.
 
-    >>> [feature_words(n) for n in (1, 8, 12, 16, 20)]
-    [1, 2, 4, 4, 6]
+    >>> feature_bytes(0, 12), feature_bytes(512 * 256 + 1, 12) == 2 * 512 * 256 * 12
+    (6144, True)
     """
+    if n > MOST_ROWS:
+        raise FormatError(f"graphics memory: expected at most {MOST_ROWS} rows of features, got {n}")
     words = -(-n_channels // 4)
-    return words if words < 3 else words + words % 2
+    per_line = 2 ** math.floor(math.log2(WIDTH / words))
+    lines = max(-(-n // per_line), 1)
+    layers = -(-lines // LINES_A_LAYER)
+    return 4 * words * per_line * min(lines, LINES_A_LAYER) * layers

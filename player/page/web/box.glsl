@@ -7,7 +7,8 @@ uniform int uResolution;
 
 const float SKIP_MARGIN = 0.01;
 
-vec3 rayPoint, rayDirection;
+vec3 rayPoint, rayDirection, rayInverse, rayAhead; // 1 / direction, and 1 along the axes where it is positive
+vec3 rayNever; // large along the axes that the ray does not move on
 float rayT, rayLength;
 float sampleS;
 
@@ -15,17 +16,16 @@ void enter(vec3 origin, vec3 direction) {
   float size = float(uResolution);
   rayPoint = (origin - uAabbMin) * uCellsPerUnit;
   rayDirection = direction * uCellsPerUnit;
-  float tIn = 0.0, tOut = 1e30;
-  for (int axis = 0; axis < 3; axis++) {
-    float o = rayPoint[axis], d = rayDirection[axis];
-    if (d == 0.0) {
-      if (o < 0.0 || o > size) tOut = -1e30;
-    } else {
-      float a = -o / d, b = (size - o) / d;
-      tIn = max(tIn, min(a, b));
-      tOut = min(tOut, max(a, b));
-    }
-  }
+  bvec3 still = equal(rayDirection, vec3(0));
+  vec3 moving = mix(rayDirection, vec3(1), still);
+  rayInverse = 1.0 / moving;
+  rayNever = mix(vec3(0), vec3(1e6), still);
+  rayAhead = vec3(greaterThan(rayDirection, vec3(0)));
+  vec3 a = -rayPoint / moving, b = (size - rayPoint) / moving;
+  vec3 near = mix(min(a, b), vec3(0), still), far = mix(max(a, b), vec3(1e30), still);
+  float tIn = max(max(near.x, near.y), max(near.z, 0.0)), tOut = min(far.x, min(far.y, far.z));
+  vec3 outside = vec3(notEqual(rayPoint, clamp(rayPoint, vec3(0), vec3(size))));
+  if (dot(outside, rayNever) > 0.0) tOut = -1e30;
   rayPoint = clamp(rayPoint + tIn * rayDirection, vec3(0), vec3(size));
   rayT = tIn;
   rayLength = min(tOut - tIn, uMostLength);
@@ -43,13 +43,10 @@ float wayOf(int size) {
 }
 
 // The next base step to look at, after step n, whose middle is at g in a brick around which all within `reach` are empty.
-int jumpFrom(int n, vec3 g, ivec3 brick, int reach) {
-  vec3 ahead = vec3((brick + (reach + 1)) * 8) - SKIP_MARGIN, behind = vec3((brick - reach) * 8) + SKIP_MARGIN;
-  float s = 1e6;
-  for (int axis = 0; axis < 3; axis++) {
-    float d = rayDirection[axis];
-    if (d != 0.0) s = min(s, ((d > 0.0 ? ahead[axis] : behind[axis]) - rayPoint[axis]) / d);
-  }
+int jumpFrom(int n, vec3 g, vec3 brick, float reach) {
+  vec3 end = (brick - reach + rayAhead * (2.0 * reach + 1.0)) * 8.0 + SKIP_MARGIN * (1.0 - 2.0 * rayAhead);
+  vec3 way = (end - rayPoint) * rayInverse * vec3(equal(rayNever, vec3(0))) + rayNever;
+  float s = min(way.x, min(way.y, way.z));
   return max(n, int(floor(min(s / uStep - 0.5, 1e9)))) + 1;
 }
 

@@ -196,13 +196,12 @@ function decodeChannel(
       if (x >>> 16 === 0) x = (x << 16) | words[at++];
       states[lane] = x;
       ofStep[lane] = symbol;
+      found[row] = symbol;
       row += lane < nLonger ? nSteps + 1 : nSteps;
     }
     row = step;
     for (let lane = 0; lane < nActive; lane++) { // only now: what is coded at the same step is not known
-      const symbol = ofStep[lane];
-      near[row] = MIXED[symbol];
-      found[row] = symbol;
+      near[row] = MIXED[ofStep[lane]];
       row += lane < nLonger ? nSteps + 1 : nSteps;
     }
     if (at > nWords) return -1;

@@ -19,7 +19,7 @@ vec2 sampleTurn; // cos and sin of phi at the last sample
 vec3 latticeAt(int i) {
   COUNT;
   i = min(i, uLatticeSize - 1);
-  return texelFetch(uLattice, ivec2(i & 1023, i >> 10), 0).xyz;
+  return texelFetch(uLattice, ivec2(i & 1023, int(float(i) * (1.0 / 1024.0))), 0).xyz;
 }
 
 void enter(vec3 origin, vec3 direction) {
@@ -64,8 +64,8 @@ float wayOf(int size) {
   return rayWidth * 2.0 * turn.x * turn.y / (max(a + b, MIN_COS) * max(a - b, MIN_COS));
 }
 
-int jumpFrom(int n, vec3 g, ivec3 brick, int reach) {
-  vec3 free = min(g - vec3((brick - reach) * 8), vec3((brick + reach + 1) * 8) - g);
+int jumpFrom(int n, vec3 g, vec3 brick, float reach) {
+  vec3 free = min(g - (brick - reach) * 8.0, (brick + reach + 1.0) * 8.0 - g);
   float least = min(free.x, min(free.y, free.z)) - SKIP_MARGIN;
   return n + max(int(floor(least / (MAX_SPEED * uStep * uCellsPerUnit.x))), 0) + 1;
 }

@@ -8,55 +8,39 @@ const float MIN_TOTAL = 1e-3;
 
 FEATURES
 
-vec4 unpacked(uint word) {
-  return vec4((ivec4(uvec4(word)) << ivec4(24, 16, 8, 0)) >> 24);
-}
-
 void addRow(int row, float share) {
+  ivec3 at = texelOfRow(row);
   ADD_ROW
-}
-
-// How many of the eight vertices of a column with bits in `mask` are stored before vertex z.
-int storedBefore(uint mask, int z) {
-  uint bits = mask & ((1u << z) - 1u) & 255u;
-  bits = (bits & 0x55u) + ((bits >> 1) & 0x55u);
-  bits = (bits & 0x33u) + ((bits >> 2) & 0x33u);
-  return int((bits + (bits >> 4)) & 15u);
-}
-
-float shareOf(uvec2 column, int z, float share) {
-  uvec2 bits = (uvec2(column.y) >> uvec2(z, z + 1)) & 1u;
-  return (1.0 - share) * float(bits.x) + share * float(bits.y);
-}
-
-void addColumn(uvec2 column, int z, float share, float weight) {
-  uvec2 bits = (uvec2(column.y) >> uvec2(z, z + 1)) & 1u;
-  int row = int(column.x) + storedBefore(column.y, z);
-  if (bits.x == 1u) addRow(row, weight * (1.0 - share));
-  int above = z == 7 ? int(column.x) + int(column.y >> 9) : row + int(bits.x);
-  if (bits.y == 1u) addRow(above, weight * share);
 }
 
 // Adds the features at a place, in cells of the densities' grid; false where too little is stored.
 bool addFeatures(vec3 g, float weight) {
   g = clamp(g * uFeatureScale, vec3(0), vec3(uFeatureResolution));
-  ivec3 low = min(ivec3(g), ivec3(uFeatureResolution - 1));
-  int held = ownerAt(low >> 3);
-  if (held < 0) return false;
-  int level = held & 7;
-  low >>= level;
-  vec3 share = g * (1.0 / float(1 << level)) - vec3(low);
-  low &= 7;
-  int at = (held >> 3) * 81 + low.x * 9 + low.y;
-  uvec2 c0 = columnAt(at), c1 = columnAt(at + 1), c2 = columnAt(at + 9), c3 = columnAt(at + 10);
+  vec3 cell = min(floor(g), vec3(uFeatureResolution - 1));
+  ivec4 owner = ownerAt(ivec3(cell * 0.125));
+  if (owner.y >= 65280) return false; // there is none
+  int level = int(float(owner.y) * (1.0 / 256.0)), first = owner.z + owner.w * 65536;
+  float scale = 1.0 / float(1 << level);
+  vec3 own = floor(cell * scale), share = g * scale - own;
+  ivec3 at = ivec3(owner.x & 255, int(float(owner.x) * (1.0 / 256.0)), owner.y & 255) * ivec3(8, 8, 9) + (ivec3(own) & 7);
+  ivec4 low = indicesAt(at), high = indicesAt(at + ivec3(0, 0, 1)); // the corners (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1)
   vec4 across = vec4((1.0 - share.x) * (1.0 - share.y), (1.0 - share.x) * share.y, share.x * (1.0 - share.y), share.x * share.y);
-  float total = across.x * shareOf(c0, low.z, share.z) + across.y * shareOf(c1, low.z, share.z)
-    + across.z * shareOf(c2, low.z, share.z) + across.w * shareOf(c3, low.z, share.z);
+  vec4 below = across * (1.0 - share.z) * vec4(greaterThanEqual(low, ivec4(0)));
+  vec4 above = across * share.z * vec4(greaterThanEqual(high, ivec4(0)));
+  float total = dot(below + above, vec4(1));
   if (total < MIN_TOTAL) return false;
-  across *= weight / total;
-  addColumn(c0, low.z, share.z, across.x);
-  addColumn(c1, low.z, share.z, across.y);
-  addColumn(c2, low.z, share.z, across.z);
-  addColumn(c3, low.z, share.z, across.w);
+  weight *= 127.0 / total;
+  below *= weight;
+  above *= weight;
+  low = first + max(low, ivec4(0));
+  high = first + max(high, ivec4(0));
+  addRow(low.x, below.x);
+  addRow(low.y, below.y);
+  addRow(low.z, below.z);
+  addRow(low.w, below.w);
+  addRow(high.x, above.x);
+  addRow(high.y, above.y);
+  addRow(high.z, above.z);
+  addRow(high.w, above.w);
   return true;
 }

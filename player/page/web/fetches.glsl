@@ -9,10 +9,12 @@ vec2 kept[KEPT]; // s and weight
 float total = 0.0, moment = 0.0;
 int nWeights = 0;
 
+// All steps of all rays are in one loop, so that those of a group that is drawn together need not wait for each other.
 void keepSamples(inout March march) {
   float s, weight;
   for (int guard = 0; guard < MOST_STEPS; guard++) {
-    if (!nextSample(march, s, weight)) break;
+    if (!stepOn(march, s, weight)) break;
+    if (weight <= 0.0) continue;
     if (nWeights < KEPT) kept[nWeights] = vec2(s, weight);
     nWeights++;
     total += weight;
@@ -20,8 +22,15 @@ void keepSamples(inout March march) {
   }
 }
 
+// The next sample with weight.
 bool again(inout March march, inout int i, out float s, out float weight) {
-  if (nWeights > KEPT) return nextSample(march, s, weight);
+  if (nWeights > KEPT) {
+    for (int guard = 0; guard < MOST_STEPS; guard++) {
+      if (!stepOn(march, s, weight)) return false;
+      if (weight > 0.0) return true;
+    }
+    return false;
+  }
   if (i >= nWeights) return false;
   s = kept[i].x;
   weight = kept[i].y;
@@ -33,34 +42,27 @@ bool again(inout March march, inout int i, out float s, out float weight) {
 void fetchFeatures(float opacity) {
   March march = begun();
   int i = 0;
-  bool few = uFetches == 0 || nWeights <= uFetches;
+  bool few = uFetches == 0 || nWeights <= uFetches; // then each sample is a bin
   int nBins = few ? nWeights : uFetches;
   float mass = total / float(nBins), s = 0.0, left = 0.0;
   for (int bin = 0; bin < MOST_STEPS; bin++) {
     if (bin >= nBins) break;
-    float place, weight, heavy;
-    if (few) {
-      again(march, i, place, weight);
-      heavy = place;
-    } else {
-      float filled = 0.0, sum = 0.0, most = -1.0;
-      for (int guard = 0; guard < MOST_STEPS; guard++) {
-        if (left <= 0.0 && !again(march, i, s, left)) break;
-        float part = min(left, mass - filled);
-        sum += part * s;
-        filled += part;
-        left -= part;
-        if (part > most) {
-          most = part;
-          heavy = s;
-        }
-        if (filled >= mass) break;
+    float filled = 0.0, sum = 0.0, most = -1.0, heavy = 0.0;
+    for (int guard = 0; guard < MOST_STEPS; guard++) {
+      if (left <= 0.0 && !again(march, i, s, left)) break;
+      float part = few ? left : min(left, mass - filled);
+      sum += part * s;
+      filled += part;
+      left -= part;
+      if (part > most) {
+        most = part;
+        heavy = s;
       }
-      if (filled <= 0.0) break;
-      place = sum / filled;
-      weight = opacity / float(uFetches);
+      if (few || filled >= mass) break;
     }
-    if (!addFeatures(placeAt(place), weight) && !few) addFeatures(placeAt(heavy), weight);
+    if (filled <= 0.0) break;
+    float weight = few ? filled : opacity / float(uFetches);
+    if (!addFeatures(placeAt(few ? heavy : sum / filled), weight) && !few) addFeatures(placeAt(heavy), weight);
   }
 }
 #endif

@@ -1,34 +1,47 @@
 // Arranges a scene for the march on a GPU: flat arrays that become textures. The twin of player/asset/grid.py.
 //
-// - table [nb^3] Int32: for a place in a brick of the finest level, at (bx * nb + by) * nb + bz: slot << 3 | level of the
-//   finest brick there, or minus the distance in bricks to the nearest place that has one with a live cell there;
-// - density [slots * 162 * 2] Uint32: a texel of two words for each half column of each brick with its apron, at
-//   slot * 162 + (x * 9 + y) * 2 + half, x, y = 0..8. The first word has the codes z = 0..3 of the half, the second that
-//   of z = 4, and in bits 8 to 11 whether the cells z = 0..3 are live: a cell is read with four fetches;
-// - owners [nf^3] Int32: number << 3 | level of the brick that holds the feature vertices around a place, or -1;
-// - columns [held * 81 * 2] Uint32: a texel for each column of these bricks with their apron, at number * 81 + x * 9 + y:
-//   the row of its first stored vertex, and which are stored: bits 0 to 8, and above them how many rows behind the first
-//   the vertex z = 8 is, which is in the next brick;
-// - features [rows * words * 4] the codes of each row, four channels a word.
+// - table [nb^3 * 4] Uint8: for a place in a brick of the finest level, at (bx * nb + by) * nb + bz: where the densities of
+//   the finest brick there are, (x, y, z) in bricks, and MANY + its level; or 0, 0, 0 and the distance in bricks to the
+//   nearest place that has one with a live cell there;
+// - density [Uint8]: a block of bricks (`blockOf`) of 8 x 8 x 10 texels of four bytes. The texel (x, y, z) of a brick, z = 0..8,
+//   has the codes of the vertices (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1), so that a cell is read with two fetches;
+//   that of z = 9 has in its first byte which cells of the column are live, a bit for each;
+// - owners [nf^3 * 4] Uint16: of the brick that holds the feature vertices around a place where its indices are, in bricks,
+//   x + 256 y, z + 256 level, and its first row in two halves; NO_OWNER where there is none;
+// - indices [Int16]: a block of bricks of 8 x 8 x 9 texels of four numbers: for the same four vertices how many rows they are
+//   behind the brick's first, -1 for one that is not stored;
+// - features [Int8]: rows of codes, four a texel, ROWS_A_LINE a line. Each brick has its own rows, those behind its last
+//   vertices too, in the order of x, y and z.
 import { coordOf, popcount } from "./bricks.js";
 
 const MOST_DISTANCE = 31;
-const HALF_COLUMNS = 162; // of a brick with an apron
-const COLUMNS = 81;
+export const MANY = 32;
+const NO_OWNER = 0xff00;
+export const DENSITY_BRICK = [8, 8, 10]; // texels
+export const INDEX_BRICK = [8, 8, 9];
+export const LINES_A_LAYER = 256;
 
 const bricksAlong = (cells) => Math.ceil(cells / 8);
 
-// How many words a row of features takes: 1, 2 or an even number, so that a texel of four words begins at one or
-// in its middle.
-export function featureWords(nChannels) {
-  const words = Math.ceil(nChannels / 4);
-  return words < 3 ? words : words + (words & 1);
+// Texels that a row of features takes, and how many rows lie beside each other: a power of two, no more than 2048 texels.
+export const featureWords = (nChannels) => Math.ceil(nChannels / 4);
+export const rowsALine = (nChannels) => 2 ** Math.floor(Math.log2(2048 / featureWords(nChannels)));
+
+// How bricks of a texture lie side by side: { across, layers, size: [3] texels }, number n at (n % across, n / across % across,
+// n / across^2). At most 25 layers, so that few places are left over, and no side is longer than it has to be.
+export function blockOf(n, brick) {
+  const across = Math.max(Math.ceil(Math.sqrt(n / 25)), 1), layers = Math.max(Math.ceil(n / across ** 2), 1);
+  if (across > 256) throw new Error(`memory of the GPU: expected at most ${25 * 256 ** 2} bricks, got ${n}`);
+  return { across, layers, size: [across * brick[0], across * brick[1], layers * brick[2]] };
 }
+
+const placeOf = (n, { across }) => [n % across, Math.floor(n / across) % across, Math.floor(n / across ** 2)];
 
 // Nothing anywhere: what is shown before a scene is.
 export const NO_GRID = {
-  resolution: 1, nb: 1, nSlots: 0, table: Int32Array.of(-1), density: new Uint32Array(0),
-  featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Int32Array.of(-1), columns: new Uint32Array(0), features: new Uint32Array(0),
+  resolution: 1, nb: 1, nSlots: 0, table: Uint8Array.of(0, 0, 0, 1), density: new Uint8Array(2560),
+  featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Uint16Array.of(0, NO_OWNER, 0, 0), indices: new Int16Array(2304),
+  features: new Int8Array(0),
 };
 
 // What the densities `{ levels, vertices, values, firstRows }` of parts.js become: { resolution, nb, nSlots, table, density }.
@@ -36,18 +49,15 @@ export function arrangeDensities({ resolution, level_steps: levelSteps }, densit
   const shown = shownBricks(densities.levels, resolution), nb = bricksAlong(resolution);
   return {
     resolution, nb, nSlots: shown.count,
-    table: tableOf(shown.levels, nb, levelSteps),
-    density: densityTexels(densities, shown.levels, shown.count),
+    table: tableOf(shown, nb, levelSteps),
+    density: densityTexels(densities, shown),
   };
 }
 
-// What the features become: { featureResolution, nf, nHeld, nRows, owners, columns, features }.
+// What the features become: { featureResolution, nf, nHeld, nRows, owners, indices, features }.
 export function arrangeFeatures({ feature_resolution: featureResolution }, features) {
   const held = heldBricks(features, featureResolution);
-  return {
-    featureResolution, nf: held.n, nHeld: held.count, nRows: features.values.length / features.n_channels,
-    owners: held.owners, columns: columnTexels(held), features: featureTexels(features, featureWords(features.n_channels)),
-  };
+  return { featureResolution, nf: held.n, nHeld: held.count, ...featureTexels(held, features) };
 }
 
 // The bricks of each level that finer ones do not hide wholly, [{ level, first, bricks, numbers }], in `bricks` of the level
@@ -85,28 +95,30 @@ function eachPlace(n, level, [x, y, z], paint) {
 
 // A place in a coarse brick none of whose cells there is live is as empty as one without a brick, unless a sample that
 // begins there may stand for several steps.
-function tableOf(shown, n, levelSteps) {
-  const table = new Int32Array(n ** 3).fill(-1);
-  for (const { level, first, bricks, numbers } of [...shown].reverse()) {
+function tableOf({ levels, count }, n, levelSteps) {
+  const block = blockOf(count, DENSITY_BRICK);
+  const table = new Uint32Array(n ** 3); // four bytes each, the first the lowest
+  for (const { level, first, bricks, numbers } of [...levels].reverse()) {
     numbers.forEach((number, i) => {
-      const entry = ((first + i) << 3) | level, own = bricks.masks.subarray(16 * number, 16 * number + 16);
+      const [x, y, z] = placeOf(first + i, block), entry = x | (y << 8) | (z << 16) | ((MANY + level) << 24);
+      const own = bricks.masks.subarray(16 * number, 16 * number + 16);
       const whole = level === 0 || levelSteps[level] > 1;
-      eachPlace(n, level, coordOf(bricks.keys[number]), (place, x, y, z) => {
-        table[place] = whole || someLive(own, level, x, y, z) ? entry : -1;
+      eachPlace(n, level, coordOf(bricks.keys[number]), (place, i, j, k) => {
+        table[place] = whole || someLive(own, level, i, j, k) ? entry : 0;
       });
     });
   }
   addDistances(table, n);
-  return table;
+  return new Uint8Array(table.buffer);
 }
 
 // Whether a cell of a coarse brick is live at a place of the finest level: 4 x 4 x 4 cells, 2 x 2 x 2, or one.
-function someLive(cells, level, ...place) {
+function someLive(cells, level, i, j, k) {
   const count = Math.max(8 >> level, 1);
-  const [x, y, z] = place.map((c) => ((8 * c) >> level) & 7);
-  for (let i = x; i < x + count; i++) {
-    for (let j = y; j < y + count; j++) {
-      const line = cells[2 * i + (j >> 2)] >>> (8 * (j & 3) + z);
+  const x = ((8 * i) >> level) & 7, y = ((8 * j) >> level) & 7, z = ((8 * k) >> level) & 7;
+  for (let cx = x; cx < x + count; cx++) {
+    for (let cy = y; cy < y + count; cy++) {
+      const line = cells[2 * cx + (cy >> 2)] >>> (8 * (cy & 3) + z);
       if (line & ((1 << count) - 1)) return true;
     }
   }
@@ -119,7 +131,7 @@ function addDistances(table, n) {
   const padded = (x, y, z) => ((x + 1) * m + y + 1) * m + z + 1;
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let z = 0; z < n; z++, at++) if (table[at] >= 0) distances[padded(x, y, z)] = 0;
+      for (let z = 0; z < n; z++, at++) if (table[at]) distances[padded(x, y, z)] = 0;
     }
   }
   const before = [];
@@ -137,36 +149,39 @@ function addDistances(table, n) {
   }
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let z = 0; z < n; z++, at++) if (table[at] < 0) table[at] = -distances[padded(x, y, z)];
+      for (let z = 0; z < n; z++, at++) if (!table[at]) table[at] = distances[padded(x, y, z)] << 24;
     }
   }
 }
 
-function densityTexels({ vertices, values, firstRows }, shown, count) {
-  const texels = new Uint32Array(2 * HALF_COLUMNS * count);
-  const column = new Uint8Array(9);
-  for (const { level, first, bricks, numbers } of shown) {
+function densityTexels({ vertices, values, firstRows }, { levels, count }) {
+  const block = blockOf(count, DENSITY_BRICK), [width, height, depth] = block.size;
+  const texels = new Uint32Array(width * height * depth), codes = new Uint8Array(9 * 81);
+  for (const { level, first, bricks, numbers } of levels) {
     const read = new ColumnReader(vertices[level], firstRows[level]);
     for (let i = 0; i < numbers.length; i++) {
       read.moveTo(...coordOf(bricks.keys[numbers[i]]));
-      const cells = bricks.masks.subarray(16 * numbers[i], 16 * numbers[i] + 16);
-      let at = 2 * HALF_COLUMNS * (first + i);
-      for (let x = 0; x < 9; x++) {
-        for (let y = 0; y < 9; y++, at += 4) {
+      for (let x = 0, at = 0; x < 9; x++) {
+        for (let y = 0; y < 9; y++) {
           read.column(x, y);
           let row = read.row, mask = read.mask;
-          for (let z = 0; z < 8; z++, mask >>= 1) column[z] = mask & 1 ? values[row++] : 0;
-          column[8] = mask & 1 ? values[read.row8] : 0;
-          const live = x < 8 && y < 8 ? cells[2 * x + (y >> 2)] >>> (8 * (y & 3)) : 0;
-          texels[at] = column[0] | (column[1] << 8) | (column[2] << 16) | (column[3] << 24);
-          texels[at + 1] = column[4] | ((live & 15) << 8);
-          texels[at + 2] = column[4] | (column[5] << 8) | (column[6] << 16) | (column[7] << 24);
-          texels[at + 3] = column[8] | (((live >> 4) & 15) << 8);
+          for (let z = 0; z < 8; z++, mask >>= 1) codes[at++] = mask & 1 ? values[row++] : 0;
+          codes[at++] = mask & 1 ? values[read.row8] : 0;
+        }
+      }
+      const [bx, by, bz] = placeOf(first + i, block), word = 16 * numbers[i];
+      for (let x = 0; x < 8; x++) {
+        for (let y = 0; y < 8; y++) {
+          let from = 81 * x + 9 * y, to = (10 * bz * height + 8 * by + y) * width + 8 * bx + x;
+          for (let z = 0; z < 9; z++, from++, to += width * height) {
+            texels[to] = codes[from] | (codes[from + 9] << 8) | (codes[from + 81] << 16) | (codes[from + 90] << 24);
+          }
+          texels[to] = (bricks.masks[word + 2 * x + (y >> 2)] >>> (8 * (y & 3))) & 255;
         }
       }
     }
   }
-  return texels;
+  return new Uint8Array(texels.buffer);
 }
 
 // Reads the columns along z of one brick with its apron: `mask` has a bit for each stored vertex z = 0..8, `row` is
@@ -202,7 +217,7 @@ class ColumnReader {
 // Which bricks hold the features' vertices, as `vertex_rows` in player/asset/grid.py says.
 function heldBricks({ levels, vertices, firstRows }, resolution) {
   const n = bricksAlong(resolution);
-  const owners = new Int32Array(n ** 3).fill(-1); // -2 - number << 3 | level: a corner is stored, but no brick
+  const owners = new Int32Array(n ** 3).fill(-1); // number << 3 | level, or -2 minus that: a corner is stored, but no brick
   const shown = shownBricks(levels, resolution).levels;
   const held = [];
   let count = 0;
@@ -242,34 +257,70 @@ function withCorners({ keys, masks }, n, wanted) {
   return found;
 }
 
-function columnTexels({ held, count }) {
-  const texels = new Uint32Array(2 * COLUMNS * count);
-  let at = 0;
+// { nRows, owners, indices, features }.
+function featureTexels({ n, owners: numbers, held, count }, { values, stride }) {
+  const block = blockOf(count, INDEX_BRICK), [width, height, depth] = block.size;
+  const indices = new Int16Array(4 * width * height * depth), firstRows = new Uint32Array(count + 1);
+  const rows = new RowWriter(values, stride / 4), around = new Int16Array(9 * 81);
+  let number = 0;
   for (const { vertices, coords, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
     for (const coord of coords) {
       read.moveTo(...coord);
-      for (let x = 0; x < 9; x++) {
-        for (let y = 0; y < 9; y++, at += 2) {
+      const first = (firstRows[number] = rows.n);
+      for (let x = 0, at = 0; x < 9; x++) {
+        for (let y = 0; y < 9; y++) {
           read.column(x, y);
-          const first = read.mask & 255 ? read.row : read.row8;
-          texels[at] = read.mask ? first : 0;
-          texels[at + 1] = read.mask | (read.mask & 256 ? (read.row8 - first) << 9 : 0);
+          let row = read.row, mask = read.mask;
+          for (let z = 0; z < 8; z++, mask >>= 1) around[at++] = mask & 1 ? rows.add(row++) - first : -1;
+          around[at++] = mask & 1 ? rows.add(read.row8) - first : -1;
+        }
+      }
+      const [bx, by, bz] = placeOf(number++, block);
+      for (let x = 0; x < 8; x++) {
+        for (let y = 0; y < 8; y++) {
+          let from = 81 * x + 9 * y, to = 4 * ((9 * bz * height + 8 * by + y) * width + 8 * bx + x);
+          for (let z = 0; z < 9; z++, from++, to += 4 * width * height) {
+            indices[to] = around[from];
+            indices[to + 1] = around[from + 9];
+            indices[to + 2] = around[from + 81];
+            indices[to + 3] = around[from + 90];
+          }
         }
       }
     }
   }
-  return texels;
+  const owners = new Uint16Array(4 * n ** 3);
+  numbers.forEach((owner, i) => {
+    const [x, y, z] = placeOf(owner >> 3, block), first = firstRows[owner >> 3];
+    if (owner < 0) owners[4 * i + 1] = NO_OWNER;
+    else owners.set([x | (y << 8), z | ((owner & 7) << 8), first & 0xffff, first >>> 16], 4 * i);
+  });
+  return { nRows: rows.n, owners, indices, features: rows.whole() };
 }
 
-// The codes as words; without a copy where rows are whole words that `words` counts.
-function featureTexels({ values, n_channels: nChannels }, words) {
-  if (nChannels === 4 * words && values.byteOffset % 4 === 0) {
-    return new Uint32Array(values.buffer, values.byteOffset, values.length / 4);
+// Gathers rows of features, of so many words, one behind the other.
+class RowWriter {
+  constructor(values, nWords) {
+    this.values = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
+    Object.assign(this, { n: 0, nWords, rows: new Int32Array(nWords << 16) });
   }
-  const nRows = values.length / nChannels, padded = new Int8Array(4 * words * nRows);
-  for (let row = 0; row < nRows; row++) {
-    padded.set(values.subarray(row * nChannels, (row + 1) * nChannels), 4 * words * row);
+
+  // Adds a row of the values; its number.
+  add(row) {
+    const { nWords, values } = this;
+    let to = this.n * nWords;
+    if (to + nWords > this.rows.length) {
+      const longer = new Int32Array(2 * this.rows.length);
+      longer.set(this.rows);
+      this.rows = longer;
+    }
+    const { rows } = this;
+    for (let from = row * nWords, end = from + nWords; from < end;) rows[to++] = values[from++];
+    return this.n++;
   }
-  return new Uint32Array(padded.buffer);
+
+  whole() {
+    return new Int8Array(this.rows.slice(0, this.n * this.nWords).buffer);
+  }
 }

@@ -10,7 +10,7 @@ layout(location = 0) out uvec4 colours;
 vec3 rgb[4];
 
 vec4 weight(int k) {
-  return texelFetch(uWeights, ivec2(k & 1023, k >> 10), 0);
+  return texelFetch(uWeights, ivec2(k & 1023, int(float(k) * (1.0 / 1024.0))), 0);
 }
 
 // x (1 + erf(x / sqrt 2)) / 2, with the error function of Abramowitz and Stegun, 7.1.28: to 5e-7.

@@ -7,55 +7,49 @@ uniform int uLevelSteps[8];
 struct March {
   int n; // the base step to go on with
   float tau;
-  ivec3 brick; // the last that was looked at, and its entry
-  int entry;
+  vec3 brick; // the last that was looked at, in bricks of the finest level,
+  ivec3 first; // where its densities begin,
+  int reach; // how far around it all is empty, in bricks; -1 where it is not
+  float scale; // cells of its level a cell of the finest
+  int size; // base steps that a sample in it stands for
 };
 
 March begun() {
-  return March(0, 0.0, ivec3(-1), 0);
+  return March(0, 0.0, vec3(-1), ivec3(0), 0, 1.0, 1);
 }
 
 vec3 gradientSum = vec3(0);
 
-int entryAt(inout March march, ivec3 brick) {
-  if (brick != march.brick) {
-    march.brick = brick;
-    march.entry = tableAt(brick);
-  }
-  return march.entry;
+void lookAt(inout March march, vec3 cell) {
+  vec3 brick = floor(cell * 0.125);
+  if (brick == march.brick) return;
+  march.brick = brick;
+  ivec4 entry = tableAt(ivec3(brick));
+  march.reach = entry.w < MANY ? entry.w - 1 : -1;
+  if (entry.w < MANY) return;
+  march.first = entry.xyz * ivec3(8, 8, 10);
+  march.scale = 1.0 / float(1 << (entry.w - MANY));
+  march.size = uLevelSteps[entry.w - MANY];
 }
 
-// The two codes of a half column around z = 0..3, interpolated.
-float edge(uvec2 texel, int z, float share) {
-  uint low = (texel.x >> (8 * z)) & 255u;
-  uint high = z == 3 ? texel.y & 255u : (texel.x >> (8 * z + 8)) & 255u;
-  float a = float(low);
-  return a + (float(high) - a) * share;
+vec3 cellOf(vec3 g) {
+  return clamp(floor(g), vec3(0), vec3(uResolution - 1));
 }
 
-ivec3 cellOf(vec3 g) {
-  return clamp(ivec3(g), ivec3(0), ivec3(uResolution - 1));
-}
-
-// The interpolated code at a place that has a brick; false where the cell is not live.
-bool codeAt(int entry, vec3 g, ivec3 cell, out float code, out vec3 slope) {
-  int level = entry & 7;
-  cell >>= level;
-  vec3 share = g * (1.0 / float(1 << level)) - vec3(cell);
-  cell &= 7;
-  int z = cell.z & 3, at = ((entry >> 3) * 81 + cell.x * 9 + cell.y) * 2 + (cell.z >> 2);
-  uvec2 first = densityAt(at);
-  if (((first.y >> (8 + z)) & 1u) == 0u) return false;
-  uvec2 second = densityAt(at + 2), third = densityAt(at + 18), fourth = densityAt(at + 20);
-  float e0 = edge(first, z, share.z), e1 = edge(second, z, share.z);
-  float e2 = edge(third, z, share.z), e3 = edge(fourth, z, share.z);
-  float f0 = e0 + (e1 - e0) * share.y, f1 = e2 + (e3 - e2) * share.y;
-  code = f0 + (f1 - f0) * share.x;
+// The interpolated code in a cell of the finest level that has a brick; false where the cell is not live.
+bool codeAt(March march, vec3 g, vec3 cell, out float code, out vec3 slope) {
+  vec3 own = floor(cell * march.scale), share = g * march.scale - own;
+  ivec3 local = ivec3(own) & 7, at = march.first + local;
+  int live = int(densityAt(ivec3(at.xy, march.first.z + 9)).r * 255.0 + 0.5);
+  if ((live & (1 << local.z)) == 0) return false;
+  vec4 low = densityAt(at) * 255.0, high = densityAt(at + ivec3(0, 0, 1)) * 255.0; // the corners (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1)
+  vec4 e = low + (high - low) * share.z;
+  vec2 f = e.xz + (e.yw - e.xz) * share.y;
+  code = f.x + (f.y - f.x) * share.x;
 #ifdef NORMALS
-  float d0 = edge(first, z, 1.0) - edge(first, z, 0.0), d1 = edge(second, z, 1.0) - edge(second, z, 0.0);
-  float d2 = edge(third, z, 1.0) - edge(third, z, 0.0), d3 = edge(fourth, z, 1.0) - edge(fourth, z, 0.0);
-  slope = vec3(f1 - f0, mix(e1 - e0, e3 - e2, share.x), mix(mix(d0, d1, share.y), mix(d2, d3, share.y), share.x));
-  slope *= 1.0 / float(1 << level);
+  vec4 d = high - low;
+  vec2 up = mix(d.xz, d.yw, share.y);
+  slope = vec3(f.y - f.x, mix(e.y - e.x, e.w - e.z, share.x), mix(up.x, up.y, share.x)) * march.scale;
 #endif
   return true;
 }
@@ -65,38 +59,34 @@ float alphaOf(float x) {
   return x < 0.03 ? x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0)))) : 1.0 - exp(-x);
 }
 
-// Moves on to the next sample that has weight; false where there is none.
-bool nextSample(inout March march, out float s, out float weight) {
-  for (int guard = 0; guard < MOST_STEPS; guard++) {
-    vec3 g = placeOf(march.n, 1);
-    if (!(sampleS < rayLength) || march.tau > uMostTau) return false;
-    ivec3 cell = cellOf(g);
-    int entry = entryAt(march, cell >> 3);
-    if (entry < 0) {
-      march.n = jumpFrom(march.n, g, cell >> 3, -1 - entry);
-      continue;
-    }
-    int size = uLevelSteps[entry & 7];
-    if (march.n != 0) size = min(size, march.n & -march.n);
-    if (size > 1) {
-      g = placeOf(march.n, size);
-      cell = cellOf(g);
-      entry = entryAt(march, cell >> 3);
-    }
-    march.n += size;
-    float code;
-    vec3 slope;
-    if (entry < 0 || !(sampleS < rayLength) || !codeAt(entry, g, cell, code, slope)) continue;
-    float optical = exp(uDensityCode.x + uDensityCode.y * code) * wayOf(size);
-    s = sampleS;
-    weight = exp(-march.tau) * alphaOf(optical);
-    march.tau += optical;
-    if (weight > 0.0) {
-#ifdef NORMALS
-      gradientSum -= weight * pulledBack(slope * uCellsPerUnit);
-#endif
-      return true;
-    }
+// Moves on by one step, a jump over what is empty or a sample; false at the ray's end. Without a sample its weight is 0.
+bool stepOn(inout March march, out float s, out float weight) {
+  weight = 0.0;
+  vec3 g = placeOf(march.n, 1);
+  if (!(sampleS < rayLength) || march.tau > uMostTau) return false;
+  vec3 cell = cellOf(g);
+  lookAt(march, cell);
+  if (march.reach >= 0) {
+    march.n = jumpFrom(march.n, g, march.brick, float(march.reach));
+    return true;
   }
-  return false;
+  int size = march.size;
+  if (march.n != 0) size = min(size, march.n & -march.n);
+  if (size > 1) {
+    g = placeOf(march.n, size);
+    cell = cellOf(g);
+    lookAt(march, cell);
+  }
+  march.n += size;
+  float code;
+  vec3 slope;
+  if (march.reach >= 0 || !(sampleS < rayLength) || !codeAt(march, g, cell, code, slope)) return true;
+  float optical = exp(uDensityCode.x + uDensityCode.y * code) * wayOf(size);
+  s = sampleS;
+  weight = exp(-march.tau) * alphaOf(optical);
+  march.tau += optical;
+#ifdef NORMALS
+  gradientSum -= weight * pulledBack(slope * uCellsPerUnit);
+#endif
+  return true;
 }

@@ -15,6 +15,7 @@ class PyramidReader {
     const isFeatures = grid === "features";
     this.steps = isFeatures ? manifest.feature_steps : manifest.density_steps;
     this.nChannels = isFeatures ? manifest.n_channels : 1;
+    this.stride = isFeatures ? 4 * Math.ceil(this.nChannels / 4) : 1; // numbers from one row of values to the next
     [this.low, this.high] = isFeatures ? [-127, 127] : [0, 255];
     this.pyramid = new Pyramid(isFeatures ? manifest.feature_resolution : manifest.resolution, this.steps.length);
     this.nKnown = this.steps.map(() => 0); // channels of each level whose symbols are read
@@ -24,11 +25,11 @@ class PyramidReader {
     const nRows = this.steps.map((_, level) => structures.find((s) => s.level === level)?.n_vertices ?? 0);
     this.firstRows = [0];
     for (const n of nRows) this.firstRows.push(this.firstRows.at(-1) + n);
-    this.all = new (isFeatures ? Int8Array : Uint8Array)(this.firstRows.at(-1) * this.nChannels);
+    this.all = new (isFeatures ? Int8Array : Uint8Array)(this.firstRows.at(-1) * this.stride);
   }
 
   valuesOf(level) {
-    return this.all.subarray(this.firstRows[level] * this.nChannels, this.firstRows[level + 1] * this.nChannels);
+    return this.all.subarray(this.firstRows[level] * this.stride, this.firstRows[level + 1] * this.stride);
   }
 
   async readStructure(section, data, where) {
@@ -70,23 +71,24 @@ class PyramidReader {
       coarser: isCoarsest ? null : this.pyramid.vertices[level + 1],
       values: this.valuesOf(level),
       coarserValues: isCoarsest ? null : this.valuesOf(level + 1),
-      nChannels: this.nChannels, first, n, symbols, beyond, beyondFirst,
+      stride: this.stride, first, n, symbols, beyond, beyondFirst,
       step: this.steps[level], low: this.low, high: this.high,
     });
   }
 
   // What is known so far. `isLast`: the arrays are handed out themselves, and this is at its end.
   values(isLast) {
-    const { pyramid, nChannels } = this;
+    const { pyramid, nChannels, stride } = this;
     for (let level = this.steps.length - 1; level >= 0; level--) {
       const n = nChannels - this.nKnown[level];
       if (n > 0) this.put(level, this.nKnown[level], n, { symbols: null });
     }
     const finest = Math.max(0, pyramid.levels.findIndex((bricks) => bricks.n > 0));
     const first = this.firstRows[finest];
-    const known = this.all.subarray(first * nChannels);
+    const known = this.all.subarray(first * stride);
     return {
       n_channels: nChannels,
+      stride,
       levels: pyramid.levels,
       vertices: pyramid.vertices,
       values: isLast && first === 0 ? this.all : known.slice(),
@@ -131,10 +133,10 @@ export class PartsReader {
     this.nRead++;
   }
 
-  // What is known of each grid: { n_channels, levels, vertices, values, firstRows }. `levels` are the Bricks of each level,
-  // the finest first, `vertices` its Vertices; `values` [n_rows * n_channels] Uint8Array for densities, Int8Array for
+  // What is known of each grid: { n_channels, stride, levels, vertices, values, firstRows }. `levels` are the Bricks of each
+  // level, the finest first, `vertices` its Vertices; `values` [n_rows * stride] Uint8Array for densities, Int8Array for
   // features, has a row for each vertex of each level, the border's too, levels one after the other, in a level by brick
-  // of vertices and then by bit; `firstRows` [n_levels + 1].
+  // of vertices and then by bit, padded to whole words for features; `firstRows` [n_levels + 1].
   values(isLast) {
     return Object.fromEntries(Object.entries(this.grids).map(([name, grid]) => [name, grid.values(isLast)]));
   }

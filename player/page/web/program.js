@@ -1,6 +1,5 @@
 // Shaders put together for a scene, compiled when they are first needed.
-import { WIDTH_BITS } from "./textures.js";
-import { featureWords } from "./grid.js";
+import { featureWords, LINES_A_LAYER, MANY, rowsALine } from "./grid.js";
 import { headCode } from "./head.js";
 import { shaders } from "./shaders.js";
 
@@ -15,27 +14,14 @@ void main() {
 
 // Texts that stand for names in the shaders.
 function featureTexts(nChannels) {
-  const words = featureWords(nChannels), n = Math.ceil(nChannels / 4);
-  const numbers = Array.from({ length: n }, (_, i) => i);
-  let add;
-  if (words < 4) {
-    add = "uvec4 t0 = featureTexel(row);\n";
-    add += numbers.map((i) => `f${i} += share * unpacked(t0.${"xy"[i]});`).join("\n");
-  } else {
-    const nTexels = Math.ceil(words / 4 + (words % 4 ? 0.5 : 0));
-    add = `int at = row * ${words};\n`;
-    for (let i = 0; i < nTexels; i++) add += `uvec4 t${i} = featureTexel((at >> 2) + ${i});\n`;
-    const word = (i) => `t${i >> 2}.${"xyzw"[i & 3]}`;
-    const lines = (from) => numbers.map((i) => `f${i} += share * unpacked(${word(i + from)});`).join("\n");
-    add += words % 4 ? `if ((at & 2) == 0) {\n${lines(0)}\n} else {\n${lines(2)}\n}` : lines(0);
-  }
+  const n = featureWords(nChannels), numbers = Array.from({ length: n }, (_, i) => i);
   const nWords = 2 * n, nOut = foundTextures(nChannels);
   const outputs = Array.from({ length: nOut }, (_, i) => `layout(location = ${i}) out uvec4 found${i};\n`);
   const word = (i) => (i < nWords ? `packSnorm2x16(f${i >> 1}.${i & 1 ? "zw" : "xy"} / 128.0)` : "0u");
   const write = Array.from({ length: nOut }, (_, i) => `found${i} = uvec4(${[0, 1, 2, 3].map((c) => word(4 * i + c)).join(", ")});`);
   return {
     FEATURES: `vec4 ${numbers.map((i) => `f${i}`).join(", ")};`,
-    ADD_ROW: add,
+    ADD_ROW: numbers.map((i) => `f${i} += share * featureAt(at + ivec3(${i}, 0, 0));`).join("\n"),
     CLEAR_FEATURES: numbers.map((i) => `f${i} = `).join("") + "vec4(0);",
     FOUND_OUTPUTS: `${outputs.join("")}layout(location = ${nOut}) out uvec4 foundOpacity;`,
     WRITE_FOUND: write.join("\n"),
@@ -62,7 +48,8 @@ function filled(text, texts) {
 export function marchSource(scene, { layer, counting, mostSteps }) {
   const { manifest } = scene, nChannels = manifest.n_channels;
   const defines = {
-    LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, WIDTH_BITS,
+    LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, MANY,
+    WORDS: featureWords(nChannels), ROWS_A_LINE: rowsALine(nChannels), LINES_A_LAYER,
     ...(layer === "normals" ? { NORMALS: 1 } : {}), ...(counting ? { COUNTING: 1 } : {}),
   };
   const features = layer === "colour" ? ["features"] : [];

@@ -174,12 +174,12 @@ for (let b = 0; b < 512; b++) {
 
 // The values of the channels from `first` on of a level, `clip(predicted + step * symbol)`, into `values`.
 // - here, coarser: the vertices of the level, and of the next coarser one (null for the coarsest);
-// - values, coarserValues: typed arrays, rows of nChannels;
+// - values, coarserValues: typed arrays, rows of `stride`;
 // - n: how many channels;
 // - symbols: Uint8Array [n * nRows], channel by channel, symbols + 63; null where all are 0;
 // - beyond, beyondFirst: for symbols of -63 and 63 how much further they are, and where each channel's begin;
 // - step, low, high: of the level, and of values.
-export function putValues({ here, coarser, values, coarserValues, nChannels, first, n, symbols, beyond, beyondFirst,
+export function putValues({ here, coarser, values, coarserValues, stride, first, n, symbols, beyond, beyondFirst,
   step, low, high }) {
   const { bricks, border } = here;
   const nRows = symbols ? symbols.length / n : 0;
@@ -189,13 +189,13 @@ export function putValues({ here, coarser, values, coarserValues, nChannels, fir
   let row = 0;
   let symbolRow = 0;
   for (let i = 0; i < bricks.n; i++) {
-    if (coarser) gather(coarser, bricks.keys[i], coarserValues, nChannels, first, n, near);
+    if (coarser) gather(coarser, bricks.keys[i], coarserValues, stride, first, n, near);
     for (let word = 0; word < 16; word++) {
       const notStored = symbols === null ? -1 : border[16 * i + word];
       for (let left = bricks.masks[16 * i + word] | 0; left !== 0; left &= left - 1) {
         const bit = left & -left;
         if (coarser) addAround(near, 32 * word + 31 - Math.clz32(bit), n, sums);
-        const into = row * nChannels + first;
+        const into = row * stride + first;
         row++;
         if (notStored & bit) {
           for (let k = 0; k < n; k++) values[into + k] = (sums[k] + 4) >> 3;
@@ -226,7 +226,7 @@ const PLACES = Uint16Array.from({ length: 8 * 125 }, (_, i) => {
 const found = new Int32Array(8);
 
 // The coarser level's values at 5 x 5 x 5 vertices around a brick of vertices, into `near` [125 n].
-function gather(coarser, key, values, nChannels, first, n, near) {
+function gather(coarser, key, values, stride, first, n, near) {
   const [x, y, z] = coordOf(key);
   for (let k = 0; k < 8; k++) {
     found[k] = coarser.bricks.find((x >> 1) + (k >> 2), (y >> 1) + ((k >> 1) & 1), (z >> 1) + (k & 1));
@@ -236,7 +236,7 @@ function gather(coarser, key, values, nChannels, first, n, near) {
     const at = PLACES[octant + place];
     const from = coarser.ranks.at(found[at >> 9], at & 511, -1);
     if (from < 0) continue; // around no vertex that is there
-    for (let k = 0; k < n; k++) near[place * n + k] = values[from * nChannels + first + k];
+    for (let k = 0; k < n; k++) near[place * n + k] = values[from * stride + first + k];
   }
 }
 

@@ -9,7 +9,7 @@ import { raysOf } from "./camera.js";
 import { NO_GRID } from "./grid.js";
 import { multiplyAdds } from "./head.js";
 import { compositeSource, foundTextures, headSource, marchSource, Program } from "./program.js";
-import { deleteFramebuffer, framebufferOf, gpuBytes, rowBits, TILE, uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
+import { deleteFramebuffer, framebufferOf, gpuBytes, TILE, uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
 
 const OPAQUE_DEPTH = Math.log(1000);
 
@@ -134,7 +134,7 @@ export class Renderer {
       uStep: manifest.step, uMostLength: Math.fround((this.mostSteps - 1) * Math.fround(manifest.step)), uNear: manifest.near,
       uResolution: manifest.resolution, uLatticeSize: this.tables.uLattice?.n ?? 0,
       uMostTau: OPAQUE_DEPTH, uDensityCode: [logLow, (logHigh - logLow) / 255],
-      uBits: rowBits(grid, manifest.n_channels), uFeatureResolution: grid.featureResolution, uFeatureScale: grid.featureResolution / grid.resolution,
+      uFeatureResolution: grid.featureResolution, uFeatureScale: grid.featureResolution / grid.resolution,
     };
   }
 

@@ -1,12 +1,11 @@
-// Long arrays lie in layered textures, row by row: WIDTH_BITS are the bits of a texel's column, uBits those of its row in
-// a layer, for densities, columns and features.
+// The grids in textures: see grid.js. Shifts cost as much as fetches where the shader runs on a processor, so that places are
+// found by products and differences.
 
-uniform highp isampler3D uTable;
-uniform highp usampler2DArray uDensity;
-uniform highp isampler3D uOwners;
-uniform highp usampler2DArray uColumns;
-uniform highp usampler2DArray uFeatures;
-uniform int uBits[3];
+uniform highp usampler3D uTable;
+uniform highp sampler3D uDensity;
+uniform highp usampler3D uOwners;
+uniform highp isampler3D uIndices;
+uniform highp sampler2DArray uFeatures;
 
 uint nTexels = 0u;
 
@@ -16,31 +15,33 @@ uint nTexels = 0u;
 #define COUNT
 #endif
 
-ivec3 texelOf(int i, int rowBits) {
-  return ivec3(i & ((1 << WIDTH_BITS) - 1), (i >> WIDTH_BITS) & ((1 << rowBits) - 1), i >> (WIDTH_BITS + rowBits));
+ivec4 tableAt(ivec3 brick) {
+  COUNT;
+  return ivec4(texelFetch(uTable, brick.zyx, 0));
 }
 
-int tableAt(ivec3 brick) {
+vec4 densityAt(ivec3 at) {
   COUNT;
-  return texelFetch(uTable, brick.zyx, 0).r;
+  return texelFetch(uDensity, at, 0);
 }
 
-int ownerAt(ivec3 brick) {
+ivec4 ownerAt(ivec3 brick) {
   COUNT;
-  return texelFetch(uOwners, brick.zyx, 0).r;
+  return ivec4(texelFetch(uOwners, brick.zyx, 0));
 }
 
-uvec2 densityAt(int i) {
+ivec4 indicesAt(ivec3 at) {
   COUNT;
-  return texelFetch(uDensity, texelOf(i, uBits[0]), 0).rg;
+  return texelFetch(uIndices, at, 0);
 }
 
-uvec2 columnAt(int i) {
-  COUNT;
-  return texelFetch(uColumns, texelOf(i, uBits[1]), 0).rg;
+// Where the first texel of a row of features is.
+ivec3 texelOfRow(int row) {
+  int line = int(float(row) * (1.0 / float(ROWS_A_LINE))), layer = int(float(line) * (1.0 / float(LINES_A_LAYER)));
+  return ivec3((row & (ROWS_A_LINE - 1)) * WORDS, line & (LINES_A_LAYER - 1), layer);
 }
 
-uvec4 featureTexel(int i) {
+vec4 featureAt(ivec3 at) {
   COUNT;
-  return texelFetch(uFeatures, texelOf(i, uBits[2]), 0);
+  return texelFetch(uFeatures, at, 0);
 }

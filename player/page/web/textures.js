@@ -1,54 +1,33 @@
-// The arrays of a grid as textures of WebGL2. A long array lies in a layered texture, row by row: every device has
-// textures of 2048 x 2048 texels and 256 layers.
-import { featureWords } from "./grid.js";
+// The arrays of a grid as textures of WebGL2.
+import { blockOf, DENSITY_BRICK, featureWords, INDEX_BRICK, LINES_A_LAYER, rowsALine } from "./grid.js";
 
-export const WIDTH_BITS = 11;
-const MOST_BITS = 11, MOST_LAYERS = 256, LEAST_BITS = 6;
-
-// How an array of n texels lies: `bits` of a row's number in its layer, and layers.
-export function layoutOf(n) {
-  const rows = Math.max(Math.ceil(n / 2 ** WIDTH_BITS), 1);
-  let bits = Math.min(Math.ceil(Math.log2(rows)), LEAST_BITS);
-  while (rows > MOST_LAYERS * 2 ** bits) bits++;
-  if (bits > MOST_BITS) throw new Error(`memory of the GPU: expected at most ${MOST_LAYERS * 2 ** (MOST_BITS + WIDTH_BITS)} texels of a kind, got ${n}`);
-  return { bits, layers: Math.ceil(rows / 2 ** bits) };
-}
-
-const bytesOf = (n, words) => {
-  const { bits, layers } = layoutOf(n);
-  return layers * 2 ** (bits + WIDTH_BITS) * 4 * words;
-};
-
-// Texels of features, and the words in each.
-export function featureLayout(nRows, nChannels) {
-  const words = featureWords(nChannels), wide = Math.min(words, 4);
-  return { n: Math.ceil((nRows * words) / wide), words: wide };
-}
-
-// The `bits` of a grid's long arrays: densities, columns and features.
-export function rowBits({ nSlots, nHeld, nRows }, nChannels) {
-  return [162 * nSlots, 81 * nHeld, featureLayout(nRows, nChannels).n].map((n) => layoutOf(n).bits);
-}
+const MOST_LAYERS = 256; // that every device has
+const MOST_ROWS = 2 ** 24; // that a shader can tell apart: see textures.glsl
 
 export const TILE = 256; // pixels along a side of what is drawn at a time, so that no driver takes it for hung
 
-// Bytes of a grid's textures, and of what a tile of the picture takes. The twin of player/page/gpu_memory.py.
-export function gpuBytes({ nb, nf, nSlots, nHeld, nRows }, nChannels) {
-  const features = featureLayout(nRows, nChannels);
-  const tile = TILE * TILE * (16 * Math.ceil(nChannels / 8) + 8 + 4);
-  return 4 * (nb ** 3 + nf ** 3) + bytesOf(162 * nSlots, 2) + bytesOf(81 * nHeld, 2) + bytesOf(features.n, features.words) + tile;
+// Size [3] of the texture of n rows of features, texels.
+function featureSize(n, nChannels) {
+  const lines = Math.max(Math.ceil(n / rowsALine(nChannels)), 1), layers = Math.ceil(lines / LINES_A_LAYER);
+  if (n > MOST_ROWS || layers > MOST_LAYERS) throw new Error(`memory of the GPU: expected at most ${MOST_ROWS} rows of features, got ${n}`);
+  return [rowsALine(nChannels) * featureWords(nChannels), Math.min(lines, LINES_A_LAYER), layers];
 }
 
-export function uploadGrid(gl, grid, nChannels) {
-  const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE), largest = Math.max(grid.nb, grid.nf);
-  if (largest > most) throw new Error(`memory of the GPU: expected textures of ${largest} texels a side, got at most ${most}`);
-  const { words } = featureLayout(grid.nRows, nChannels);
+const product = (numbers) => numbers.reduce((all, number) => all * number, 1);
+
+// Bytes of a grid's textures, and of what a tile of the picture takes. The twin of player/page/gpu_memory.py.
+export function gpuBytes({ nb, nf, density, indices, nRows }, nChannels) {
+  const tile = TILE * TILE * (16 * Math.ceil(nChannels / 8) + 8 + 4);
+  return 4 * nb ** 3 + 8 * nf ** 3 + density.byteLength + indices.byteLength + 4 * product(featureSize(nRows, nChannels)) + tile;
+}
+
+export function uploadGrid(gl, { nb, nf, nSlots, nHeld, nRows, ...grid }, nChannels) {
   return {
-    uTable: cube(gl, grid.nb, grid.table),
-    uDensity: layered(gl, grid.density, 2),
-    uOwners: cube(gl, grid.nf, grid.owners),
-    uColumns: layered(gl, grid.columns, 2),
-    uFeatures: layered(gl, grid.features, words),
+    uTable: texture3D(gl, gl.TEXTURE_3D, [nb, nb, nb], [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], grid.table),
+    uDensity: texture3D(gl, gl.TEXTURE_3D, blockOf(nSlots, DENSITY_BRICK).size, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], grid.density),
+    uOwners: texture3D(gl, gl.TEXTURE_3D, [nf, nf, nf], [gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT], grid.owners),
+    uIndices: texture3D(gl, gl.TEXTURE_3D, blockOf(nHeld, INDEX_BRICK).size, [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT], grid.indices),
+    uFeatures: texture3D(gl, gl.TEXTURE_2D_ARRAY, featureSize(nRows, nChannels), [gl.RGBA8_SNORM, gl.RGBA, gl.BYTE], grid.features),
   };
 }
 
@@ -60,27 +39,21 @@ function fresh(gl, target) {
   return { texture, target };
 }
 
-function cube(gl, n, values) {
-  const found = fresh(gl, gl.TEXTURE_3D);
-  gl.texStorage3D(gl.TEXTURE_3D, 1, gl.R32I, n, n, n);
-  gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, n, n, n, gl.RED_INTEGER, gl.INT, values);
-  return found;
-}
-
-function layered(gl, values, words) {
-  const target = gl.TEXTURE_2D_ARRAY, n = values.length / words, width = 2 ** WIDTH_BITS;
-  const { bits, layers } = layoutOf(n), height = 2 ** bits;
-  const found = fresh(gl, target);
-  const [inside, format] = { 1: [gl.R32UI, gl.RED_INTEGER], 2: [gl.RG32UI, gl.RG_INTEGER], 4: [gl.RGBA32UI, gl.RGBA_INTEGER] }[words];
-  gl.texStorage3D(target, 1, inside, width, height, layers);
-  const rows = Math.floor(n / width), rest = n % width;
-  const put = (row, count, across) => {
-    if (count) {
-      gl.texSubImage3D(target, 0, 0, row % height, Math.floor(row / height), across, count, 1, format, gl.UNSIGNED_INT, values, row * width * words);
-    }
+// A texture of some size [3], formats [inside, format, type], filled with `values` line by line as far as these go.
+function texture3D(gl, target, [width, height, depth], [inside, format, type], values) {
+  const most = gl.getParameter(target === gl.TEXTURE_3D ? gl.MAX_3D_TEXTURE_SIZE : gl.MAX_TEXTURE_SIZE), largest = Math.max(width, height);
+  if (largest > most || (target === gl.TEXTURE_3D && depth > most)) {
+    throw new Error(`memory of the GPU: expected textures of ${Math.max(largest, depth)} texels a side, got at most ${most}`);
+  }
+  const found = fresh(gl, target), line = 4 * width;
+  gl.texStorage3D(target, 1, inside, width, height, depth);
+  const put = (x, y, z, w, h, d, from) => {
+    if (w && h && d) gl.texSubImage3D(target, 0, x, y, z, w, h, d, format, type, values, from);
   };
-  for (let row = 0; row < rows; row += height) put(row, Math.min(height, rows - row), width);
-  if (rest) put(rows, 1, rest);
+  const lines = Math.floor(values.length / line), layers = Math.floor(lines / height), rest = lines % height;
+  put(0, 0, 0, width, height, layers, 0);
+  put(0, 0, layers, width, rest, 1, layers * height * line);
+  put(0, rest, layers, (values.length % line) / 4, 1, 1, lines * line);
   return found;
 }
 

@@ -37,7 +37,8 @@ globalThis.found = (async () => {
     for await (const scene of loadScene(({ done, total }) => progress.push(done / total))) {
       ({ cameras, head } = scene);
       if (!scene.grid) continue;
-      const [densities, features] = [await described(scene.grid.densities), await described(scene.grid.features)];
+      const { grid } = scene;
+      const [densities, features] = [await described(grid.densities), await described(grid.features)];
       scenes.push({ n_parts: scene.n_parts, problem: scene.problem, densities, features });
     }
   } catch (thrown) {
@@ -48,8 +49,9 @@ globalThis.found = (async () => {
 """
 
 ARRANGED = """
-const plain = ({ levels, n_channels, values, firstRows }) => ({
-  n_channels, values, firstRows, levels: levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks })),
+const plain = ({ levels, n_channels, stride, values, firstRows }) => ({
+  n_channels, values: values.filter((_, i) => i % stride < n_channels), firstRows,
+  levels: levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks })),
 });
 export const arrangeDensities = (manifest, densities) => ({ densities: plain(densities) });
 export const arrangeFeatures = (manifest, features) => ({ features: plain(features) });

@@ -182,7 +182,7 @@ def test_an_asset_that_lacks_a_part_is_refused(broken_folder: Path, tmp_path: Pa
 
 
 PLAYS = """async () => {
-  const early = typeof window.vfr;
+  const early = typeof window.vfr.render;
   await vfr.ready;
   const c2w = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 9, 0, 0, 0, 1];
   const view = { c2w, fx: 40, fy: 40, cx: 20, cy: 15, width: 40, height: 30, background: [0, 0, 1] };
@@ -195,7 +195,7 @@ PLAYS = """async () => {
 def check_plays(found: Opened) -> None:
     found.page.wait_for_selector("#canvas[data-shown]")
     played = found.page.evaluate(PLAYS)
-    assert (played["early"], played["width"], played["height"]) == ("object", 40, 30)
+    assert (played["early"], played["width"], played["height"]) == ("function", 40, 30)
     assert played["corner"] == [0, 0, 255, 255] and played["middle"] != played["corner"]
     assert [line for line in found.said if "GPU stall due to ReadPixels" not in line] == []
 
@@ -237,6 +237,22 @@ def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_
             assert found.page.evaluate("() => document.getElementById('poster').naturalWidth") > 0
             told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
             assert "cut short" in told
+
+
+@pytest.mark.parametrize("where", [b'id="viewer"', b'data-file="part_0.bin">', b'data-file="head.bin">'])
+def test_a_page_that_was_changed_says_so(
+    chromium: Browser, asset: Asset, tmp_path: Path, where: bytes
+) -> None:
+    """One character of the viewer's script, of the scene, or of the head is another one."""
+    changed, path = bytearray(page(asset)), tmp_path / "changed.html"
+    at = changed.index(where) + 1000
+    changed[at] = ord("a" if changed[at] != ord("a") else "b")
+    path.write_bytes(changed)
+    with opened(chromium, path.as_uri()) as found:
+        found.page.wait_for_function("() => document.body.innerText.includes('cannot be shown here')")
+        assert "changed on its way" in found.page.inner_text("body")
+        told = found.page.evaluate("() => vfr.render({}).then(() => null, (error) => error.message)")
+        assert "changed on its way" in told
 
 
 # --- what it begins with ---

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -116,21 +117,56 @@ def test_layers_are_the_players(scene: Scene) -> None:
 def test_the_arrays_are_the_players(scene: Scene) -> None:
     """Distances and slots, the bricks that hold features, and the memory that is foretold."""
     found, grid = scene.page.page.evaluate("() => arrays()"), scene.asset.grid
-    check_table(scene.page.array(found["table"], np.int32), grid)
-    assert (scene.page.array(found["owners"], np.int32) == grid.rows.bricks).all()
-    codes = np.zeros((found["nSlots"], 9, 9, 9), np.uint8)
-    texels = scene.page.array(found["density"], np.uint8).reshape(-1, 9, 9, 2, 8)
-    codes[..., :4], codes[..., 4:8], codes[..., 8] = texels[..., 0, :4], texels[..., 1, :4], texels[..., 1, 4]
-    assert (codes.reshape(-1, 729) == grid.codes).all()
-    live = (texels[:, :8, :8, 0, 5] | texels[:, :8, :8, 1, 5] << 4).reshape(-1)
-    assert (live == grid.live).all()
-    columns = scene.page.array(found["columns"], np.uint32).reshape(-1, 9, 9, 2)
-    rows = grid.rows.rows.reshape(-1, 9, 9, 9)[: len(columns)]
-    stored = columns[..., 1, None] >> np.arange(9, dtype=np.uint32) & 1
-    number = columns[..., 0, None] + np.cumsum(stored, axis=-1) - stored
-    number[..., 8] = columns[..., 0] + (columns[..., 1] >> 9)
-    assert ((stored == 1) == (rows >= 0)).all() and (number[rows >= 0] == rows[rows >= 0]).all()
+    table = scene.page.array(found["table"], np.uint8).reshape(-1, 4)
+    check_table(entries_of(table, found["nSlots"]), grid)
+    texels = unblocked(scene.page.array(found["density"], np.uint8), found["nSlots"], (8, 8, 10))
+    codes = grid.codes.reshape(-1, 9, 9, 9)
+    assert (texels[:, :, :, :9] == corners(codes)).all()
+    live = texels[..., 9, 0]
+    assert (live.reshape(-1) == grid.live).all()
+    owners = scene.page.array(found["owners"], np.uint16).astype(np.int64).reshape(-1, 4)
+    held = owners[:, 1] < 0xFF00
+    place = np.stack([owners[:, 0] & 255, owners[:, 0] >> 8, owners[:, 1] & 255], axis=-1)
+    numbers = number_of(place, found["nHeld"]) << 3 | owners[:, 1] >> 8
+    assert (np.where(held, numbers, -1) == grid.rows.bricks).all()
+    rows = grid.rows.rows.reshape(-1, 9, 9, 9)[: found["nHeld"]]
+    first = np.zeros(found["nHeld"], np.int64)
+    first[grid.rows.bricks[held] >> 3] = owners[held, 2] + (owners[held, 3] << 16)
+    indices = unblocked(scene.page.array(found["indices"], np.int16), found["nHeld"], (8, 8, 9))
+    wanted = corners(rows)
+    assert ((indices >= 0) == (wanted >= 0)).all()
+    n_channels, n_words = grid.n_channels, -(-grid.n_channels // 4)
+    features = scene.page.array(found["features"], np.int8).reshape(-1, 4 * n_words)[:, :n_channels]
+    shown = np.unique(grid.rows.bricks[held] >> 3)  # of others nobody knows where their rows begin
+    stored = wanted[shown] >= 0
+    own = (indices[shown] + first[shown, None, None, None, None])[stored]
+    assert (features[own] == grid.features[wanted[shown][stored]]).all()
     assert scene.page.page.evaluate("() => vfr.info.gpuBytes") == gpu_bytes(scene.asset)
+
+
+def number_of(place: np.ndarray, count: int) -> np.ndarray:
+    """[n] numbers of bricks at places [n, 3] of a texture of `count` bricks."""
+    across = max(math.ceil(math.sqrt(count / 25)), 1)
+    return place[:, 0] + across * (place[:, 1] + across * place[:, 2])
+
+
+def unblocked(texels: np.ndarray, count: int, brick: tuple[int, int, int]) -> np.ndarray:
+    """[count, x, y, z, 4] the bricks of a texture."""
+    across = max(math.ceil(math.sqrt(count / 25)), 1)
+    x, y, z = brick
+    split = texels.reshape(-1, z, across, y, across, x, 4)
+    return split.transpose(0, 2, 4, 5, 3, 1, 6).reshape(-1, x, y, z, 4)[:count]
+
+
+def corners(values: np.ndarray) -> np.ndarray:
+    """[n, 8, 8, 9, 4] of [n, 9, 9, 9]: the values at (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
+    return np.stack([values[:, x : x + 8, y : y + 8] for x, y in ((0, 0), (0, 1), (1, 0), (1, 1))], axis=-1)
+
+
+def entries_of(table: np.ndarray, count: int) -> np.ndarray:
+    """[n] as the player's table: slot << 3 | level, or minus the distance to the nearest brick."""
+    place, kind = table[:, :3].astype(np.int64), table[:, 3].astype(np.int64)
+    return np.where(kind < 32, -kind, number_of(place, count) << 3 | (kind - 32))
 
 
 def check_table(found: np.ndarray, grid: SparseGrid) -> None:

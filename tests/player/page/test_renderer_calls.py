@@ -117,7 +117,7 @@ def test_another_scene_takes_its_place(page: RenderPage, asset: Asset) -> None:
         """() => {
           const { scene } = renderer;
           globalThis.first = scene;
-          const features = new Uint32Array(new Int8Array(scene.grid.features.buffer).map((x) => -x).buffer);
+          const features = scene.grid.features.map((x) => -x);
           renderer.replace({ ...scene, grid: { ...scene.grid, features } });
         }"""
     )

@@ -56,7 +56,8 @@ def stub_loader(cameras: list[dict[str, Any]], fails: str = "") -> str:
     """A loader of a scene with these cameras and nothing to draw; or one that says why it has none."""
     import json
 
-    scene = json.dumps({"manifest": {"background": [1, 1, 1]}, "cameras": cameras, "grid": {}, "problem": None})
+    manifest = {"background": [1, 1, 1]}
+    scene = json.dumps({"manifest": manifest, "cameras": cameras, "grid": {}, "problem": None})
     failure = f"throw new Error({json.dumps(fails)});" if fails else ""
     return f"""
     export async function* loadScene(onProgress) {{

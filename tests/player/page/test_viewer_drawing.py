@@ -1,0 +1,155 @@
+"""The page's viewer in a browser: what it draws when, and where it cannot draw."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from tests.player.page.drawn_views import FILES, TARGET, UP, VIEWS, distance, drag, height, pixel
+from tests.player.page.test_pose import as_json
+from tests.player.page.viewer_page import c2w, opened, page_files, still, stub_loader, wait_for
+
+
+def test_it_begins_level_in_the_middle_and_draws_every_pixel_of_the_screen(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off", device_scale_factor=2) as (page, *_):
+        view = still(page)
+        assert [view["width"], view["height"]] == [1280, 2 * height(page)]
+        assert abs(c2w(view)[:3, 0] @ UP) < 1e-9 and distance(view) == pytest.approx(math.hypot(4, 0.5))
+        np.testing.assert_allclose(pixel(view, TARGET), [view["width"] / 2, view["height"] / 2], atol=1e-6)
+        added = [view for view in page.evaluate("() => drawn") if view["accumulate"]]
+        jitters = {tuple(view["jitter"]) for view in added}
+        assert len(jitters) >= 4 and all(abs(side) <= 0.5 for jitter in jitters for side in jitter)
+        assert {view["width"] for view in added} == {1280}, "what is added up is whole"
+        n = page.evaluate("() => drawn.length")
+        page.wait_for_timeout(400)
+        assert page.evaluate("() => drawn.length") == n, "nothing is drawn while nothing changes"
+        assert page.locator("#status").text_content() == "" and not page.locator("#progress").is_visible()
+
+
+def test_pictures_are_smaller_while_the_camera_moves(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off", viewport={"width": 1200, "height": 900}) as (page, *_):
+        still(page)
+        page.evaluate("() => { globalThis.rate = 3e6; }")
+        drag(page, 30, 0)  # it finds out how fast the device is now
+        still(page)
+        n = page.evaluate("() => drawn.length")
+        drag(page, 100, 0)
+        last = still(page)
+        views = page.evaluate("n => drawn.slice(n)", n)
+        moving = [view for view in views if view["quality"] == "fast"]
+        assert moving and not any(view["accumulate"] for view in moving)
+        assert all(view["width"] * view["height"] < 1.3 * 3e6 / 30 for view in moving[3:])
+        assert last["width"] == 1200 and last["height"] == height(page)
+        first = next(view for view in views if view["quality"] == "high")
+        assert 400 < first["width"] <= 1200, "what some tenths of a second allow"
+
+
+def test_the_window_may_change_its_size(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        page.set_viewport_size({"width": 900, "height": 300})
+        wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 900)
+        after = still(page)
+        assert after["height"] == height(page) < 300 and after["fx"] < before["fx"]
+        np.testing.assert_allclose(c2w(after), c2w(before), atol=1e-12)
+        page.set_viewport_size({"width": 200, "height": 20})
+        wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 200)
+
+
+def test_a_finer_scene_and_a_lost_context(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        still(page)
+        page.evaluate(
+            "() => { globalThis.gl = renderer.gl.getExtension('WEBGL_lose_context'); gl.loseContext(); }"
+        )
+        page.wait_for_function("() => document.getElementById('status').textContent.includes('come back')")
+        n = page.evaluate("() => drawn.length")
+        drag(page, 40, 0)
+        page.wait_for_timeout(200)
+        assert page.evaluate("() => drawn.length") == n, "nothing is drawn meanwhile"
+        page.evaluate("() => gl.restoreContext()")
+        page.wait_for_function("n => drawn.length > n", arg=n)
+        still(page)
+        assert page.locator("#status").text_content() == ""
+
+
+def test_embedded_it_takes_the_wheel_once_it_was_clicked(chromium: Browser) -> None:
+    outer = b"<!doctype html><style>body{height:3000px}</style>"
+    outer += b"<iframe src='index.html#turn=off' width=500 height=300>"
+    with opened(chromium, {**FILES, "outer.html": outer}, wait=False) as (page, *_):
+        page.goto("http://localhost/scene/outer.html")
+        frame = page.frames[1]
+        frame.wait_for_selector("#canvas[data-shown]")
+        still(frame)  # type: ignore[arg-type]
+        n = frame.evaluate("() => drawn.length")
+        page.mouse.move(200, 100)
+        page.mouse.wheel(0, 200)
+        page.wait_for_function("() => scrollY > 0")
+        assert frame.evaluate("() => drawn.length") == n
+        page.evaluate("() => scrollTo(0, 0)")
+        page.mouse.click(200, 100)
+        page.mouse.wheel(0, 200)
+        frame.wait_for_function("n => drawn.length > n", arg=n)
+        assert page.evaluate("() => scrollY") == 0
+
+
+@pytest.mark.parametrize("why", ["no WebGL 2", "a broken file"])
+def test_where_it_cannot_be_shown_the_poster_stays_and_a_sentence_says_what_to_do(
+    chromium: Browser, why: str
+) -> None:
+    poster = (Path(__file__).parents[3] / "docs" / "fox.jpg").read_bytes()
+    files = page_files(stub_loader(as_json(VIEWS), "" if "WebGL" in why else why), poster)
+    if "WebGL" in why:
+        files["real_renderer.js"] = files["real_renderer.js"].replace(b'"webgl2"', b'"webgl3"')
+    with opened(chromium, files, wait=False) as (page, *_):
+        page.wait_for_selector("body.failed")
+        said = page.locator("#status").text_content() or ""
+        assert said.startswith("This scene cannot be shown here: ")
+        assert ("Open this page in a current Chrome" if "WebGL" in why else "load the page again") in said
+        assert why in said or "WebGL 2" in said
+        box, line = page.locator("#poster").bounding_box(), page.locator("#status").bounding_box()
+        assert box is not None and line is not None and box["height"] > 200
+        assert box["y"] + box["height"] <= line["y"], "the sentence is below the poster"
+        assert not page.locator("#bar").is_visible() and not page.locator("#progress").is_visible()
+        assert page.evaluate("() => document.getElementById('poster').naturalWidth") > 0
+
+
+def test_the_poster_is_there_before_the_scene_is(chromium: Browser) -> None:
+    poster = (Path(__file__).parents[3] / "docs" / "fox.jpg").read_bytes()
+    loader = stub_loader(as_json(VIEWS)).replace(
+        "onProgress({", "await new Promise((go) => (globalThis.go = go)); onProgress({"
+    )
+    loader = loader.replace("onProgress({", "onProgress({ done: 1, total: 4 }); onProgress({", 1)
+    with opened(chromium, page_files(loader, poster), wait=False) as (page, *_):
+        page.wait_for_function("() => globalThis.go")
+        assert page.locator("#status").text_content() == "Loading…" and page.locator("#progress").is_visible()
+        assert page.evaluate("() => getComputedStyle(document.getElementById('canvas')).opacity") == "0"
+        assert page.locator("#poster").is_visible()
+        page.evaluate("() => go()")
+        page.wait_for_selector("#canvas[data-shown]")
+
+
+def test_a_scene_that_comes_in_parts_keeps_its_poster_until_it_is_touched_or_whole(chromium: Browser) -> None:
+    loader = stub_loader(as_json(VIEWS))
+    scene = loader[loader.index("yield") :].partition(";")[0]
+    wait = "await new Promise((go) => (globalThis.go = go));"
+    loader = loader.replace(scene, f"{scene}; {wait} {scene}")
+    for touched in (False, True):
+        with opened(chromium, page_files(loader), "#turn=off", wait=False) as (page, *_):
+            page.wait_for_function("() => globalThis.go")
+            page.wait_for_timeout(300)
+            assert page.evaluate("() => drawn.length") == 0 and page.locator("#progress").is_visible()
+            if touched:
+                drag(page, 60, 0)
+                turned = still(page)
+                assert page.locator("#progress").is_visible()
+            page.evaluate("() => go()")
+            page.wait_for_selector("#canvas[data-shown]")
+            after = still(page)
+            assert not page.locator("#progress").is_visible()
+            if touched:
+                np.testing.assert_allclose(c2w(after), c2w(turned), atol=1e-12)
