@@ -39,44 +39,39 @@ export async function* loadScene(onProgress) {
   const cameras = JSON.parse(new TextDecoder().decode(await small("cameras.json")));
   const head = headOf(JSON.parse(new TextDecoder().decode(await small("head.json"))), await small("head.bin"));
   const readers = await startReaders(manifest);
-  let scene = { manifest, cameras, head, grid: null, n_parts: 0, problem: null };
   const read = (file) => readers.read(file, (n) => {
     done.decoded += n;
     tell();
   });
+  // Has a part decoded, and arranged where it is shown; resolves when that is asked for, and the next may be.
+  const begin = async (part, isShown) => {
+    const file = await get(manifest.parts[part].file);
+    const asked = { read: read(file), grid: isShown ? readers.grid(part + 1 === nParts) : null };
+    for (const promise of [asked.read, asked.grid]) promise?.catch(() => {}); // told when it is their turn
+    return asked;
+  };
+  let scene = { manifest, cameras, head, grid: null, n_parts: 0, problem: null };
   try {
-    let next = get(manifest.parts[0].file);
-    let reading = next.then(read);
-    reading.catch(() => {}); // told when it is its turn, as what follows
+    const begun = [];
+    for (let part = 0; part < nParts; part++) {
+      // What a page holds is there at once: one picture, and the whole.
+      const isShown = part === 0 || part + 1 === nParts || !isFile;
+      begun.push(part ? begun[part - 1].then(() => begin(part, isShown)) : begin(part, isShown));
+      begun[part].catch(() => {});
+    }
     yield scene;
-    for (let part = 0, problem = null; part < nParts && problem === null; part++) {
-      let isRead = 1;
+    for (let part = 0; part < nParts && scene.problem === null; part++) {
       try {
-        if (part + 1 < nParts) {
-          next = get(manifest.parts[part + 1].file);
-          next.catch(() => {});
-        }
-        await reading;
+        const asked = await begun[part];
+        await asked.read;
+        if (!asked.grid) continue;
+        scene = { ...scene, grid: await asked.grid, n_parts: part + 1 };
       } catch (error) {
         if (part === 0) throw error;
-        isRead = 0;
-        problem = `${error.message}: shown as the first ${part} of ${nParts} parts have it`;
-        if (!readers.areWhole) {
-          yield { ...scene, problem };
-          return;
-        }
+        const problem = `${error.message}: shown as the first ${part} of ${nParts} parts have it`;
+        scene = { ...scene, ...(readers.areWhole && { grid: await readers.grid(true), n_parts: part }), problem };
       }
-      const isLast = problem !== null || part + 1 === nParts;
-      const isShown = isLast || part === 0 || !isFile; // what a page holds is there at once: one picture, and the whole
-      const arranged = isShown && readers.grid(isLast);
-      if (!isLast) {
-        reading = next.then(read);
-        reading.catch(() => {});
-      }
-      if (isShown) {
-        scene = { ...scene, grid: await arranged, n_parts: part + isRead, problem };
-        yield scene;
-      }
+      yield scene;
     }
   } finally {
     readers.close();

@@ -29,25 +29,36 @@ export class SceneReader {
     this.manifest = manifest;
     this.pause = pause;
     this.parts = new PartsReader(manifest, grids);
+    this.last = Promise.resolve(); // what was asked for last
     this.isWhole = true; // whether a part was not begun to be read that is broken
   }
 
   // Reads the next part, { text } or { bytes }; `onProgress` is told of bytes. Rejects with an Error: the scene is then
-  // that of the parts before, unless `isWhole` has become false.
-  async read(file, onProgress) {
-    const { file: name } = this.manifest.parts[this.parts.nRead];
-    const data = await checkedFile(name, file, this.manifest.files[name]);
-    this.isWhole = false;
-    await this.parts.read(data, onProgress, this.pause);
-    this.isWhole = true;
+  // that of the parts before, unless `isWhole` has become false. Calls may be made before the last one is done.
+  read(file, onProgress) {
+    return this.next(async () => {
+      const { file: name } = this.manifest.parts[this.parts.nRead];
+      const data = await checkedFile(name, file, this.manifest.files[name]);
+      this.isWhole = false;
+      await this.parts.read(data, onProgress, this.pause);
+      this.isWhole = true;
+    });
   }
 
   // The arrays of its grids, as far as they are read.
   grid(isLast) {
-    const { densities, features } = this.parts.values(isLast);
-    return {
-      ...(densities && arrangeDensities(this.manifest, densities)),
-      ...(features && arrangeFeatures(this.manifest, features)),
-    };
+    return this.next(() => {
+      const { densities, features } = this.parts.values(isLast);
+      return {
+        ...(densities && arrangeDensities(this.manifest, densities)),
+        ...(features && arrangeFeatures(this.manifest, features)),
+      };
+    });
+  }
+
+  next(call) {
+    const found = this.last.then(call);
+    this.last = found.catch(() => {});
+    return found;
   }
 }
