@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from player.asset.asset import Asset
-from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera
 from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
 from player.head.head import Head
-from player.march.bounds import BLOCK, block_bounds
-from player.march.box import Bounds
+from player.march.bounds import block_bounds
+from player.march.interpolation import Quality, Stage, interpolate, stages
 from player.march.march import MarchResult
 from player.march.normals import composited_normals
-from player.march.pixels import Planes, pixels_of_blocks, rays_of_pixels, write_pixels
+from player.march.pixels import EVERY, Planes, write_pixels
+from player.march.view import View
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
@@ -41,11 +41,6 @@ MAX_PIXELS = 1 << 26
 FRAME_BYTES = 30
 """Memory of a frame, bytes a pixel: colour 12, opacity, depth and samples 4 each, and its 8-bit picture
 with what rounds it 6."""
-
-FAR_AWAY = 64.0
-"""Camera distance, in half diagonals of the box, from which rays start beside the box: their float32
-origins would be too coarse at the camera, by a sixteenth of a pixel of 8192 here and by everything at 1e8
-units."""
 
 TASK_BLOCKS = {"numba": 256, "numpy": 128}
 """Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks;
@@ -117,11 +112,16 @@ class Renderer:
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
         self.march, self._module = choose_march(march)
-        self._write_pixels, self._directions = write_pixels, None
+        self._write_pixels, self._interpolate, self._directions = write_pixels, interpolate, None
+        self._block_bounds = block_bounds
         if self.march == "numba":
+            from player.compiled import bounds as bounds_compiled
+            from player.compiled import interpolation as interpolation_compiled
             from player.compiled import pixels as pixels_compiled
 
             self._write_pixels = pixels_compiled.write_pixels
+            self._interpolate = interpolation_compiled.interpolate
+            self._block_bounds = bounds_compiled.block_bounds
             self._directions = pixels_compiled.directions
         self.asset = asset
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels, self.march == "numba")
@@ -149,6 +149,7 @@ class Renderer:
         n_fetches: int | None = None,
         background: Background | None = None,
         layers: bool = False,
+        quality: Quality = "exact",
     ) -> Frame:
         """One picture.
 
@@ -166,122 +167,101 @@ class Renderer:
         k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
         if k < 0:
             raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
-        grid = self._grid
-        k = min(k, grid.most_samples)
         check_size(camera.width, camera.height)
         if background is None:
             red, green, blue = self.asset.manifest.background
             background = (red, green, blue)
+        picture = self._blank(camera, background, min(k, self._grid.most_samples), layers)
+        for stage in stages(quality):
+            self._in_tasks(picture, stage)
+        planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
+        normals = self._all_normals(picture.view, self._pool.map) if layers else None
+        return Frame(
+            planes.rgb.reshape(*shape, 3),
+            planes.opacity.reshape(shape),
+            planes.depth.reshape(shape),
+            planes.n_density_samples.reshape(shape),
+            background,
+            None if features is None else features.reshape(*shape, -1),
+            lambda: self._all_normals(picture.view) if normals is None else normals,
+        )
+
+    def _blank(self, camera: Camera, background: Background, n_fetches: int, layers: bool) -> _Picture:
+        """A picture that shows what is behind."""
         n_pixels = camera.width * camera.height
-        behind = (0.0, 0.0, 0.0) if background == "transparent" else background
         rgb = np.empty((n_pixels, 3), np.float32)
-        rgb[:] = behind
-        opacity, depth = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.float32)
-        counts = np.zeros(n_pixels, np.int32)
-        features = np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None
-        normals = np.zeros((n_pixels, 3), np.float32) if layers else None
-        frame = Frame(rgb, opacity, depth, counts, background, features)
-        view = _View.of(grid, camera.transformed(self._model_from_world))
-        size = min(TASK_BLOCKS[self.march], max(len(view.blocks) // (TASKS_A_THREAD * self.n_threads), 16))
-        tasks = [view.blocks[i : i + size] for i in range(0, len(view.blocks), size)]
-        futures = [self._pool.submit(self._task, frame, normals, view, blocks, k) for blocks in tasks]
+        rgb[:] = (0.0, 0.0, 0.0) if background == "transparent" else background
+        zeros = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.float32)
+        return _Picture(
+            view=View.of(self._grid, camera.transformed(self._model_from_world), self._block_bounds),
+            planes=Planes(rgb, *zeros, np.zeros(n_pixels, np.int32)),
+            behind=None if background == "transparent" else background,
+            n_fetches=n_fetches,
+            features=np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None,
+        )
+
+    def _in_tasks(self, picture: _Picture, stage: Stage) -> None:
+        """Find the pixels of a stage, in all blocks, on all threads."""
+        tasks = self._tasks(picture.view.blocks, len(stage.within))
+        futures = [self._pool.submit(self._task, picture, stage, blocks) for blocks in tasks]
         try:
             for future in futures:
                 future.result()
         finally:
             for future in futures:
                 future.cancel()
-        shape = (camera.height, camera.width)
-        return Frame(
-            rgb.reshape(*shape, 3),
-            opacity.reshape(shape),
-            depth.reshape(shape),
-            counts.reshape(shape),
-            background,
-            None if features is None else features.reshape(*shape, -1),
-            lambda: self._all_normals(view, tasks) if normals is None else normals.reshape(*shape, 3),
-        )
 
-    def _all_normals(self, view: _View, tasks: list[np.ndarray]) -> np.ndarray:
-        """[h, w, 3] normals, on the caller's thread: the renderer may have been closed."""
+    def _tasks(self, blocks: np.ndarray, n_pixels: int) -> list[np.ndarray]:
+        """Blocks shared out to tasks, where `n_pixels` of each are found at a time."""
+        size = min(
+            TASK_BLOCKS[self.march] * len(EVERY) // n_pixels,
+            max(len(blocks) // (TASKS_A_THREAD * self.n_threads), 16),
+        )
+        return [blocks[i : i + size] for i in range(0, len(blocks), size)]
+
+    def _task(self, picture: _Picture, stage: Stage, blocks: np.ndarray) -> None:
+        """Find the pixels of a stage in some blocks: what neighbours do not tell is marched and shaded."""
+        view, planes, camera = picture.view, picture.planes, picture.view.camera
+        pixels = view.pixels(blocks, stage.within)
+        if len(stage.neighbours):
+            size, transparent = (camera.width, camera.height), picture.behind is None
+            pixels = pixels.only(self._interpolate(planes, size, pixels, stage, transparent))
+            if not len(pixels.rows):
+                return
+        index = view.index(pixels)
+        rays_o, rays_d, bounds = view.rays(pixels, self._directions)
+        result: MarchResult = self._module.march(view.grid, rays_o, rays_d, picture.n_fetches, bounds)
+        if picture.features is not None:
+            picture.features[index[result.hits]] = result.features
+        rgb = self._head(result.features, rays_d[result.hits])
+        self._write_pixels(planes, index, result, rgb, picture.behind, view.start, self.asset.scale)
+
+    def _all_normals(self, view: View, each: Callable[..., Iterable[None]] = map) -> np.ndarray:
+        """[h, w, 3] normals; `each` is the threads' map, or that of the caller's own: the renderer may have
+        been closed."""
         normals = np.zeros((view.camera.height * view.camera.width, 3), np.float32)
-        for blocks in tasks:
-            index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-            normals[index] = self._normals(view.grid, rays_o, rays_d, bounds)
+        rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
+
+        def find(blocks: np.ndarray) -> None:
+            pixels = view.pixels(blocks)
+            rays = view.rays(pixels, self._directions)
+            normals[view.index(pixels)] = composited_normals(view.grid, *rays) @ rotation.T
+
+        for _ in each(find, self._tasks(view.blocks, len(EVERY))):
+            pass
         return normals.reshape(view.camera.height, view.camera.width, 3)
 
-    def _normals(
-        self, grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds
-    ) -> np.ndarray:
-        rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
-        return composited_normals(grid, rays_o, rays_d, bounds) @ rotation.T
 
-    def _task(
-        self, frame: Frame, normals: np.ndarray | None, view: _View, blocks: np.ndarray, k: int
-    ) -> None:
-        """March and shade the pixels of some blocks, into the flat arrays of `frame` and `normals`."""
-        index, rays_o, rays_d, bounds = view.rays(blocks, self._directions)
-        result: MarchResult = self._module.march(view.grid, rays_o, rays_d, k, bounds)
-        if frame.features is not None:
-            frame.features[index[result.hits]] = result.features
-        if normals is not None:
-            normals[index] = self._normals(view.grid, rays_o, rays_d, bounds)
-        rgb = self._head(result.features, rays_d[result.hits])
-        self._write_pixels(
-            Planes(frame.rgb, frame.opacity, frame.depth, frame.n_density_samples),
-            index,
-            result,
-            rgb,
-            None if frame.background == "transparent" else frame.background,
-            view.start,
-            self.asset.scale,
-        )
+class _Picture(NamedTuple):
+    """A picture while it is made."""
 
-
-class _View(NamedTuple):
-    """What a camera, in the model frame, may see of the grid."""
-
-    grid: SparseGrid
-    camera: Camera
-    start: float
-    """Way along each ray, model units, that is known to be empty: 0 unless the camera is far away."""
-    blocks: np.ndarray
-    """[n] the blocks of pixels that may meet a brick."""
-    near: np.ndarray
-    far: np.ndarray
-    """[rows, columns] float32 bounds of t for each block, from `start` on."""
-
-    @classmethod
-    def of(cls, grid: SparseGrid, camera: Camera) -> _View:
-        if grid.contracted:  # all of space: every pixel may meet something, from the camera on
-            shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
-            every = np.arange(shape[0] * shape[1])
-            return cls(
-                grid, camera, 0.0, every, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
-            )
-        near, far = block_bounds(grid, camera)
-        seen = far >= near
-        size = grid.resolution / grid.cells_per_unit.astype(np.float64)
-        radius = float(np.linalg.norm(size)) / 2
-        distance = float(np.linalg.norm(camera.c2w[:3, 3] - (grid.aabb_min + size / 2)))
-        start = distance - radius if distance > FAR_AWAY * radius else 0.0
-        if start:  # the bounds are as coarse there as the origins
-            near, far = np.where(seen, np.float32(0), near), np.where(seen, np.float32(np.inf), far)
-        return cls(grid, camera, start, np.flatnonzero(seen), near, far)
-
-    def rays(
-        self, blocks: np.ndarray, directions: Callable[..., np.ndarray] | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bounds]:
-        """Each pixel's index in the picture, origin, direction and bounds, for the pixels in some blocks;
-        `directions` may be a faster way to find directions."""
-        columns, rows, owner = pixels_of_blocks(self.camera, blocks, self.near.shape[1])
-        if directions is None or self.start:
-            rays_o, rays_d = rays_of_pixels(self.camera, columns, rows, self.start)
-        else:
-            rays_d = directions(self.camera, columns, rows)
-            rays_o = np.broadcast_to(self.camera.c2w[:3, 3].astype(np.float32), rays_d.shape)
-        bounds = (self.near.reshape(-1)[owner], self.far.reshape(-1)[owner])
-        return rows * self.camera.width + columns, rays_o, rays_d, bounds
+    view: View
+    planes: Planes
+    behind: tuple[float, float, float] | None
+    """The background's colour, None for none."""
+    n_fetches: int
+    features: np.ndarray | None
+    """[n, n_channels] float32 what the head was given for each pixel, if anybody asked."""
 
 
 def check_size(width: int, height: int) -> None:

@@ -121,7 +121,7 @@ def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     k = asset.manifest.n_fetches if settings.samples is None else settings.samples
     behind = asset.manifest.background if settings.background is None else settings.background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    facts = json.dumps([camera.c2w.tolist(), lens, k, behind])
+    facts = json.dumps([camera.c2w.tolist(), lens, k, behind, settings.quality])
     manifest = read_bytes(asset.folder / NAME, "a manifest", MAX_BYTES, asset.folder)
     return hashlib.sha256(manifest + facts.encode()).hexdigest()
 

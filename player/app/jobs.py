@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from player.cameras.camera import Camera
 from player.files.images import ENCODERS
-from player.render import Background, Renderer
+from player.render import Background, Quality, Renderer
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,8 @@ class Job:
     """Feature fetches a ray, as in `PlaySettings`."""
     background: Background | None
     """What is behind, as in `PlaySettings`."""
+    quality: Quality
+    """As in `PlaySettings`."""
     key: str
     """Digest of what the picture depends on; its file carries it."""
     suffix: str
@@ -45,7 +47,7 @@ class Done:
 def render_job(renderer: Renderer, job: Job) -> Done:
     """Render the frame of a job and encode its file."""
     start = time.perf_counter()
-    frame = renderer.render(job.camera, job.samples, job.background)
+    frame = renderer.render(job.camera, job.samples, job.background, quality=job.quality)
     milliseconds = (time.perf_counter() - start) * 1000
     data = ENCODERS[job.suffix](frame.to_uint8(), job.key)
     return Done(job.index, data, milliseconds, renderer.march, renderer.n_threads)

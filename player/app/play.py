@@ -30,7 +30,7 @@ class Played(NamedTuple):
 
     figures: dict[str, Any]
     """What `vfr-play --json` writes: `ms_median` and `ms_p95` of a frame, `frames` that were rendered, their
-    `width` and `height`, `threads`, `march`, `peak_rss_mb` and `samples`."""
+    `width` and `height`, `threads`, `march`, `peak_rss_mb`, `n_fetches` and `quality`."""
     n_kept: int
     """Frames that were there already."""
     seconds: float
@@ -85,7 +85,15 @@ def play(
     keys = [frame_key(asset, camera, settings) for camera in chosen]
     missing = unfinished(paths, keys, chosen) if settings.resume else range(len(chosen))
     jobs = [
-        Job(n, chosen[index], settings.samples, settings.background, keys[index], target.suffix)
+        Job(
+            n,
+            chosen[index],
+            settings.samples,
+            settings.background,
+            settings.quality,
+            keys[index],
+            target.suffix,
+        )
         for n, index in enumerate(missing)
     ]
     if settings.samples is not None and settings.samples > asset.most_samples:
@@ -117,7 +125,8 @@ def _rendered(asset: Asset, jobs: Sequence[Job], settings: PlaySettings) -> Iter
     elif jobs:
         with Renderer(asset, settings.threads, settings.march) as renderer:
             # compiles, or reads what was compiled before
-            renderer.render(jobs[0].camera.resized(64, 64), settings.samples, settings.background)
+            small = jobs[0].camera.resized(64, 64)
+            renderer.render(small, settings.samples, settings.background, quality=settings.quality)
             for job in jobs:
                 yield render_job(renderer, job)
 
@@ -146,6 +155,7 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
         "march": done[0].march if done else None,
         "peak_rss_mb": peak_rss_mb(),
         "n_fetches": asset.manifest.n_fetches if settings.samples is None else settings.samples,
+        "quality": settings.quality,
     }
 
 

@@ -184,6 +184,7 @@ class Asset:
             (low, high),
             m.contracted,
             m.near,
+            skip_dead=True,
         )
 
     @property

@@ -7,7 +7,8 @@ compiled code:
     table      [nb^3] int32        at (bx * nb + by) * nb + bz, for a place in this brick of the finest level:
                                    slot << 3 | level of the finest brick there, or minus the Chebyshev
                                    distance, in bricks of the finest level, to the nearest place that has one
-                                   (at most MAX_DISTANCE)
+                                   (at most MAX_DISTANCE). With `skip_dead`, a coarser brick is not in places
+                                   where all of its cells are dead
     live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
     density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
                                    that the eight corners of a cell are in one brick; SPARE bytes follow
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +108,12 @@ class SparseGrid:
     """Whether the box is all of space, contracted."""
     near: float = 0.0
     """Where rays begin, model units, if contracted."""
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """[n, 3] int32: the bricks of the finest level in which rays look for live cells."""
+        found = np.flatnonzero(self.table >= 0)
+        return np.stack(np.unravel_index(found, (self.n_per_axis,) * 3), axis=-1).astype(np.int32)
 
     @property
     def n_levels(self) -> int:
@@ -201,6 +209,7 @@ def build_grid(
     density_range: tuple[float, float],
     contracted: bool = False,
     near: float = 0.0,
+    skip_dead: bool = False,
 ) -> SparseGrid:
     """Arrange the pyramids of an asset for marching.
 
@@ -213,6 +222,8 @@ def build_grid(
         density_range: log sigma at codes 0 and 255.
         contracted: whether the box is all of space, contracted.
         near: where rays begin, model units, if contracted.
+        skip_dead: have the table say of a place where all cells of a coarser brick are dead that it has no
+            brick, which no picture shows and rays jump over.
 
     >>> from player.asset.bricks import pack_vertices
     >>> from player.asset.single_level import VertexBricks, from_vertices
@@ -227,7 +238,10 @@ def build_grid(
     pyramid = densities.pyramid
     shown = [_shown(pyramid, level) for level in range(len(pyramid.levels))]
     coords = [bricks.coords for bricks in shown]
-    table = _table(pyramid, coords)
+    table = _painted(pyramid, coords)
+    if skip_dead:
+        _forget_dead(table, [bricks.masks for bricks in shown], level_steps)
+    _add_distances(table)
     low, slope = decode_constants(density_range)
     box = np.asarray(aabb, np.float64)
     values = features.values[0] if len(features.values) == 1 else np.concatenate(features.values)
@@ -330,15 +344,41 @@ def _with_apron(densities: PyramidValues, coords: Sequence[np.ndarray]) -> np.nd
     return flat
 
 
-def _table(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
-    """[nb, nb, nb] int32: the table of slots at `coords` [n, 3] of each level, which are numbered level by
-    level. Each round of distances grows the reached set by one brick on every side."""
+def _painted(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
+    """[nb, nb, nb] int32: the slots at `coords` [n, 3] of each level, which are numbered level by level, in
+    the places where they are the finest; -1 where there is none."""
     table = np.full((1, 1, 1), -1, np.int32)
     starts = np.cumsum([0, *(len(some) for some in coords)])
     for level in reversed(range(len(coords))):
         table = _refined(table, pyramid, level)
         slots = np.arange(starts[level], starts[level + 1], dtype=np.int32)
         table[tuple(coords[level].astype(np.int64).T)] = slots << 3 | level
+    return table
+
+
+def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Sequence[int]) -> None:
+    """Take bricks out of the `table` of `_painted`, in the places where all of their cells are dead.
+
+    Of a level whose samples stand for several steps none is taken out: a sample that begins there may be
+    somewhere else.
+    """
+    first = len(masks[0])
+    for level in range(1, len(masks)):
+        places = np.flatnonzero((table.reshape(-1) >= 0) & (table.reshape(-1) & 7 == level))
+        if level_steps[level] == 1 and len(places):
+            n = 1 << min(level, 3)  # parts of a brick along an axis, each one place wide or wider
+            cells = stored_bits(masks[level]).reshape(-1, n, 8 // n, n, 8 // n, n, 8 // n)
+            live = cells.any(axis=(2, 4, 6))
+            at = np.stack(np.unravel_index(places, table.shape))
+            part = (at & ((1 << level) - 1)) >> max(level - 3, 0)
+            dead = ~live[((table.reshape(-1)[places] >> 3) - first, *part)]
+            table.reshape(-1)[places[dead]] = -1
+        first += len(masks[level])
+
+
+def _add_distances(table: np.ndarray) -> None:
+    """Put distances where a table has no brick. Each round grows the reached set by one brick on every
+    side."""
     reached = table >= 0
     for distance in range(1, MAX_DISTANCE + 1):
         table[~reached] = -distance
@@ -346,7 +386,6 @@ def _table(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
             reached = _dilate(reached, axis)
         if reached.all():
             break
-    return table
 
 
 def _dilate(mask: np.ndarray, axis: int) -> np.ndarray:

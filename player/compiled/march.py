@@ -174,10 +174,10 @@ def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tu
     packets[:] = rows.reshape(SPACE_ROWS, n_packets, LANES).swapaxes(0, 1)
     angle = np.arange(grid.level_steps[-1] + 1).astype(F32) * grid.step
     angles = np.stack([np.cos(angle * F32(0.5)), np.sin(angle * F32(0.5)), np.sin(angle)])
-    middles, ends = (np.ascontiguousarray(path.table[:, first::2]) for first in (0, 1))
+    middles, ends = (np.ascontiguousarray(path.table[1:, first::2].T) for first in (0, 1))
     fastest = MAX_SPEED * grid.step * path.cells
-    sizes = middles.shape[1], angles.shape[1]
-    return SpaceSteps(middles, ends, angles, *sizes, fastest, path.cells), packets
+    sizes = len(middles), angles.shape[1]
+    return SpaceSteps(middles, ends, grid.step, angles, *sizes, fastest, path.cells), packets
 
 
 @compiled

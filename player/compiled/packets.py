@@ -66,9 +66,12 @@ class SpaceSteps(NamedTuple):
     """What all rays through contracted space have in common."""
 
     middles: np.ndarray
-    """[3, n_steps] float32: the lattice of `player.march.contracted` at the middles of base steps."""
+    """[n_steps, 2] float32: cos and sin of s at the middles of base steps, beside each other: one word of 64
+    bits, and one read. s itself is the product that the lattice of `player.march.contracted` is made of."""
     ends: np.ndarray
-    """[3, n_steps] float32: the same at their ends."""
+    """[n_steps, 2] float32: the same at their ends."""
+    step: np.float32
+    """dphi."""
     angles: np.ndarray
     """[3, n_sizes] float32: cos and sin of half the angle of so many base steps, and sin of the angle."""
     n_steps: int
@@ -159,10 +162,7 @@ class _Space:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
         self._p, self._wd = rows[:3], rows[3:6]
         self._cos0, self._sin0, self._width, self._length, self._t_nearest = rows[6:]
-        self._middles, self._ends = (
-            [b.gep(table, [b.mul(steps.n_steps, LONG(row))]) for row in range(3)]
-            for table in (steps.middles, steps.ends)
-        )
+        self._middles, self._ends, self._step = steps.middles, steps.ends, splat(b, steps.step)
         self._angles = [b.gep(steps.angles, [b.mul(steps.n_sizes, LONG(row))]) for row in range(3)]
         self._one = [splat(b, b.load(b.gep(row, [LONG(1)]))) for row in self._angles]
         self._end = splat(b, b.trunc(steps.n_steps, INT))
@@ -176,8 +176,8 @@ class _Space:
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
         active = active & (i < self._end)
-        s, cos_s, sin_s = (gather(row, i, 4, active).as_float() for row in self._middles)
-        placed = self._turned(cos_s, sin_s)
+        s = (i.to_float() + 0.5) * self._step
+        placed = self._turned(*_pairs(self._middles, i, active))
         for variable, value in zip((*self._placed, *self._of_size), (*placed, *self._one), strict=True):
             variable.set(value)
         return s, active & (s < self._length), self._on_grid(*placed)
@@ -185,8 +185,8 @@ class _Space:
     def place_group(self, i: Lanes, size: Lanes, where: Lanes) -> tuple[Lanes, Lanes, Three]:
         number = i + (size >> 1) - 1
         known = where & (number < self._end)
-        s, cos_s, sin_s = (gather(row, number, 4, known).as_float() for row in self._ends)
-        placed = self._turned(cos_s, sin_s)
+        s = (number + 1).to_float() * self._step
+        placed = self._turned(*_pairs(self._ends, number, known))
         angles = (gather(row, size, 4, where).as_float() for row in self._angles)
         for variable, value in zip((*self._placed, *self._of_size), (*placed, *angles), strict=True):
             variable.set(choose(where, value, variable.get()))
@@ -227,6 +227,12 @@ class _Space:
         middle = self._cells * 2.0
         x, y, z = (axis * scale + middle for axis in v)
         return x, y, z
+
+
+def _pairs(table: Any, index: Lanes, where: Lanes) -> tuple[Lanes, Lanes]:
+    """Two float32 of each of the rows `index` of a table, for the lanes that are true in `where`."""
+    one, other = gather(table, index, 8, where, LONG).halves()
+    return one.as_float(), other.as_float()
 
 
 def _path(context: Any, b: Any, kinds: Any, steps: Any, packets: Any, number: Any) -> _Box | _Space:
@@ -306,13 +312,14 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
                 behind = (-depth).exp()
                 series = 1.0 - optical * (1 / 2 - optical * (1 / 6 - optical * (1 / 24)))
                 weight = choose(optical > 0.1, before - behind, before * optical * series)
-                weight = choose(live & (weight > 0), weight, zero)
+                counts = live & (weight > 0)
+                weight = choose(counts, weight, zero)
                 tau.set(depth)
                 trans.set(choose(live, behind, before))
                 taken.set(taken.get() + lit)
-                n_weights.set(choose(weight > 0, n_weights.get() + 1, n_weights.get()))
-                total.add(weight)
-                moment.add(weight * s)
+                n_weights.set(choose(counts, n_weights.get() + 1, n_weights.get()))
+                total.add(weight, counts)
+                moment.add(weight * s, counts)
                 active.set(inside & ~(depth > float(MAX_TAU)))
                 row = b.load(n_rows)
                 place = b.mul(row, LONG(LANES))
@@ -363,11 +370,13 @@ class _Sum:
     def __init__(self, zero: Lanes) -> None:
         self._sum, self._lost = Variable(zero), Variable(zero)
 
-    def add(self, number: Lanes) -> None:
+    def add(self, number: Lanes, where: Lanes) -> None:
+        """Add the numbers that are true in `where`. Adding 0 to the others would move what they have lost,
+        and with it the last bit of their sums: those of a ray must not depend on the rays beside it."""
         missing = number - self._lost.get()
         total = self._sum.get() + missing
-        self._lost.set((total - self._sum.get()) - missing)
-        self._sum.set(total)
+        self._lost.set(choose(where, (total - self._sum.get()) - missing, self._lost.get()))
+        self._sum.set(choose(where, total, self._sum.get()))
 
     def get(self) -> Lanes:
         return self._sum.get()

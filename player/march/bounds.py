@@ -1,12 +1,14 @@
 """Which pixels of a picture can meet a live cell at all, and between which distances.
 
-The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick with a live cell is projected; a block
+The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick in which rays look is projected; a block
 keeps the least and the greatest distance of the bricks whose projection touches it. Rays of a block without
 bricks are never made, the others start at the near bound. The bounds are conservative, so that pictures do
 not depend on them.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +21,23 @@ BLOCK = 8
 
 MARGIN_PX = 0.01
 """Pixels by which projections are grown: far more than the rounding of float64."""
+
+
+class Bricks(NamedTuple):
+    """n bricks of one size as a camera sees them: its x is right, its y up, and it looks along -z."""
+
+    firsts: np.ndarray
+    """[n, 3] float64, the lowest corner of each, model units."""
+    steps: np.ndarray
+    """[3, 3] float64: what a brick is along the x, y and z of the grid."""
+
+
+def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
+    """The bricks in which rays look for live cells; the camera is in the model frame."""
+    edge = BRICK / grid.cells_per_unit.astype(np.float64)
+    w2c = np.linalg.inv(camera.c2w)
+    steps = (w2c[:3, :3] * edge).T
+    return Bricks(grid.places @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3]), steps)
 
 
 def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -34,23 +53,19 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     """
     shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
     near, far = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
-    edge = BRICK / grid.cells_per_unit.astype(np.float64)
-    w2c = np.linalg.inv(camera.c2w)
-    steps = (w2c[:3, :3] * edge).T  # [3, 3]: what a brick of level 0 is along x, y, z in the camera's frame
-    size = np.ldexp(1.0, grid.slot_levels)  # bricks are so many times as wide
-    first = (grid.slot_coords * size[:, None]) @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
-    radius = float(np.linalg.norm(edge)) / 2 * size
-    distance = np.linalg.norm(first + size[:, None] * steps.sum(axis=0) / 2, axis=1)
+    first, steps = seen_bricks(grid, camera)
+    radius = float(np.linalg.norm(steps)) / 2
+    distance = np.linalg.norm(first + steps.sum(axis=0) / 2, axis=1)
     starts, ends = np.maximum(distance - radius * 1.001, 0), distance + radius * 1.001
     corners = np.array(list(np.ndindex(2, 2, 2))) @ steps
-    depths = -(first[:, 2] + corners[:, 2, None] * size)  # [8, n]
+    depths = -(first[:, 2] + corners[:, 2, None])  # [8, n]
     ahead, behind = (depths > 1e-6 * radius).all(axis=0), (depths < 0).all(axis=0)
     around = np.flatnonzero(~ahead & ~behind)
     if len(around):  # the camera is in or beside such a brick: it may be anywhere in the picture
         near[:], far[:] = starts[around].min(), ends[around].max()
     shown = np.flatnonzero(ahead)
-    x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None] * size[shown]) / depths[:, shown]
-    y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None] * size[shown]) / depths[:, shown]
+    x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None]) / depths[:, shown]
+    y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None]) / depths[:, shown]
     left, right = _range(x, shape[1])
     top, bottom = _range(y, shape[0])
     _spread((left, right, top, bottom), starts[shown], ends[shown], near, far)

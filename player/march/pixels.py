@@ -11,21 +11,40 @@ from player.march.bounds import BLOCK
 from player.march.march import MarchResult
 
 
-def pixels_of_blocks(
-    camera: Camera, blocks: np.ndarray, per_row: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns, rows and block of the pixels in some blocks, block after block; what sticks out is left
-    away."""
-    within = np.arange(BLOCK)
+class Pixels(NamedTuple):
+    """Some pixels of a picture."""
+
+    columns: np.ndarray
+    """[n] int64."""
+    rows: np.ndarray
+    """[n] int64."""
+    blocks: np.ndarray
+    """[n] int64, the block that each is in."""
+
+    def only(self, which: np.ndarray) -> Pixels:
+        """Those that `which` chooses, as an index into an array."""
+        return Pixels(self.columns[which], self.rows[which], self.blocks[which])
+
+
+EVERY = np.stack(np.divmod(np.arange(BLOCK * BLOCK), BLOCK), axis=-1)
+"""[64, 2] row and column in a block of each of its pixels."""
+
+
+def pixels_of_blocks(camera: Camera, blocks: np.ndarray, per_row: int, within: np.ndarray = EVERY) -> Pixels:
+    """The pixels in some blocks, block after block; what sticks out of the picture is left away.
+
+    Args:
+        camera: says how large the picture is.
+        blocks: [n_blocks] numbers of blocks, row by row.
+        per_row: blocks in a row of the picture.
+        within: [m, 2] row and column of the pixels in each block.
+    """
     top, left = np.divmod(blocks, per_row)
-    shape = (len(blocks), BLOCK, BLOCK)
-    rows = np.broadcast_to((top[:, None] * BLOCK + within)[:, :, None], shape).reshape(-1)
-    columns = np.broadcast_to((left[:, None] * BLOCK + within)[:, None, :], shape).reshape(-1)
-    owner = np.repeat(blocks, BLOCK * BLOCK)
+    rows = (top[:, None] * BLOCK + within[:, 0]).reshape(-1)
+    columns = (left[:, None] * BLOCK + within[:, 1]).reshape(-1)
+    pixels = Pixels(columns, rows, np.repeat(blocks, len(within)))
     inside = (rows < camera.height) & (columns < camera.width)
-    if inside.all():
-        return columns, rows, owner
-    return columns[inside], rows[inside], owner[inside]
+    return pixels if inside.all() else pixels.only(inside)
 
 
 def rays_of_pixels(

@@ -20,11 +20,11 @@ from player.asset.asset import Asset
 from player.cameras.camera import focus_point, orbit, world_up
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
-from player.render import Background, March, Renderer
+from player.render import Background, March, Quality, Renderer
 from player.terminal import printable
 from player.viewer.growing import Growing, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
-from player.viewer.window import Window
+from player.viewer.window import Chosen, Window
 
 PORT = 8080
 PORTS = 100
@@ -41,6 +41,8 @@ class ServeSettings:
     """Port; the first that is free from 8080 on if None."""
     samples: int | None = None
     """Feature fetches a ray; the asset's own number if None, every sample if 0."""
+    quality: Quality | None = None
+    """That of all pictures; if None, "fast" while the camera moves and "exact" when it stands still."""
     background: Background | None = None
     """Colour, 3 numbers 0..1; the asset's own if None."""
     threads: int | None = None
@@ -101,7 +103,7 @@ def serve(
         windows: dict[int, Window] = {}
         growing = None
         try:
-            windows = open_windows(server, renderers, settings.samples, settings.background)
+            windows = open_windows(server, renderers, settings)
 
             def changed() -> None:
                 for window in list(windows.values()):
@@ -156,7 +158,7 @@ def _page(folder: Path) -> bytes:
 
 
 def open_windows(
-    server: Any, renderers: Sequence[Renderer], samples: int | None, background: Any
+    server: Any, renderers: Sequence[Renderer], settings: ServeSettings = ServeSettings()
 ) -> dict[int, Window]:
     """Give every client of a guarded server a window, and end it when the client is gone.
 
@@ -164,6 +166,7 @@ def open_windows(
     """
     from player.viewer.guard import CONNECTION
 
+    chosen = Chosen(settings.samples, settings.quality, settings.background)
     trained = asset_cameras(renderers[0].asset)
     focus = focus_point(trained)
     first = orbit(trained, 1)[0]
@@ -178,7 +181,7 @@ def open_windows(
     @server.on_client_connect
     async def _(client: Any) -> None:  # awaited where its connection is known; a plain function is not
         client.camera.fov = fov
-        window = Window(client, CONNECTION.get(), renderers, trained, focus, samples, background, whole)
+        window = Window(client, CONNECTION.get(), renderers, trained, focus, chosen, whole)
         windows[client.client_id] = window
         window.start()
 

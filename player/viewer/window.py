@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from player.cameras.nerfstudio import write_camera_path
 from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import VfrError
 from player.files.images import png_bytes
-from player.render import Frame, Renderer
+from player.march.bounds import BLOCK
+from player.render import Background, Frame, Quality, Renderer
 from player.terminal import printable
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.pages import page_path
@@ -41,6 +42,18 @@ HANDED_OVER_SECONDS = 0.2
 """Seconds after which viser has given a file to the connection."""
 
 
+QUALITIES = ("fast while moving", "exact", "high", "fast")
+"""What the control offers; the first is followed by exact pictures when the camera stands still."""
+
+
+class Chosen(NamedTuple):
+    """What the command line says of pictures; None leaves it to the asset and to the viewer."""
+
+    samples: int | None
+    quality: Quality | None
+    background: Background | None
+
+
 class Window:
     """What one client sees; `start` begins, `close` ends it, also when the client is gone."""
 
@@ -51,8 +64,7 @@ class Window:
         renderers: Sequence[Renderer],
         trained: Sequence[Camera],
         focus: np.ndarray,
-        samples: int | None,
-        background: tuple[float, float, float] | None,
+        chosen: Chosen,
         whole: threading.Lock,
     ) -> None:
         """`whole` is held by the one window that makes a whole picture: memory is needed for one alone."""
@@ -73,8 +85,11 @@ class Window:
         self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
         own = self._renderer.asset.manifest
         self._add_controls(
-            own.n_fetches if samples is None else min(samples, self._renderer.asset.most_samples),
-            own.background if background is None else background,
+            own.n_fetches
+            if chosen.samples is None
+            else min(chosen.samples, self._renderer.asset.most_samples),
+            QUALITIES[0] if chosen.quality is None else chosen.quality,
+            own.background if chosen.background is None else chosen.background,
         )
         client.camera.on_update(lambda _: self.touch())
 
@@ -97,7 +112,7 @@ class Window:
 
     # --- controls ---
 
-    def _add_controls(self, samples: int, background: Sequence[float]) -> None:
+    def _add_controls(self, samples: int, quality: str, background: Any) -> None:
         from player.viewer.messages import colour, one_of
 
         gui = self._client.gui
@@ -116,13 +131,19 @@ class Window:
                 samples,
                 hint="places along a ray where features are fetched; 0: all",
             )
+            self._quality = gui.add_dropdown(
+                "Quality",
+                QUALITIES,
+                initial_value=quality,
+                hint="high and fast interpolate pixels between neighbours that agree",
+            )
             behind = tuple(round(255 * value) for value in background)
             self._background = gui.add_rgb("Background", behind)
             degrees = round(math.degrees(self._client.camera.fov), 1)
             self._fov = gui.add_slider("Field of view", 1.0, 150.0, 0.1, min(max(degrees, 1.0), 150.0))
             self._state = gui.add_text("Now", "", disabled=True)
             self._link = gui.add_markdown(_link(0))
-        for control in (self._layer, self._samples, self._background):
+        for control in (self._layer, self._samples, self._quality, self._background):
             control.on_update(lambda _: self.touch())
         self._fov.on_update(lambda _: self._set_fov())
         with gui.add_folder("Views"):
@@ -142,6 +163,7 @@ class Window:
         self._save.on_click(lambda _: self._save_path())
         self._clear.on_click(lambda _: self._clear_path())
         self._takes(self._layer, one_of(LAYERS))
+        self._takes(self._quality, one_of(QUALITIES))
         self._takes(self._background, colour)
         self._let_use(
             sliders=(self._samples, self._fov, self._view, self._seconds),
@@ -242,9 +264,11 @@ class Window:
         width, height = fitted(min(width, MOST_SIDE), min(height, MOST_SIDE), MOST_PIXELS)
         return camera.resized(width, height)
 
-    def _frame(self, camera: Camera) -> Frame:
+    def _frame(self, camera: Camera, moving: bool = False) -> Frame:
         red, green, blue = (value / 255 for value in self._background.value)
-        return self._renderer.render(camera, int(self._samples.value), (red, green, blue))
+        chosen = self._quality.value
+        quality: Quality = chosen if chosen != QUALITIES[0] else "fast" if moving else "exact"
+        return self._renderer.render(camera, int(self._samples.value), (red, green, blue), quality=quality)
 
     def _run(self) -> None:
         version = -1
@@ -271,7 +295,7 @@ class Window:
         camera = self._camera()
         start = time.perf_counter()
         small = camera.resized(*self._pace.moving(camera.width, camera.height))
-        picture = layer_picture(self._frame(small), self._layer.value)
+        picture = layer_picture(self._frame(small, moving=True), self._layer.value)
         seconds = time.perf_counter() - start
         self._pace.measured(small.width * small.height, seconds)
         self._send(picture, 75, f"{small.width}x{small.height}, {seconds * 1000:.0f} ms")
@@ -307,7 +331,7 @@ class Window:
     def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
         """[h, w, 3] uint8 of the chosen layer, or None if something changed meanwhile."""
         layer = self._layer.value
-        rows = max(1, STRIP_PIXELS // camera.width)
+        rows = max(1, STRIP_PIXELS // camera.width // BLOCK) * BLOCK  # whole blocks: the pattern goes on
         frames = []
         for top in range(0, camera.height, rows):
             if self._closed or self._version != version:

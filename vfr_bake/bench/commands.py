@@ -6,6 +6,7 @@ import shlex
 from typing import Any
 
 from player.asset.asset import Asset
+from player.march.interpolation import Quality
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 
@@ -36,12 +37,13 @@ def bake_command(folder: str, asset: Asset) -> str:
     return shlex.join(["vfr-bake", "model.pt", folder, "--preset", preset, *options])
 
 
-def play_command(folder: str, samples: int, size: tuple[int, int]) -> str:
+def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, int]) -> str:
     """The command that plays an asset with k = `samples`.
 
-    >>> play_command("my out", 5, (400, 300))
-    "vfr-play 'my out' --samples 5 --size 400x300 --orbit 60 --output frames/"
+    >>> play_command("my out", 5, "fast", (400, 300))
+    "vfr-play 'my out' --samples 5 --quality fast --size 400x300 --orbit 60 --output frames/"
     """
     width, height = size
-    words = ["--samples", str(samples), "--size", f"{width}x{height}", "--orbit", "60", "--output", "frames/"]
-    return shlex.join(["vfr-play", folder, *words])
+    dials = ["--samples", str(samples), *([] if quality == "exact" else ["--quality", quality])]
+    views = ["--size", f"{width}x{height}", "--orbit", "60", "--output", "frames/"]
+    return shlex.join(["vfr-play", folder, *dials, *views])

@@ -3,10 +3,10 @@
     python -m vfr_bake.bench.frames player ASSET CAMERAS THREADS MAX_MEMORY
     python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS
 
-A request has `view`, `size` [width, height], `samples` (for an asset only), and `rgb`, a file for the picture
-or null. The answer has the milliseconds of the frame and, of them, of march with lookups and of the head
-(time in their tasks over the number of threads), the fetches of all rays that hit, and peak memory. A model's
-frame is not taken apart.
+A request has `view`, `size` [width, height], for an asset `samples` and `quality`, and `rgb`, a file for the
+picture or null. The answer has the milliseconds of the frame and, of them, of march with lookups and of the
+head (time in their tasks over the number of threads), the fetches of all rays that hit, and peak memory. A
+model's frame is not taken apart.
 
 The player's process imports the player alone, as `vfr-play` does; so what either needs is imported where it
 is opened.
@@ -42,8 +42,8 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
     def answer(request: dict[str, Any]) -> dict[str, Any]:
         camera = views[request["view"]].resized(*request["size"])
         march.seconds = head.seconds = 0.0
-        frame, ms = _timed(lambda: renderer.render(camera, request["samples"]))
-        taken = frame.n_density_samples[frame.opacity > MIN_OPACITY]
+        frame, ms = _timed(lambda: renderer.render(camera, request["samples"], quality=request["quality"]))
+        taken = frame.n_density_samples[(frame.opacity > MIN_OPACITY) & (frame.n_density_samples > 0)]
         return _kept(request, frame.rgb) | {
             "ms": ms,
             "march_ms": 1000 * march.seconds / renderer.n_threads,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from player.march.interpolation import Quality
 from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.front import Point, pareto_front, recommend
 from vfr_bake.bench.timing import Size, Times
@@ -19,11 +20,13 @@ class Setting:
     """One row of the trade."""
 
     name: str
-    """Folder and k of an asset, or the file of the model."""
+    """Folder, k and quality of an asset, or the file of the model."""
     asset: str | None
     """The folder; None for the full model."""
     n_fetches: int | None
     """Feature fetches a ray, k; 0 for every sample. None for the full model."""
+    quality: Quality | None
+    """The player's. None for the full model."""
     what: dict[str, Any]
     """What the asset is made of: preset, head, resolution, channels and number formats."""
     scores: dict[str, float | None]

@@ -1,24 +1,41 @@
 """Frame times, measured in rounds that ask every process in turn, so that a busy minute of the machine falls
 on all of them.
 
-In a round each asset and size is visited once, in an order of its own; a visit renders one view with every k,
-in an order of its own too, after a frame that is not counted. Times are those of whole frames.
+In a round each asset and size is visited once, in an order of its own; a visit renders one view with every k
+and quality, in an order of its own too, after a frame that is not counted. Times are those of whole frames.
 
 March and lookups are one loop, which has no seams to time. Of the same view the lookups alone differ with k:
-the slope b of the march's time against the fetches, fitted within each visit, the median of all visits, makes
-`lookups = b x fetches`, and the march is what remains. Medians, so that a pause decides nothing.
+the slope b of the march's time against the fetches, fitted to the exact frames of each visit, the median of
+all visits, makes `lookups = b x fetches`, and the march is what remains. Medians, so that a pause decides
+nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from player.march.interpolation import Quality
+
 Size = tuple[int, int]
 """Width and height of a frame in pixels."""
+
+
+class Dials(NamedTuple):
+    """What a frame is asked with."""
+
+    n_fetches: int
+    """k, feature fetches a ray; 0 for every sample."""
+    quality: Quality = "exact"
+
+    def request(self) -> dict[str, Any]:
+        """As a process takes them."""
+        return {"samples": self.n_fetches, "quality": self.quality}
+
+
 Ask = Callable[..., dict[str, Any]]
 SEED = 0
 """Seed of the order within the rounds."""
@@ -49,13 +66,13 @@ def measure_times(
     players: Sequence[Ask],
     n_views: int,
     sizes: Sequence[Size],
-    samples: Sequence[int],
+    dials: Sequence[Dials],
     n_rounds: int,
     progress: Callable[[int, int], object],
-) -> dict[tuple[int, int, Size], Times]:
-    """Times of every (player, k, size); each in `players` asks one process for a frame."""
+) -> dict[tuple[int, Dials, Size], Times]:
+    """Times of every (player, dials, size); each in `players` asks one process for a frame."""
     random = np.random.default_rng(SEED)
-    visits: dict[tuple[int, Size], list[dict[int, dict[str, Any]]]] = {}
+    visits: dict[tuple[int, Size], list[dict[Dials, dict[str, Any]]]] = {}
     done, total = 0, n_rounds * len(players) * len(sizes)
     for turn in range(n_rounds):
         places = [(player, size) for player in range(len(players)) for size in sizes]
@@ -63,9 +80,9 @@ def measure_times(
             player, size = places[index]
             ask = players[player]
             request = {"view": turn % n_views, "size": size, "rgb": None}
-            ask(**request, samples=samples[0])
-            order = random.permutation(len(samples))
-            answers = {samples[i]: ask(**request, samples=samples[i]) for i in order}
+            ask(**request, **dials[0].request())
+            order = random.permutation(len(dials))
+            answers = {dials[i]: ask(**request, **dials[i].request()) for i in order}
             visits.setdefault((player, size), []).append(answers)
             done += 1
             progress(done, total)
@@ -74,12 +91,12 @@ def measure_times(
         slope = lookup_slope(rounds)
         shared = [_mean_ms([visits[other, size][turn] for other in range(len(players))])
                   for turn in range(n_rounds)]  # fmt: skip
-        for k in samples:
-            times[player, k, size] = frame_times([answers[k] for answers in rounds], slope, shared)
+        for some in dials:
+            times[player, some, size] = frame_times([answers[some] for answers in rounds], slope, shared)
     return times
 
 
-def _mean_ms(visits: Sequence[dict[int, dict[str, Any]]]) -> float:
+def _mean_ms(visits: Sequence[dict[Dials, dict[str, Any]]]) -> float:
     return float(np.mean([answer["ms"] for answers in visits for answer in answers.values()]))
 
 
@@ -94,16 +111,20 @@ def notch(ms: np.ndarray, shared: Sequence[float]) -> float:
     return float(1.57 * (high - low) * np.mean(shared) / len(ms) ** 0.5)
 
 
-def lookup_slope(rounds: Sequence[dict[int, dict[str, Any]]]) -> float | None:
-    """Milliseconds a fetch; None where the number of fetches never differs.
+def lookup_slope(rounds: Sequence[dict[Dials, dict[str, Any]]]) -> float | None:
+    """Milliseconds a fetch of exact frames; None where their number of fetches never differs.
 
-    >>> lookup_slope([{1: {"fetches": 10, "march_ms": 7.0}, 2: {"fetches": 20, "march_ms": 9.0}}])
+    >>> few, many = {"fetches": 10, "march_ms": 7.0}, {"fetches": 20, "march_ms": 9.0}
+    >>> lookup_slope([{Dials(1): few, Dials(2): many}])
     0.2
     """
     slopes = []
     for answers in rounds:
-        fetches = np.array([a["fetches"] for a in answers.values()], np.float64)
-        march = np.array([a["march_ms"] for a in answers.values()], np.float64)
+        exact = [answer for dials, answer in answers.items() if dials.quality == "exact"]
+        fetches = np.array([answer["fetches"] for answer in exact], np.float64)
+        march = np.array([answer["march_ms"] for answer in exact], np.float64)
+        if not len(exact):
+            continue
         fetches -= fetches.mean()
         if fetches.any():
             slopes.append(float(fetches @ march / (fetches @ fetches)))

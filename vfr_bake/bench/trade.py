@@ -22,12 +22,13 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
+from player.march.interpolation import Quality
 from player.render import bounded_threads
 from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.commands import bake_command, play_command
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import Setting, Trade, conclude
-from vfr_bake.bench.timing import Size, frame_times, measure_times
+from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene, reader_as
@@ -54,7 +55,7 @@ class Views:
 
 
 def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:
-    """Play the assets, with every k, at every size; `progress` is called with what is done and how far.
+    """Play the assets, with every k and quality, at every size; `progress` is called with what is done.
 
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
@@ -66,41 +67,41 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
     own = views.cameras[0].width, views.cameras[0].height
     half_and_twice = [((own[0] + 1) // 2, (own[1] + 1) // 2), (2 * own[0], 2 * own[1])]
     sizes = list(dict.fromkeys([own, *(config.frame_sizes() or half_and_twice)]))
-    ks = set(config.samples) | {asset.manifest.n_fetches for asset in assets.values()}
-    samples = sorted(ks, key=lambda k: k or 1e9)
+    dials = _all_dials(config, list(assets.values()))
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
         run = _Run(Path(folder), views, config, lpips, progress)
         model, full = (None, None) if config.model is None else run.model(config.model, sizes, config.data)
         first = run.first_pictures(list(assets), own)
         players = [stack.enter_context(run.player(name)) for name in assets]
         qualities = [
-            run.quality(name, asset, player, samples, full)
+            run.quality(name, asset, player, dials, full)
             for (name, asset), player in zip(assets.items(), players, strict=True)
         ]
         times = measure_times(
             [player.ask for player in players],
             len(views.cameras),
             sizes,
-            samples,
+            dials,
             config.frames,
             lambda done, of: progress("frame times", done, of),
         )
-        played = players[0].ask(view=0, size=own, samples=samples[0], rgb=None)
+        played = players[0].ask(view=0, size=own, **dials[0].request(), rgb=None)
     rows = [
         Setting(
-            name=f"{name} k={k or 'all'}",
+            name=f"{name} k={some.n_fetches or 'all'}{'' if some.quality == 'exact' else ' ' + some.quality}",
             asset=name,
-            n_fetches=k,
+            n_fetches=some.n_fetches,
+            quality=some.quality,
             what=describe(asset),
-            scores=qualities[index].scores[k],
-            times={size: times[index, k, size] for size in sizes},
+            scores=qualities[index].scores[some],
+            times={size: times[index, some, size] for size in sizes},
             n_bytes=played_bytes(asset),
             peak_mb=qualities[index].peak_mb,
             first_picture_ms=first[index],
-            commands=(bake_command(name, asset), play_command(name, k, own)),
+            commands=(bake_command(name, asset), play_command(name, some.n_fetches, some.quality, own)),
         )
         for index, (name, asset) in enumerate(assets.items())
-        for k in samples
+        for some in dials
     ]
     settings, sentence = conclude(rows, model)
     conditions = {
@@ -123,8 +124,8 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
 class _Quality:
     """One asset's pictures, compared."""
 
-    scores: dict[int, dict[str, float | None]]
-    """The scores for each k."""
+    scores: dict[Dials, dict[str, float | None]]
+    """The scores with each setting of the dials."""
     peak_mb: float | None
     worst_view: Pictures
     """The view that is farthest off with the asset's own k."""
@@ -169,6 +170,7 @@ class _Run:
             name=str(path),
             asset=None,
             n_fetches=None,
+            quality=None,
             what={"preset": "full model"},
             scores=self.scores(pictures, None),
             times={size: frame_times(some, None, [1.0] * len(some)) for size, some in answers.items()},
@@ -181,7 +183,7 @@ class _Run:
 
     def first_pictures(self, names: list[str], size: Size) -> list[float]:
         """Milliseconds from starting a process to its first picture, by asset; their turns alternate."""
-        request = {"view": 0, "size": size, "samples": 1, "rgb": None}
+        request = {"view": 0, "size": size, "rgb": None, **Dials(1).request()}
         with self.player(names[0]) as process:  # compiles, where that has not been done before
             process.ask(**request)
         taken: list[list[float]] = [[] for _ in names]
@@ -195,25 +197,26 @@ class _Run:
         return [float(np.median(milliseconds)) for milliseconds in taken]
 
     def quality(
-        self, name: str, asset: Asset, player: Process, samples: list[int], full: list[np.ndarray] | None
+        self, name: str, asset: Asset, player: Process, dials: list[Dials], full: list[np.ndarray] | None
     ) -> _Quality:
-        """Every view with every k, against the photographs and the model's pictures if there are some."""
+        """Every view with all dials, against the photographs and the model's pictures if there are some."""
         wanted = self._views.photographs if full is None else full
-        scores: dict[int, dict[str, float | None]] = {}
+        scores: dict[Dials, dict[str, float | None]] = {}
         worst_view, worst, peak = Pictures(name, wanted[0], wanted[0]), [], None
-        for done, k in enumerate(samples):
+        for done, some in enumerate(dials):
             pictures = []
             for view, photograph in enumerate(self._views.photographs):
                 height, width = photograph.shape[:2]
-                answer = player.ask(view=view, size=[width, height], samples=k, rgb=str(self._picture))
+                request = {"view": view, "size": [width, height], "rgb": str(self._picture)}
+                answer = player.ask(**request, **some.request())
                 pictures.append(np.load(self._picture))
                 peak = answer["peak_mb"]
-            scores[k] = self.scores(pictures, full)
-            if k == asset.manifest.n_fetches:
+            scores[some] = self.scores(pictures, full)
+            if some == Dials(asset.manifest.n_fetches):
                 lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, pictures, strict=True)]))
                 worst_view = Pictures(name, wanted[lowest], pictures[lowest])
                 worst = worst_pixels(asset, self._views.cameras, wanted, pictures)
-            self._progress(f"quality of {name}", done + 1, len(samples))
+            self._progress(f"quality of {name}", done + 1, len(dials))
         return _Quality(scores, peak, worst_view, worst)
 
     def scores(self, pictures: list[np.ndarray], full: list[np.ndarray] | None) -> dict[str, float | None]:
@@ -224,6 +227,14 @@ class _Run:
             off = None if full is None else [score(a, b) for a, b in zip(pictures, full, strict=True)]
             means[name] = None if off is None else float(np.mean(off))
         return means
+
+
+def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
+    """Exact pictures with every k, and the other qualities with the k of the assets."""
+    own = {asset.manifest.n_fetches for asset in assets}
+    every = sorted(set(config.samples) | own, key=lambda k: k or 1e9)
+    others: tuple[Quality, ...] = ("high", "fast")
+    return [Dials(k) for k in every] + [Dials(k, quality) for quality in others for k in sorted(own)]
 
 
 def describe(asset: Asset) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from vfr_bake.bench.commands import bake_command
 from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import MAX_PSNR
-from vfr_bake.bench.timing import Times, lookup_slope, measure_times
+from vfr_bake.bench.timing import Dials, Times, lookup_slope, measure_times
 from vfr_bake.bench.worst import APART, worst_pixels
 from vfr_bake.cli import bench_main
 from vfr_bake.config import BakeConfig, FieldConfig
@@ -76,7 +76,8 @@ def results(shells_folder: Path, data: Path, tmp_path_factory: pytest.TempPathFa
 
 def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder: Path) -> None:
     rows = results[0]["settings"]
-    assert [row["n_fetches"] for row in rows] == [1, 2, 5, 0], "5 is the asset's own"
+    assert [row["n_fetches"] for row in rows] == [1, 2, 5, 0, 5, 5], "5 is the asset's own"
+    assert [row["quality"] for row in rows] == ["exact"] * 4 + ["high", "fast"]
     asset = Asset.open(shells_folder)
     for row in rows:
         assert row["n_bytes"] == sum(entry.bytes for entry in asset.manifest.files.values())
@@ -130,7 +131,7 @@ def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Pa
 
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
     """The photographs are the asset's own pictures: nothing is lost with every sample, more with fewer."""
-    rows = {row["n_fetches"]: row["scores"] for row in results[0]["settings"]}
+    rows = {row["n_fetches"]: row["scores"] for row in results[0]["settings"] if row["quality"] == "exact"}
     assert rows[0]["psnr"] is None and rows[0]["ssim"] == 1 and rows[0]["loss_db"] == 0
     assert rows[1]["psnr"] < rows[2]["psnr"] < rows[5]["psnr"] < MAX_PSNR
     assert rows[1]["loss_db"] == pytest.approx(MAX_PSNR - rows[1]["psnr"])
@@ -199,7 +200,7 @@ def test_a_player_that_fails_says_why(shells_folder: Path, tmp_path: Path) -> No
         Process("player", *arguments) as process,
         pytest.raises(Exception, match=r"head\.onnx: size: expected \d+ bytes, got 0"),
     ):
-        process.ask(view=0, size=[8, 8], samples=1, rgb=None)
+        process.ask(view=0, size=[8, 8], rgb=None, **Dials(1).request())
 
 
 # --- the front ---
@@ -235,11 +236,15 @@ def test_lookups_are_told_from_the_march() -> None:
     """Frames of views with very different marches: 2 us a fetch are found all the same."""
     random = np.random.default_rng(0)
     rounds = [
-        {k: {"fetches": 1000 * k, "march_ms": base + 2 * k + random.normal(0, 0.1)} for k in (1, 2, 4, 8)}
+        {
+            Dials(k): {"fetches": 1000 * k, "march_ms": base + 2 * k + random.normal(0, 0.1)}
+            for k in (1, 2, 4, 8)
+        }
+        | {Dials(8, "fast"): {"fetches": 4, "march_ms": base / 9}}
         for base in random.uniform(10, 400, 40)
     ]
     assert lookup_slope(rounds) == pytest.approx(0.002, rel=0.02)
-    assert lookup_slope([{5: {"fetches": 9, "march_ms": 3.0}}]) is None
+    assert lookup_slope([{Dials(5): {"fetches": 9, "march_ms": 3.0}}]) is None
 
 
 def test_rounds_ask_everybody_in_turn() -> None:
@@ -252,12 +257,14 @@ def test_rounds_ask_everybody_in_turn() -> None:
 
         return ask
 
-    times = measure_times([player("a"), player("b")], 2, [(8, 8)], [1, 2], 3, lambda done, of: None)
+    times = measure_times(
+        [player("a"), player("b")], 2, [(8, 8)], [Dials(1), Dials(2)], 3, lambda done, of: None
+    )
     assert len(asked) == 3 * 2 * (1 + 2), "one frame of each visit is not counted"
     for visits in (asked[i : i + 6] for i in (0, 6, 12)):
         assert sorted({name for name, _ in visits}) == ["a", "b"]
-    assert times[0, 2, (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 0.0, 3, 4.0, 0.0, 3.0, 13.0)
-    assert times[1, 1, (8, 8)].uncertainty == 0
+    assert times[0, Dials(2), (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 0.0, 3, 4.0, 0.0, 3.0, 13.0)
+    assert times[1, Dials(1), (8, 8)].uncertainty == 0
 
 
 # --- where the loss sits ---
