@@ -113,6 +113,8 @@ def _train(options: Any) -> int:
             figures |= _test_figures(model, scene, n_views)
             save_model(options.model, replace(model, figures=figures))
         checkpoint.unlink(missing_ok=True)
+        for line in trainer.effects.described():
+            print(f"vfr-train: {line}", file=sys.stderr)
         _report_training(options, figures, interrupted)
     processes.leave()
     return 130 if interrupted else 0
@@ -233,6 +235,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
     if preview is not None:
         preview.write(trainer)
     return {
+        "effects": trainer.effects.figures(),
         "steps": trainer.next_step,
         "seconds": round(trainer.seconds, 1),
         "skipped_steps": trainer.n_bad_steps,
@@ -355,7 +358,7 @@ def _eval(options: Any) -> int:
     from vfr_bake.data import load_scene, reader_as
     from vfr_bake.training.evaluation import render_views
     from vfr_bake.training.lpips import Lpips
-    from vfr_bake.training.metrics import comparison, mean_scores, score_view
+    from vfr_bake.training.metrics import comparison, mean_scores
     from vfr_bake.training.model_file import load_model
 
     lpips = None if options.lpips is None else Lpips(options.lpips)
@@ -376,7 +379,7 @@ def _eval(options: Any) -> int:
             if options.pictures is not None:
                 picture = comparison(view.photograph, view.rgb)
                 write_png(options.pictures / f"{names[len(scores)]}.png", picture)
-            scores.append(score_view(view.name, view.rgb, view.photograph, lpips, view.seen))
+            scores.append(view.score(lpips))
             bar.count(len(scores), len(world))
     means = mean_scores(scores)
     figures = _finite(means) | {
@@ -384,6 +387,7 @@ def _eval(options: Any) -> int:
         "n_views": len(scores),
         "background": model.background.tolist(),
         "bits": 8,
+        "exposure_fitted": model.exposure is not None,
         "lpips_network": options.lpips,
     }
     perceptual = "" if lpips is None else f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
@@ -391,7 +395,8 @@ def _eval(options: Any) -> int:
         options.json,
         figures,
         f"{options.model}: {means['psnr']:.2f} dB mean PSNR, SSIM {means['ssim']:.4f}{perceptual} "
-        f"over {len(scores)} test views",
+        f"over {len(scores)} test views"
+        + (" (exposure fitted on their left halves, right halves scored)" if model.exposure else ""),
     )
     return 0
 

@@ -155,7 +155,9 @@ class HeldOut:
     over its background."""
 
     def __init__(self, model: Model, n_views: int) -> None:
-        witnesses = model.witnesses if model.witnesses is not None and len(model.witnesses.pixels) else None
+        witnesses = model.neutral_witnesses()
+        if witnesses is not None and not len(witnesses.pixels):
+            witnesses = None
         n_of_view = RAYS_OF_A_VIEW if witnesses is None else RAYS_BESIDE_WITNESSES
         random = np.random.default_rng(SEED)
         rays = []

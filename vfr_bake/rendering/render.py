@@ -38,11 +38,17 @@ def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.
 
 def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: np.ndarray) -> np.ndarray:
     """The full model's picture [height, width, 3] float32 in [0, 1] for a camera in the model frame."""
-    rays_o, rays_d = camera.rays()
-    render = _composited_colours if field.config.compositing == "colour" else _colours_of_features
-    colours, opacity = render(field, sampler, rays_o, rays_d)
+    colours, opacity = render_rays(field, sampler, *camera.rays())
     rgb = colours + (1 - opacity[:, None]) * background.astype(np.float32)
     return rgb.reshape(camera.height, camera.width, 3)
+
+
+def render_rays(
+    field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(Colours times opacity [n_rays, 3], opacity [n_rays]) of rays [n_rays, 3] in the model frame."""
+    render = _composited_colours if field.config.compositing == "colour" else _colours_of_features
+    return render(field, sampler, rays_o, rays_d)
 
 
 def mean_colour(field: VfrField, sampler: Sampler, cameras: Sequence[Camera]) -> np.ndarray:

@@ -1,4 +1,9 @@
-"""The full model against photographs, over its own background."""
+"""The full model against photographs, over its own background.
+
+Where the exposure of a capture changes, nobody knows that of a view that was not learned from. So it is
+fitted on the left half of the view (`vfr_bake.training.captures`), and the right half is scored, as is usual
+since Martin-Brualla et al., "NeRF in the wild", 2021.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.rendering.render import render_image
+from vfr_bake.rendering.render import render_rays
+from vfr_bake.training.captures.picture_colours import fitted
 from vfr_bake.training.metrics import Distance, ViewScore, over_background, score_view
 from vfr_bake.training.model_file import Model
 
@@ -22,9 +28,17 @@ class RenderedView:
     rgb: np.ndarray
     """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
     photograph: np.ndarray
-    """[height, width, 3] float32 in [0, 1], over the same background; as rendered where it is masked."""
-    seen: float = 1.0
-    """Share of the pixels that is not masked."""
+    """[height, width, 3] float32 in [0, 1], over the same background."""
+    first_column: int = 0
+    """Columns from this one on are scored: on those before it the exposure was fitted."""
+
+    def score(self, lpips: Distance | None = None) -> ViewScore:
+        """The scores of the columns that are scored; with `lpips`, that distance as well.
+
+        Raises ShapeError: they are smaller than SSIM's window.
+        """
+        rgb, photograph = self.rgb[:, self.first_column :], self.photograph[:, self.first_column :]
+        return score_view(self.name, rgb, photograph, lpips)
 
 
 def render_views(
@@ -38,14 +52,16 @@ def render_views(
     if 0 < n_views < len(chosen):
         chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
     for index in chosen:
-        camera = views.cameras[index]
-        rgb = render_image(model.field, model.sampler, camera, model.background)
-        image = views.images[index]
-        photograph, seen = over_background(image, model.background), 1.0
-        if masked:
-            opaque = image[..., 3] == 255
-            photograph, seen = np.where(opaque[..., None], photograph, rgb), float(opaque.mean())
-        yield RenderedView(camera.name, rgb, photograph, seen)
+        camera, rgba = views.cameras[index], views.images[index]
+        colours, opacity = render_rays(model.field, model.sampler, *camera.rays())
+        first_column = 0
+        if model.exposure is not None:
+            first_column = camera.width // 2
+            left = np.flatnonzero(np.arange(len(opacity)) % camera.width < first_column)
+            gains, offsets = fitted(colours[left], opacity[left], rgba.reshape(-1, 4)[left])
+            colours = (colours * gains + opacity[:, None] * offsets).clip(0, opacity[:, None])
+        rgb = (colours + (1 - opacity[:, None]) * model.background).reshape(camera.height, camera.width, 3)
+        yield RenderedView(camera.name, rgb, over_background(rgba, model.background), first_column)
 
 
 def evaluate(
@@ -59,5 +75,5 @@ def evaluate(
 
     Raises ShapeError: a picture is smaller than SSIM's window.
     """
-    for view in render_views(model, views, n_views, masked):
-        yield score_view(view.name, view.rgb, view.photograph, lpips, view.seen)
+    for view in render_views(model, views, n_views):
+        yield view.score(lpips)

@@ -4,14 +4,16 @@ only, and loads with `weights_only=True`.
 Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
 the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
 frame, as transforms.json text), sampler (below), state (the field's tensors), figures (what training
-measured), and since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), which are missing in older
-files. The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits),
-resolution; that of an unbounded scene its proposals: near (model units), state (their tensors).
+measured), since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), which are missing in older
+files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where
+all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
+occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
+tensors).
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +33,16 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
-from vfr_bake.rendering.render import Sampler, mean_colour
+from vfr_bake.rendering.render import Sampler, mean_colour, render_rays
+from vfr_bake.training.captures.exposure import Correction
+from vfr_bake.training.captures.picture_colours import (
+    GAINS,
+    OFFSETS,
+    PictureColours,
+    colours_content,
+    fitted,
+    restore_colours,
+)
 from vfr_bake.training.tensor_files import check_kinds, check_plain, read_tensors, write_tensors
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
@@ -40,7 +51,7 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 1)
+VERSION = (2, 2)
 N_MEAN_VIEWS = 16
 """Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
@@ -65,6 +76,8 @@ class Model:
     witnesses: Witnesses | None = None
     """Pixels of the training views that training has not learned from; None in the models of before there
     were any."""
+    exposure: PictureColours | None = None
+    """How the training views show the field's colours; None where all show them as they are."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -106,6 +119,12 @@ class Model:
         rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         return rays_o, rays_d
 
+    def neutral_witnesses(self) -> Witnesses | None:
+        """The witnesses with the colours that the field should have, whatever their picture's exposure."""
+        if self.witnesses is None or self.exposure is None:
+            return self.witnesses
+        return self.exposure.neutral(self.witnesses)
+
     def _in_model_frame(self) -> list[Camera]:
         model_from_world = np.linalg.inv(self.world_from_model)
         return [camera.transformed(model_from_world) for camera in self.cameras]
@@ -113,7 +132,7 @@ class Model:
 
 def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Model:
     """The model that `trainer` has by now, of the `scene` that it trains on."""
-    return Model(
+    model = Model(
         field=trainer.field,
         sampler=trainer.sampler,
         world_from_model=scene.world_from_model,
@@ -123,6 +142,25 @@ def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Mo
         figures=figures,
         witnesses=trainer.witnesses,
     )
+    if not trainer.effects.exposure_on:
+        return model
+    return replace(model, exposure=_exposure(model, trainer.witnesses, trainer.effects.correction))
+
+
+def _exposure(model: Model, witnesses: Witnesses, learned: Correction) -> PictureColours:
+    """How the training views show the field's colours: those that were `learned` from, and the whole
+    witnesses, which are fitted to what the model shows there."""
+    n_views = len(witnesses.counts)
+    gains, offsets = np.ones((n_views, 3), np.float32), np.zeros((n_views, 3), np.float32)
+    gains[witnesses.learned()] = learned.gains.cpu().numpy()
+    offsets[witnesses.learned()] = learned.offsets.cpu().numpy()
+    rays_o, rays_d = model.witness_rays()
+    views = witnesses.views()
+    for view in witnesses.whole:
+        rows = views == view
+        shown = render_rays(model.field, model.sampler, rays_o[rows], rays_d[rows])
+        gains[view], offsets[view] = fitted(*shown, witnesses.rgba[rows])
+    return PictureColours(gains.clip(*GAINS), offsets.clip(*OFFSETS))
 
 
 def save_model(path: Path, model: Model) -> None:
@@ -141,6 +179,8 @@ def save_model(path: Path, model: Model) -> None:
     }
     if model.witnesses is not None:
         content["witnesses"] = witness_content(model.witnesses)
+    if model.exposure is not None:
+        content["exposure"] = colours_content(model.exposure)
     write_tensors(path, content)
 
 
@@ -172,6 +212,9 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
     witnesses = None
     if "witnesses" in content:
         witnesses = restore_witnesses(content["witnesses"], cameras, f"{path}: witnesses")
+    exposure = None
+    if "exposure" in content:
+        exposure = restore_colours(content["exposure"], len(cameras), f"{path}: exposure")
     return Model(
         field=field,
         sampler=sampler,
@@ -181,6 +224,7 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
         train=content["train"],
         figures=content["figures"],
         witnesses=witnesses,
+        exposure=exposure,
     )
 
 

@@ -27,6 +27,10 @@ class RayBatch:
     """[n_rays, 3] float32, unit length."""
     rgba: Tensor
     """[n_rays, 4] float32 in [0, 1], straight alpha, sRGB."""
+    pictures: Tensor
+    """[n_rays] int64: the number of each ray's picture among those that are drawn from."""
+    places: Tensor
+    """[n_rays, 2] float32 in (0, 1): the pixel's centre as shares of the picture's width and height."""
 
 
 class Pixels(NamedTuple):
@@ -45,6 +49,7 @@ class Pixels(NamedTuple):
     pixel at place p is number (stride p) mod size in row-major order; all pixels are in the places 0, 1, 2,
     ... of stride 1."""
     widths: Any
+    heights: Any
     """[n_pictures] int64."""
     poses: Any
     """[n_pictures, 3, 4] float32 camera to model frame."""
@@ -71,6 +76,7 @@ class Pixels(NamedTuple):
             strides=strides,
             sizes=sizes,
             widths=np.array([camera.width for camera in cameras]),
+            heights=np.array([camera.height for camera in cameras]),
             poses=np.stack([camera.c2w[:3] for camera in cameras]).astype(np.float32),
             intrinsics=np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], np.float32),
         )
@@ -86,6 +92,10 @@ class Pixels(NamedTuple):
         x, y = (column + 0.5 - cx) / fx, (cy - row - 0.5) / fy
         poses = self.poses[view]
         return x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
+
+    def places(self, view: Any, row: Any, column: Any) -> tuple[Any, Any]:
+        """Shares [n_rays] of the width and of the height at the centres of pixels of the pictures `view`."""
+        return (column + 0.5) / self.widths[view], (row + 0.5) / self.heights[view]
 
 
 class PixelSampler:
@@ -145,15 +155,18 @@ class PixelSampler:
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator).numpy()
         index += np.searchsorted(self._n_before, index, side="right")
         view = np.searchsorted(pixels.ends, index, side="right")
-        row, column = np.divmod(pixels.numbers(view, index), pixels.widths[view])
-        rays_d = pixels.directions(view, row.astype(np.float32), column.astype(np.float32))
+        row, column = np.divmod(index - pixels.starts[view], pixels.widths[view])
+        row, column = row.astype(np.float32), column.astype(np.float32)
+        rays_d = pixels.directions(view, row, column)
         rays_d /= np.sqrt((rays_d * rays_d).sum(axis=-1, keepdims=True))
         rgba = np.ones((n_rays, 4), np.float32)
         rgba[:, : pixels.rgba.shape[1]] = pixels.rgba[index] * np.float32(1 / 255)
         return RayBatch(
             rays_o=torch.from_numpy(pixels.poses[view, :, 3]),
             rays_d=torch.from_numpy(rays_d),
-            rgba=torch.from_numpy(rgba),
+            rgba=torch.from_numpy(pixels.rgba[index] * np.float32(1 / 255)),
+            pictures=torch.from_numpy(view),
+            places=torch.from_numpy(np.stack(pixels.places(view, row, column), axis=1).astype(np.float32)),
         )
 
 
@@ -172,14 +185,15 @@ class DevicePixelSampler(PixelSampler):
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator, device=device)
         index += torch.searchsorted(self._n_before, index, right=True)
         view = torch.searchsorted(pixels.ends, index, right=True)
-        number, width = pixels.numbers(view, index), pixels.widths[view]
-        rays_d = pixels.directions(view, number // width, number % width)
-        rgba = torch.ones((n_rays, 4), device=device)
-        rgba[:, : pixels.rgba.shape[1]] = pixels.rgba[index] * (1 / 255)
+        inside, width = index - pixels.starts[view], pixels.widths[view]
+        row, column = inside // width, inside % width
+        rays_d = pixels.directions(view, row, column)
         return RayBatch(
             rays_o=pixels.poses[view, :, 3],
             rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
-            rgba=rgba,
+            rgba=pixels.rgba[index] * (1 / 255),
+            pictures=view,
+            places=torch.stack(pixels.places(view, row, column), dim=1).float(),
         )
 
 

@@ -22,6 +22,7 @@ from vfr_bake.rendering.compositing import RaySamples, composite
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
+from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.optimiser import (
@@ -159,6 +160,8 @@ class Trainer:
         self.witnesses = witnesses
         """The pixels of the training views that no step learns from."""
         self._pixels = sampler(self._views, self._generator, witnesses)
+        self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
+        """Changing exposure, and things that move; its pictures are the views that are learned from."""
 
     def _step_length(self) -> float:
         return 2.0 * self.config.step_cells / self._field.config.max_resolution
@@ -207,13 +210,15 @@ class Trainer:
         samples = self._guide.sample(
             self._field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
         )
-        totals = self.processes.total(len(samples.rays), len(samples.t_mid))
-        n_rays, n_samples = int(totals[0]), int(totals[1])
+        learned = self.effects.learned(batch.pictures, batch.places)
+        n_learned = len(samples.rays) if learned is None else int(learned[samples.rays].sum())
+        totals = self.processes.total(len(samples.rays), len(samples.t_mid), n_learned)
+        n_rays, n_samples, n_learned = (int(total) for total in totals)
         self._guide.observe(n_rays, n_samples)
-        error, weights = self._error(batch, samples, pilot)
+        error, weights, seen = self._error(batch, samples, learned, pilot)
         regulariser = self._guide.regulariser(samples, weights)
-        value = self.processes.total(float(error.detach()))[0] / (3 * max(n_rays, 1))
-        loss = error / (3 * max(n_rays, 1))
+        value = self.processes.total(float(error.detach()))[0] / (3 * max(n_learned, 1))
+        loss = error / (3 * max(n_learned, 1))
         if regulariser is not None:
             loss = loss + regulariser / max(n_rays, 1)
         # A batch that met nothing (seen by no process) has nothing to teach.
@@ -226,6 +231,8 @@ class Trainer:
         self._adam.step()
         for table in (self._grid_adam, *self._guide.tables()):
             table.step(self.pace.grid_rate * factor)
+        if seen is not None:
+            self.effects.observe(seen, n_rays)
         return value, n_rays, n_samples
 
     def _draw(self, n_rays: int) -> Batch:
@@ -237,21 +244,43 @@ class Trainer:
         else:
             background = torch.ones(n_rays, 3, device=self.device)
         share = self.processes.share
-        return Batch(*(share(rows) for rows in (rays.rays_o, rays.rays_d, rays.rgba, jitter, background)))
+        return Batch(*(share(rows) for rows in (*vars(rays).values(), jitter, background)))
 
-    def _error(self, batch: Batch, samples: RaySamples, pilot: bool) -> tuple[Tensor, Tensor]:
-        """(Squared error of the served rays, summed over rays and channels; weights [n_samples])."""
+    def _error(
+        self, batch: Batch, samples: RaySamples, learned: Tensor | None, pilot: bool
+    ) -> tuple[Tensor, Tensor, Seen | None]:
+        """(Squared error of the rays that were served and are `learned` from, a bool for each ray or all,
+        summed over rays and channels; weights [n_samples]; what was seen, if that is looked at)."""
         rgba, background = batch.rgba[samples.rays], batch.background[samples.rays]
+        pictures = batch.pictures[samples.rays]
         target = rgba[:, :3] * rgba[:, 3:] + background * (1 - rgba[:, 3:])
         # Rays that meet nothing show the background; only the others need the field.
         hit = samples.counts > 0
-        missed_error = ((background[~hit] - target[~hit]) ** 2).sum()
         dirs = batch.rays_d[samples.rays[hit]]
         colours, opacity, weights = self._colours(
             samples, samples.starts[hit], samples.counts[hit], dirs, pilot
         )
-        rgb = colours + background[hit] * (1 - opacity[:, None])
-        return ((rgb - target[hit]) ** 2).sum() + missed_error, weights
+        shown = self.effects.shown(colours, opacity, pictures[hit])
+        errors = background - target
+        errors[hit] = shown + background[hit] * (1 - opacity[:, None]) - target[hit]
+        kept = errors if learned is None else errors[learned[samples.rays]]
+        seen = self._seen(batch, samples, hit, colours, opacity, errors) if self.effects.looks else None
+        return kept.square().sum(), weights, seen
+
+    def _seen(
+        self, batch: Batch, samples: RaySamples, hit: Tensor, colours: Tensor, opacity: Tensor, errors: Tensor
+    ) -> Seen:
+        """What the served rays showed, for `CaptureEffects`."""
+        rays = samples.rays
+        seen_opacity = torch.zeros(len(rays), device=self.device)
+        seen_opacity[hit] = opacity.detach()
+        seen_colours = torch.zeros(len(rays), 3, device=self.device)
+        seen_colours[hit] = colours.detach()
+        rgba, background = batch.rgba[rays], batch.background[rays]
+        wanted = rgba[:, :3] * rgba[:, 3:] + background * (seen_opacity[:, None] - rgba[:, 3:])
+        return Seen(
+            batch.pictures[rays], batch.places[rays], seen_colours, seen_opacity, wanted, errors.detach()
+        )
 
     def _colours(
         self, samples: RaySamples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
@@ -312,7 +341,7 @@ class Trainer:
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
             "witnesses": witness_content(self.witnesses),
-            "pixels": self._pixels.position,
+            "effects": self.effects.state(),
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
 
@@ -327,7 +356,7 @@ class Trainer:
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
         self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
-        self._pixels.restore(state["pixels"])
+        self.effects.restore(state["effects"])
 
 
 def choose_device(name: str) -> torch.device:

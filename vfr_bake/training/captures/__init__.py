@@ -1,0 +1,1 @@
+"""What real captures have and a field has not: exposure that changes, and things that move."""
