@@ -62,7 +62,11 @@ void fetchFeatures(float opacity) {
     }
     if (filled <= 0.0) break;
     float weight = few ? filled : opacity / float(uFetches);
-    if (!addFeatures(placeAt(few ? heavy : sum / filled), weight) && !few) addFeatures(placeAt(heavy), weight);
+    float place = few ? heavy : sum / filled;
+    for (int attempt = 0; attempt < 2; attempt++) { // in a loop, so that its code is there once
+      if (addFeatures(placeAt(place), weight) || few) break;
+      place = heavy;
+    }
   }
 }
 #endif
