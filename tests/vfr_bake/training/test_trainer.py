@@ -14,8 +14,11 @@ import torch
 
 from player.errors import ConfigError, FormatError, TrainingError
 from vfr_bake.config import FieldOptions, SceneKind, TrainConfig
+from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.data.store import stored
+from vfr_bake.data.store.stored import Layout, in_order, map_pictures, write_picture
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
@@ -121,10 +124,26 @@ def test_only_in_scenes_what_is_near_learns_slowly(
     assert seen == ([0.7, 0.7] if distance == 0.7 else [])
 
 
-@pytest.mark.parametrize("kind", ["object", "unbounded"])
-def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(kind: str, tmp_path: Path) -> None:
+def on_disk(scene: Scene, path: Path) -> Scene:
+    """The scene with its training pictures on the disk, in ten chunks, each drawn from for a few steps."""
+    images = scene.train.images
+    layout = Layout.of((image.shape[1], image.shape[0]) for image in images)
+    assert len(layout.chunks) == 11
+    with path.open("wb") as file:
+        for number, image in enumerate(images):
+            write_picture(file, layout, number, in_order(image, 4))
+    return replace(scene, train=PosedImages(scene.train.cameras, map_pictures(path, layout, 4, frozenset())))
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded", "on disk"])
+def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bit by bit: everything that the next step depends on is in the checkpoint."""
-    scene = demo_scene(size=32, n_train=12, n_test=2) if kind == "object" else unbounded()
+    monkeypatch.setattr(stored, "PIXELS_OF_A_PIECE", 100)
+    scene = unbounded() if kind == "unbounded" else demo_scene(size=32, n_train=12, n_test=2)
+    if kind == "on disk":
+        scene = on_disk(scene, tmp_path / "pixels.bin")
     settings = {"steps": 40, "pilot_steps": 10, "batch_rays": 64, "batch_samples": 2048}
     whole = Trainer(scene, config(**settings))
     losses = [report.loss for report in whole.run()]
