@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib.util import find_spec
@@ -87,9 +87,10 @@ def _train(options: Any) -> int:
     check_target(options.model, options.force)
     config = options.config
     processes = Processes.from_environment()
-    if processes.first:
-        _look(options.data, config)
+    glance = _glance(options.data, config) if processes.first else None
     data = processes.in_turn(lambda: _with_cameras(options.data))
+    if glance is not None:
+        glance()  # pictures that were no good have found their cameras all the same
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
@@ -136,19 +137,30 @@ def _check(options: Any) -> int:
     return 0
 
 
-def _look(data: str, config: TrainConfig) -> None:
-    """The first lines of a run: what a glance at some of the pictures tells."""
+def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
+    """The first lines of a run: what a glance at some of the pictures tells.
+
+    Where that is bad, it is returned as something to be said later: the estimation of cameras looks at all
+    pictures, and refuses them in one line if they are.
+    """
     from vfr_bake.data import working_size
-    from vfr_bake.data.check.check import check_data
+    from vfr_bake.data.check.check import BAD, check_data
 
     if data == "demo":
-        return
+        return None
     try:
         check = check_data(data, working_size(config), seconds=3, most=GLANCED_AT)
     except VfrError:  # said by what reads the pictures
-        return
-    for line in check.lines():
-        _say(data, line)
+        return None
+
+    def say() -> None:
+        for line in check.lines():
+            _say(data, line)
+
+    if check.verdict == BAD:
+        return say
+    say()
+    return None
 
 
 def _say(data: str, text: str) -> None:
