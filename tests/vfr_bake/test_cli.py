@@ -175,7 +175,7 @@ def test_eval_says_what_lpips_lacks_before_any_work(
 def test_a_view_without_error_is_null_in_json(
     model: Path, small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def perfect(model: Model, views: PosedImages):
+    def perfect(model: Model, views: PosedImages, masked: bool):
         for camera, image in zip(views.cameras, views.images, strict=True):
             rgb = over_background(image, model.background)
             yield RenderedView(camera.name, rgb, rgb)

@@ -36,9 +36,10 @@ N_RAYS = 2_000_000
 UNBOUNDED_RAYS = 500_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
 RAYS_SHARE = 0.3
-"""Share of the memory for cells and rays that rays may take at least, if they need it. Finer grids took so
-much of it that a scene of 71 phone photographs was taught by a fifth of the rays, and its refinement lost
-more than it gained."""
+"""Share of the memory for cells and rays that rays may take at least, if they need it. 71 phone photographs
+have some 15 million cells at 1088 an axis, beside which there was room for a fifth of the rays. On a grid of
+200 cells an axis, refinement of that scene gains 0.10 dB with 146 vertices for each ray, as many as there
+were then, and 0.34 dB with 26."""
 FEWEST_RAYS = 100_000
 RAYS_OF_CELL = 0.8
 """Training rays for each stored cell of the features' grid: as many as teach all of lego's. A third of them
@@ -99,7 +100,7 @@ class Plan:
     @property
     def most_cells(self) -> int:
         """The number of cells that fit beside the rays that teach them. Where there is no room for all rays,
-        they have a share of it: what few rays have refined shows other rays less than it did before."""
+        they have a share of it: with few of them refinement gains little."""
         every = (UNBOUNDED_RAYS if self.unbounded else N_RAYS) * self.ray_bytes
         rays = max(min(every, RAYS_SHARE * self.room), FEWEST_RAYS * self.ray_bytes)
         return int((self.room - rays) / self.cell_bytes)
