@@ -7,8 +7,10 @@ compiled code:
     table      [nb^3] int32        at (bx * nb + by) * nb + bz, for a place in this brick of the finest level:
                                    slot << 3 | level of the finest brick there, or minus the Chebyshev
                                    distance, in bricks of the finest level, to the nearest place that has one
-                                   (at most MAX_DISTANCE). With `skip_dead`, a coarser brick is not in places
-                                   where all of its cells are dead
+                                   (at most MAX_DISTANCE). With `skip_dead`, a place where all cells of a
+                                   coarser brick are dead counts as one without a brick; but for the level of
+                                   that brick, which is above the distance's DISTANCE_BITS, if samples there
+                                   stand for several steps
     live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
     density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
                                    that the eight corners of a cell are in one brick; SPARE bytes follow
@@ -34,6 +36,8 @@ from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 SPARE = 2
 """Bytes behind the densities: compiled code reads whole words."""
 
+DISTANCE_BITS = 5
+"""Bits of a distance in the table; above them is the level of a dead brick."""
 MAX_DISTANCE = 31
 """Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
 
@@ -132,6 +136,18 @@ class SparseGrid:
     def entries(self, cells: np.ndarray) -> np.ndarray:
         """The entries [...] of `table` for cells [3, ...] of the finest level."""
         return self.table.take(brick_number(cells, self.n_per_axis))
+
+    def steps_at(self, entries: np.ndarray) -> np.ndarray:
+        """For how many base steps a sample at most stands that begins where the table has `entries`."""
+        taken = -entries >> DISTANCE_BITS
+        steps = self.level_steps.take(np.where(entries < 0, taken, entries & 7), mode="clip")
+        return np.where((entries < 0) & (taken == 0), 1, steps)
+
+    @property
+    def most_steps(self) -> int:
+        """For how many base steps a sample stands at most: a group of steps that begins with one that this
+        number does not divide, ends before the next that it does."""
+        return int(self.level_steps[-1])
 
     def find(self, g: np.ndarray) -> Found:
         """What is at points `g` [3, ...], grid coordinates."""
@@ -239,9 +255,8 @@ def build_grid(
     shown = [_shown(pyramid, level) for level in range(len(pyramid.levels))]
     coords = [bricks.coords for bricks in shown]
     table = _painted(pyramid, coords)
-    if skip_dead:
-        _forget_dead(table, [bricks.masks for bricks in shown], level_steps)
-    _add_distances(table)
+    masks = [bricks.masks for bricks in shown]
+    _add_distances(table, _forget_dead(table, masks, level_steps) if skip_dead else None)
     low, slope = decode_constants(density_range)
     box = np.asarray(aabb, np.float64)
     values = features.values[0] if len(features.values) == 1 else np.concatenate(features.values)
@@ -356,29 +371,30 @@ def _painted(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
     return table
 
 
-def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Sequence[int]) -> None:
-    """Take bricks out of the `table` of `_painted`, in the places where all of their cells are dead.
+def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Sequence[int]) -> np.ndarray:
+    """Take coarser bricks out of the `table` of `_painted`, in the places where all of their cells are dead.
 
-    Of a level whose samples stand for several steps none is taken out: a sample that begins there may be
-    somewhere else.
+    Returns [nb, nb, nb] int32: the levels of what was taken out; 0 where nothing was, or where samples of the
+    level stand for one step.
     """
+    entries, taken = table.reshape(-1), np.zeros(table.size, np.int32)
     first = len(masks[0])
     for level in range(1, len(masks)):
-        places = np.flatnonzero((table.reshape(-1) >= 0) & (table.reshape(-1) & 7 == level))
-        if level_steps[level] == 1 and len(places):
-            n = 1 << min(level, 3)  # parts of a brick along an axis, each one place wide or wider
-            cells = stored_bits(masks[level]).reshape(-1, n, 8 // n, n, 8 // n, n, 8 // n)
-            live = cells.any(axis=(2, 4, 6))
-            at = np.stack(np.unravel_index(places, table.shape))
-            part = (at & ((1 << level) - 1)) >> max(level - 3, 0)
-            dead = ~live[((table.reshape(-1)[places] >> 3) - first, *part)]
-            table.reshape(-1)[places[dead]] = -1
+        places = np.flatnonzero((entries >= 0) & (entries & 7 == level))
+        n = 1 << min(level, 3)  # parts of a brick along an axis, each one place wide or wider
+        cells = stored_bits(masks[level]).reshape(-1, n, 8 // n, n, 8 // n, n, 8 // n)
+        at = np.stack(np.unravel_index(places, table.shape))
+        part = (at & ((1 << level) - 1)) >> max(level - 3, 0)
+        live = cells.any(axis=(2, 4, 6))[((entries[places] >> 3) - first, *part)]
+        dead = places[~live]
+        entries[dead], taken[dead] = -1, level if level_steps[level] > 1 else 0
         first += len(masks[level])
+    return taken.reshape(table.shape)
 
 
-def _add_distances(table: np.ndarray) -> None:
-    """Put distances where a table has no brick. Each round grows the reached set by one brick on every
-    side."""
+def _add_distances(table: np.ndarray, taken: np.ndarray | None) -> None:
+    """Put distances, and the levels of `taken`, where a table has no brick. Each round grows the reached set
+    by one brick on every side."""
     reached = table >= 0
     for distance in range(1, MAX_DISTANCE + 1):
         table[~reached] = -distance
@@ -386,6 +402,8 @@ def _add_distances(table: np.ndarray) -> None:
             reached = _dilate(reached, axis)
         if reached.all():
             break
+    if taken is not None:
+        table -= taken << DISTANCE_BITS
 
 
 def _dilate(mask: np.ndarray, axis: int) -> np.ndarray:

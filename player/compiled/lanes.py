@@ -37,7 +37,7 @@ def vector(element: Any) -> ir.VectorType:
 
 class Lanes:
     """LANES float32, int32 or truth values. Operators take another vector of the same kind, or a Python
-    number that stands for LANES of it; comparisons give truth values, which & and ~ combine."""
+    number that stands for LANES of it; comparisons give truth values, which &, | and ~ combine."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.b, self.value = builder, value
@@ -75,6 +75,9 @@ class Lanes:
 
     def __and__(self, other: Any) -> Lanes:
         return self._binary("and_", "and_", other)
+
+    def __or__(self, other: Any) -> Lanes:
+        return self._binary("or_", "or_", other)
 
     def __rshift__(self, other: Any) -> Lanes:
         return self._binary("ashr", "ashr", other)

@@ -136,7 +136,7 @@ def enter(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Boun
     """Rays where they enter a grid of either kind; the arguments are those of `march`."""
     lookup = Lookup(
         grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
-        int(grid.level_steps[0] == 1), grid.density_low, grid.density_slope,
+        int(grid.level_steps[0] == 1), grid.most_steps, grid.density_low, grid.density_slope,
     )  # fmt: skip
     if grid.contracted:
         steps, packets = _enter_space(grid, rays_o, rays_d)
@@ -157,6 +157,7 @@ def _enter_box(
     _enter_rays(
         F32(grid.resolution), grid.aabb_min, grid.cells_per_unit, grid.step,
         F32(grid.most_samples - 1) * grid.step,  # there is no room for more samples, whatever the ray
+        grid.most_steps,
         np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far, packets,
     )  # fmt: skip
     return BoxSteps(grid.step), packets
@@ -181,7 +182,7 @@ def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tu
 
 
 @compiled
-def _enter_rays(size, origin, scale, step, longest, rays_o, rays_d, near, far, packets):
+def _enter_rays(size, origin, scale, step, longest, most_steps, rays_o, rays_d, near, far, packets):
     """Rays where they enter the box of `size` cells, into rows of packets."""
     for ray in range(len(rays_o)):
         dx, dy, dz = rays_d[ray, 0] * scale[0], rays_d[ray, 1] * scale[1], rays_d[ray, 2] * scale[2]
@@ -201,7 +202,7 @@ def _enter_rays(size, origin, scale, step, longest, rays_o, rays_d, near, far, p
         packets[packet, 2, lane] = min(max(oz + t_in * dz, F32(0.0)), size)
         packets[packet, 3, lane], packets[packet, 4, lane], packets[packet, 5, lane] = dx, dy, dz
         packets[packet, LENGTH, lane], packets[packet, ENTRY, lane] = length, t_in
-        packets[packet, FIRST, lane] = max(math.floor(min(ahead, F32(1e9))), 0)
+        packets[packet, FIRST, lane] = max(math.floor(min(ahead, F32(1e9))), 0) & -most_steps
 
 
 @inlined

@@ -20,6 +20,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from player.asset.grid import DISTANCE_BITS, MAX_DISTANCE
 from player.compiled.lanes import (
     INT,
     LANES,
@@ -51,6 +52,8 @@ class Lookup(NamedTuple):
     n_per_axis: int
     least_coarse: int
     """Places of levels below this one are read like those of a grid of one level: 0 or 1."""
+    most_steps: int
+    """For how many base steps a sample stands at most."""
     density_low: np.float32
     density_slope: np.float32
 
@@ -265,6 +268,8 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
     tau, trans, n_weights = Variable(zero), Variable(zero.like(1.0)), Variable(zero)
     total, moment = _Sum(zero), _Sum(zero)
     least_coarse = splat(b, b.trunc(grid.least_coarse, INT))
+    multiple = 0 - splat(b, b.trunc(grid.most_steps, INT))
+    one, there = multiple.like(1), Variable(multiple.like(0))
 
     def look_up(g: Three, where: Lanes) -> tuple[list[Lanes], Lanes]:
         """Cells of the finest level, and the table's entries."""
@@ -282,14 +287,18 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
         active.set(inside)
         with b.if_then(empty.any()):
             bricks = (cell[0] >> 3, cell[1] >> 3, cell[2] >> 3)
-            i.set(choose(empty, path.jump(now, g, bricks, -entry - 1), now + 1))
+            there.set(path.jump(now, g, bricks, (-entry & MAX_DISTANCE) - 1))
+            i.set(choose(empty, (there.get() & multiple).most(now + 1), now + 1))
         at = _At(s, entry, busy, g, cell)
-        coarse = busy & ((entry & 7) >= least_coarse)
+        level = choose(empty, -entry >> DISTANCE_BITS, entry & 7)
+        coarse = inside & (level >= choose(empty, one, least_coarse))
         with b.if_then(coarse.any()):
-            size = gather(grid.level_steps, entry & 7, 4, coarse)
+            size = gather(grid.level_steps, level, 4, coarse)
             size = choose(now > 0, size.least(now & (0 - now)), size)  # the least power of two divides all
-            i.set(choose(coarse, now + size, i.get()))
-            grouped = coarse & (size > 1)
+            after = now + size
+            i.set(choose(coarse & (busy | (after > i.get())), after, i.get()))
+            # what begins in a dead brick may have its middle in a live cell, if that is not jumped over
+            grouped = coarse & (size > 1) & (busy | (after > there.get()))
             with b.if_then(grouped.any()):
                 s, reached, g = path.place_group(now, size, grouped)
                 cell, entry = look_up(g, reached)

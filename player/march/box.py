@@ -109,5 +109,6 @@ def enter_box(
         near, far = bounds
         ahead = np.maximum(near - t_in, 0) / grid.step - np.float32(0.5)
         first = np.maximum(np.floor(np.minimum(ahead, np.float32(1e9))), 0).astype(np.int32)
+        first &= -grid.most_steps  # a step that the march comes by, wherever it begins
         length = np.minimum(length, far - t_in)
     return BoxPath(t_in, first, length, point, direction, grid.step)

@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import Found, SparseGrid
+from player.asset.grid import MAX_DISTANCE, Found, SparseGrid
 from player.march.box import ONE, Bounds
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
@@ -131,10 +131,17 @@ def sample_rays(
         g = path.place(ray, i)
         cells = grid.cells(g)
         entries = grid.entries(cells)
-        busy, empty = np.flatnonzero(entries >= 0), np.flatnonzero(entries < 0)
+        busy = entries >= 0
+        empty = np.flatnonzero(~busy)
         if len(empty):
-            brick, reach = cells[:, empty] >> 3, -1 - entries[empty]
-            i[empty] = path.jump(ray[empty], i[empty], g[:, empty], brick, reach)
+            brick, reach = cells[:, empty] >> 3, (-entries[empty] & MAX_DISTANCE) - 1
+            there = path.jump(ray[empty], i[empty], g[:, empty], brick, reach)
+            after = i[empty] + group_size(grid, i[empty], entries[empty])
+            busy[empty] = after > there  # its middle may be in a live cell
+            i[empty] = np.where(
+                busy[empty], i[empty], np.maximum(there & -grid.most_steps, after)
+            )  # a step that the march comes by
+        busy = np.flatnonzero(busy)
         if len(busy):
             chunk = _chunk(grid, path, ray[busy], i[busy])
             chunks.append(_take(grid, path, ray[busy], chunk, tau))
@@ -174,7 +181,7 @@ def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chun
     then = i
     for column, here in enumerate(steps.T):
         at = then == here
-        begins[:, column] = at & (found.entries[:, column] >= 0)
+        begins[:, column] = at & ((found.entries[:, column] >= 0) | (sizes[:, column] > 1))
         then = np.where(at, here + sizes[:, column], then)
     row, column = np.nonzero(begins)
     i, size = steps[row, column], sizes[row, column]
@@ -186,7 +193,7 @@ def group_size(grid: SparseGrid, i: np.ndarray, entries: np.ndarray) -> np.ndarr
     """For how many base steps the samples stand that begin with steps `i`, in whose middles the table has
     `entries`: the largest power of two that is at most the level's and divides i; 1 where there is no
     brick."""
-    most = np.where(entries < 0, 1, grid.level_steps.take(entries & 7, mode="clip"))
+    most = grid.steps_at(entries)
     return np.where(i == 0, most, np.minimum(most, i & -i)).astype(np.int32)
 
 

@@ -2,6 +2,7 @@
 
     python tests/benchmarks/bench_play.py out/ --cameras transforms_test.json --size 800x800
     python tests/benchmarks/bench_play.py fidelity/ balanced/ fast/ --curves
+    python tests/benchmarks/bench_play.py out/ --against CHECKOUT ITS_ASSET --frames 60
 
 Parts are processor time of all threads, divided by their number: what they take of a frame when all are busy.
 What is left of the wall's clock is waiting, for another program or for the last task. Lookups cannot be
@@ -9,7 +10,9 @@ timed apart: they are k / (k - 1) of what k fetches a ray take longer than one. 
 two marches must give the same picture within one level of eight bits; a head in 8 bits takes a last bit for
 another level now and then, which moves one pixel in ten thousand by two levels or more.
 
-With `--curves`, tables of time against pixels, threads and assets, numba alone.
+With `--against`, every quality beside another version of the player that plays an asset of its own baking
+(`tests/benchmarks/against.py`). With `--curves`, tables of time against pixels, threads and assets, numba
+alone.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: the threads 
 import argparse
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -38,6 +42,7 @@ from player.cameras.transforms import read_cameras
 from player.head.graph import read_head
 from player.march.march import MIN_OPACITY
 from player.render import Frame, Renderer, default_threads
+from tests.benchmarks import against
 from vfr_bake.bench.process import Clock
 
 SIZES = (200, 400, 566, 800, 1131)
@@ -196,6 +201,22 @@ def curves(assets: list[Asset], arguments: argparse.Namespace, n_threads: int) -
         )
 
 
+def against_another(arguments: argparse.Namespace) -> int:
+    """Every asset of this version against the one of the other."""
+    for folder in arguments.assets:
+        with tempfile.TemporaryDirectory(prefix="vfr-bench-play-") as scratch:
+            rows = against.compare(
+                folder, tuple(arguments.against), arguments.size, arguments.frames, arguments.threads,
+                arguments.march, Path(scratch),
+            )  # fmt: skip
+        load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+        print(
+            f"\n{folder}, {arguments.march}, {arguments.threads} threads, {arguments.frames} frames{load}\n"
+        )
+        print("\n".join(against.lines(rows)))
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("assets", type=Path, nargs="+")
@@ -205,7 +226,13 @@ def main() -> int:
     parser.add_argument("--threads", type=positive, default=default_threads())
     parser.add_argument("--samples", type=int)
     parser.add_argument("--curves", action="store_true", help="time against pixels, threads and assets")
+    parser.add_argument(
+        "--against", type=Path, nargs=2, metavar=("CHECKOUT", "ASSET"), help="another version"
+    )
+    parser.add_argument("--march", choices=("numba", "numpy"), default="numba", help="with --against")
     arguments = parser.parse_args()
+    if arguments.against:
+        return against_another(arguments)
     start = time.perf_counter()
     assets = [Asset.open(path) for path in arguments.assets]
     assets[0].grid  # noqa: B018

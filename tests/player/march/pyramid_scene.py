@@ -112,11 +112,19 @@ class PyramidScene:
 
     @property
     def grid(self) -> SparseGrid:
+        return self._grid(skip_dead=False)
+
+    @property
+    def grid_that_skips(self) -> SparseGrid:
+        """The same, whose table has no bricks where their cells are dead, as an asset's."""
+        return self._grid(skip_dead=True)
+
+    def _grid(self, skip_dead: bool) -> SparseGrid:
         edge = 2.0 if self.contracted else 1.0
         box = np.array([[-edge] * 3, [edge] * 3])
         return build_grid(
             self.densities, self.features, box, self.step, self.level_steps, self.density_range,
-            self.contracted,
+            self.contracted, skip_dead=skip_dead,
         )  # fmt: skip
 
     def march(self, ray_o: np.ndarray, ray_d: np.ndarray, k: int) -> tuple[float, float, int, np.ndarray]:

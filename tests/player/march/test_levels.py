@@ -183,3 +183,22 @@ def test_bounds_do_not_change_a_bit(module: ModuleType) -> None:
     assert len(free.hits) > 300 and (near > 0).any()
     for a, b in zip(free, module.march(scene.grid, rays_o, rays_d, 3, (near, far)), strict=True):
         assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
+@pytest.mark.parametrize("steps", STEPS)
+def test_jumping_over_dead_cells_does_not_change_a_bit(
+    module: ModuleType, contracted: bool, steps: tuple[int, ...]
+) -> None:
+    """Steps of a sample, too, begin where they begin without."""
+    skipped = 0
+    for seed in range(2):
+        scene = random_scene(60, 30, steps, seed=seed, contracted=contracted)
+        whole, skipping = scene.grid, scene.grid_that_skips
+        skipped += int(((whole.table >= 0) & (skipping.table < 0)).sum())
+        assert ((whole.table >= 0) | (skipping.table < 0)).all()
+        results = [module.march(grid, *rays(200, seed), 3) for grid in (whole, skipping)]
+        for name, a, b in zip(results[0]._fields, *results, strict=True):
+            assert a.tobytes() == b.tobytes(), name
+    assert len(steps) == 1 or skipped > 3

@@ -1,0 +1,209 @@
+"""Which pixels become the mean of their neighbours, against a loop in float64, and what a picture is then."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset
+from player.cameras.camera import Camera
+from player.cameras.transforms import read_cameras
+from player.compiled import interpolation as compiled
+from player.march.bounds import BLOCK
+from player.march.interpolation import Agreement, Quality, Stage, interpolate, stages
+from player.march.pixels import Pixels, Planes, pixels_of_blocks
+from player.render import Frame, Renderer
+
+QUALITIES: tuple[Quality, ...] = ("exact", "high", "fast")
+LOSSY = QUALITIES[1:]
+MARCHES = ["numpy", pytest.param("numba", marks=pytest.mark.extra)]
+
+
+def random_planes(n_pixels: int, random: np.random.Generator) -> Planes:
+    """Colours, opacities and depths of which most squares of four agree and some do not, in every way."""
+    rgb = (0.5 + random.normal(0, 0.004, (n_pixels, 3))).astype(np.float32)
+    opacity = (0.6 + random.normal(0, 0.004, n_pixels)).astype(np.float32)
+    depth = random.uniform(2, 2.05, n_pixels).astype(np.float32)
+    rgb[random.random(n_pixels) < 0.03, 1] += np.float32(0.2)
+    opacity[random.random(n_pixels) < 0.03] += np.float32(0.2)
+    depth[random.random(n_pixels) < 0.03] *= np.float32(1.5)
+    empty = random.random(n_pixels) < 0.2
+    depth[empty], opacity[empty] = 0, random.choice([0, 1e-4], empty.sum())
+    return Planes(rgb, opacity, depth, np.zeros(n_pixels, np.int32))
+
+
+def all_pixels(width: int, height: int, stage: Stage) -> Pixels:
+    per_row = -(-width // BLOCK)
+    blocks = np.arange(per_row * -(-height // BLOCK))
+    camera = Camera("", np.eye(4), width, height, 1.0, 1.0, 0.5, 0.5)
+    return pixels_of_blocks(camera, blocks, per_row, stage.within)
+
+
+def expected_pixel(
+    planes: Planes, size: tuple[int, int], row: int, column: int, stage: Stage, transparent: bool
+) -> tuple[float, ...] | None:
+    """r, g, b, opacity and depth of a pixel in float64; None where it is to be marched."""
+    width, height = size
+    four = []
+    for down, right in stage.neighbours:
+        y, x = row + int(down), column + int(right)
+        if not (0 <= y < height and 0 <= x < width):
+            return None
+        four.append(y * width + x)
+    a = [float(planes.opacity[i]) for i in four]
+    t = [float(planes.depth[i]) for i in four]
+    colours = [[float(c) * (a[n] if transparent else 1) for c in planes.rgb[i]] for n, i in enumerate(four)]
+    allowed: Agreement = stage.agreement
+    if max(a) - min(a) > allowed.opacity:
+        return None
+    if max(a) > allowed.opacity and max(t) - min(t) > allowed.depth * min(t):
+        return None
+    if any(max(channel) - min(channel) > allowed.colour for channel in zip(*colours, strict=True)):
+        return None
+    mean = [sum(channel) / 4 for channel in zip(*colours, strict=True)]
+    opacity = sum(a) / 4
+    if transparent:
+        mean = [channel / opacity if opacity else 0 for channel in mean]
+    return *mean, opacity, sum(t) / 4 if min(t) > 0 else 0.0
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality) -> None:
+    found = np.full((3 * BLOCK, 3 * BLOCK), -1)
+    for number, stage in enumerate(stages(quality)):
+        rows, columns = (
+            (axis[:, None] + BLOCK * np.arange(3)).reshape(len(axis), 3) for axis in stage.within.T
+        )
+        for row, column in zip(rows, columns, strict=True):
+            for y, x in itertools.product(row, column):
+                assert found[y, x] == -1
+                found[y, x] = number
+    assert (found >= 0).all()
+    for number, stage in enumerate(stages(quality)):
+        for row, column in stage.within + BLOCK:
+            assert all(found[row + down, column + right] < number for down, right in stage.neighbours)
+
+
+@pytest.mark.parametrize(
+    "function", [interpolate, pytest.param(compiled.interpolate, marks=pytest.mark.extra)]
+)
+@pytest.mark.parametrize("transparent", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (7, 9), (33, 18)])
+def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int, int]) -> None:  # type: ignore[no-untyped-def]
+    random = np.random.default_rng(3)
+    kept = filled = 0
+    for stage in [stage for quality in LOSSY for stage in stages(quality)]:
+        planes = random_planes(size[0] * size[1], random)
+        before = Planes(*(plane.copy() for plane in planes))
+        pixels = all_pixels(*size, stage)
+        rest = set(function(planes, size, pixels, stage, transparent).tolist())
+        for i, (row, column) in enumerate(zip(pixels.rows.tolist(), pixels.columns.tolist(), strict=True)):
+            expected = (
+                expected_pixel(before, size, row, column, stage, transparent)
+                if len(stage.neighbours)
+                else None
+            )
+            at = row * size[0] + column
+            assert (i in rest) == (expected is None), (row, column)
+            if expected is None:
+                assert all(np.array_equal(a[at], b[at]) for a, b in zip(planes, before, strict=True))
+                kept += 1
+            else:
+                got = [*planes.rgb[at], planes.opacity[at], planes.depth[at]]
+                np.testing.assert_allclose(got, expected, rtol=1e-6, atol=0)
+                filled += 1
+    assert kept > 0 and (filled > 20 or size[0] * size[1] < 70)
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("transparent", [False, True])
+def test_compiled_code_gives_the_same_bits(transparent: bool) -> None:
+    for seed in range(5):
+        for stage in stages("fast"):
+            both = []
+            for function in (interpolate, compiled.interpolate):
+                planes = random_planes(40 * 30, np.random.default_rng(seed))
+                rest = function(planes, (40, 30), all_pixels(40, 30, stage), stage, transparent)
+                both.append([rest, *planes])
+            assert all(a.tobytes() == b.tobytes() for a, b in zip(*both, strict=True))
+
+
+def render(asset: Asset, camera: Camera, quality: Quality, march: str = "numpy", **settings: object) -> Frame:
+    with Renderer(asset, 2, march) as renderer:  # type: ignore[arg-type]
+        return renderer.render(camera, quality=quality, **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def camera(asset: Asset) -> Camera:
+    return read_cameras(asset.path("cameras.json"))[0].resized(201, 157)
+
+
+@pytest.mark.parametrize("march", MARCHES)
+@pytest.mark.parametrize("quality", LOSSY)
+@pytest.mark.parametrize("settings", [{}, {"background": "transparent"}, {"n_fetches": 1}])
+def test_marched_pixels_are_those_of_exact(
+    march: str, quality: Quality, settings: dict, asset: Asset, camera: Camera
+) -> None:
+    exact, other = (render(asset, camera, name, march, **settings) for name in ("exact", quality))
+    marched = other.n_density_samples > 0
+    assert 0.05 < marched.mean() < (exact.n_density_samples > 0).mean()
+    first = stages(quality)[0].within
+    step = first[1, 1] - first[0, 1]
+    lattice = np.zeros(exact.opacity.shape, bool)
+    lattice[::step, ::step] = True
+    same = marched | lattice
+    for name in ("rgb", "opacity", "depth", "n_density_samples"):
+        assert getattr(other, name)[same].tobytes() == getattr(exact, name)[same].tobytes(), name
+    assert np.abs(other.opacity - exact.opacity).mean() < 0.01
+    a, b = (
+        frame.rgb * (frame.opacity[..., None] if settings.get("background") else 1)
+        for frame in (exact, other)
+    )
+    assert -10 * np.log10(np.mean((a - b) ** 2)) > (34 if quality == "high" else 28)
+
+
+@pytest.mark.parametrize("march", MARCHES)
+@pytest.mark.parametrize("quality", LOSSY)
+def test_threads_and_tasks_do_not_change_a_bit(
+    march: str, quality: Quality, asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = []
+    for n_threads, blocks in ((1, 1000), (2, 7), (3, 1)):
+        monkeypatch.setitem(__import__("player.render").render.TASK_BLOCKS, march, blocks)
+        with Renderer(asset, n_threads, march) as renderer:  # type: ignore[arg-type]
+            frames += [renderer.render(camera, quality=quality) for _ in range(2)]
+    for frame in frames[1:]:
+        for name in ("rgb", "opacity", "depth", "n_density_samples"):
+            assert getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes(), name
+
+
+@pytest.mark.parametrize("quality", LOSSY)
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 2), (8, 8), (17, 3)])
+def test_small_pictures(quality: Quality, size: tuple[int, int], asset: Asset, camera: Camera) -> None:
+    exact, other = (render(asset, camera.resized(*size), name) for name in ("exact", quality))
+    assert other.rgb.shape == exact.rgb.shape and np.isfinite(other.rgb).all()
+    if min(size) == 1:  # no pixel has four neighbours
+        assert other.rgb.tobytes() == exact.rgb.tobytes()
+
+
+@pytest.mark.parametrize("quality", LOSSY)
+def test_nothing_is_marched_where_nothing_is(quality: Quality, asset: Asset, camera: Camera) -> None:
+    from dataclasses import replace
+
+    away = replace(camera, c2w=camera.c2w @ np.diag([-1.0, 1, -1, 1]))
+    frame = render(asset, away, quality, background=(0.0, 1.0, 0.5))
+    assert (frame.to_uint8() == [0, 255, 128]).all() and not frame.opacity.any() and not frame.depth.any()
+
+
+@pytest.mark.parametrize("quality", LOSSY)
+def test_layers_are_those_of_the_pixels_that_were_marched(
+    quality: Quality, asset: Asset, camera: Camera
+) -> None:
+    exact, other = (render(asset, camera, name, layers=True) for name in ("exact", quality))
+    assert exact.features is not None and other.features is not None
+    marched = other.n_density_samples > 0
+    assert other.features[marched].tobytes() == exact.features[marched].tobytes()
+    assert not other.features[~marched].any()
+    assert other.normals.tobytes() == exact.normals.tobytes()
