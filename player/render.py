@@ -62,7 +62,7 @@ class Frame:
     depth: np.ndarray
     """[h, w] float32, mean distance along the ray, WORLD units; 0 where nothing was met."""
     n_density_samples: np.ndarray
-    """[h, w] int32, density samples taken."""
+    """[h, w] int32, density samples taken; 0 where the pixel was interpolated."""
     background: Background
     """What is behind, or "transparent"."""
     features: np.ndarray | None = None
@@ -158,6 +158,8 @@ class Renderer:
             n_fetches: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
                 can have.
             background: colour 0..1 or "transparent"; the asset's own if None.
+            quality: "exact" marches every pixel; "high" and "fast" interpolate those between neighbours that
+                agree (`player.march.interpolation`).
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 

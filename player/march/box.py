@@ -55,7 +55,8 @@ class BoxPath(NamedTuple):
         face = np.where(direction > 0, ahead, behind).astype(np.float32)
         s = (face - self.point[:, ray]) / np.where(still, np.float32(1), direction)
         s[still] = np.inf
-        left = np.minimum(s.min(axis=0), np.float32(1e6)) / self.step - np.float32(0.5)
+        # a place within the margin of a face that the ray nearly runs along is far behind it
+        left = np.clip(s.min(axis=0), np.float32(0), np.float32(1e6)) / self.step - np.float32(0.5)
         return np.maximum(i, np.floor(np.minimum(left, np.float32(1e9))).astype(np.int32)) + 1
 
     def way(self, ray: np.ndarray, i: np.ndarray, size: np.ndarray = ONE) -> np.ndarray:

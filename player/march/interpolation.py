@@ -86,8 +86,8 @@ def _agreement(levels: float) -> Agreement:
 
 _STAGES: dict[Quality, tuple[Stage, ...]] = {
     "exact": (Stage(EVERY, _NONE, _NOTHING),),
-    "high": _pattern(4, (_agreement(6), _agreement(12))),
-    "fast": _pattern(4, (_agreement(12), _agreement(24))),
+    "high": _pattern(4, (_agreement(5), _agreement(10))),
+    "fast": _pattern(4, (_agreement(10), _agreement(20))),
 }
 
 

@@ -29,6 +29,7 @@ from player.cameras.transforms import read_cameras
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, OutputError
 from player.files.images import png_bytes, read_key, webp_bytes
+from player.march.interpolation import Quality
 from player.render import FRAME_BYTES, Renderer, render
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -288,3 +289,22 @@ def test_videos_that_cannot_be(
     assert cli.main([*trained(shells_folder), "--output", str(target)]) == 1
     assert "pip install 'vfr-bake[video]'; or write pictures: --output DIR" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mixed.json"], "said before anything was rendered"
+
+
+@pytest.mark.parametrize("quality", ["high", "fast"])
+def test_a_frame_is_the_same_alone_and_in_a_film_of_a_quality(
+    quality: Quality, asset: Asset, tmp_path: Path
+) -> None:
+    """And a film that is resumed with another quality is refused."""
+    cameras = orbit(read_cameras(asset.path("cameras.json")), 3, (61, 47))
+    film = PlaySettings(tmp_path / "film", quality=quality, march="numpy")
+    assert play(asset, cameras, film).figures["quality"] == quality
+    play(asset, cameras, PlaySettings(tmp_path / "one", frames=slice(1, 2), quality=quality, march="numpy"))
+    name = "orbit_001.png"
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "film" / name).read_bytes()
+    (tmp_path / "film" / name).unlink()
+    again = replace(film, resume=True)
+    assert play(asset, cameras, again).n_kept == 2
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "film" / name).read_bytes()
+    with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
+        play(asset, cameras, replace(again, quality="exact"))
