@@ -26,7 +26,7 @@ from vfr_bake.config import BakeConfig, TrainConfig
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.model_file import Model
-    from vfr_bake.training.preview import Preview
+    from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
 EVAL_VIEWS = {False: 10, True: 3}
@@ -94,7 +94,8 @@ def _train(options: Any) -> int:
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
-        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind, scale=config.scale)
+        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
+    scene, blurred = _without_blurred(scene, processes)
     if processes.first:
         _warn_of_folds(scene)
     trainer = Trainer(scene, config, processes)
@@ -106,6 +107,7 @@ def _train(options: Any) -> int:
     preview = _preview(options, scene) if options.preview and processes.first else None
     figures = _train_steps(trainer, checkpoint, preview)
     interrupted = figures.pop("interrupted")
+    figures["blurred"] = blurred
     if processes.first:
         model = trained_model(trainer, scene, figures)
         save_model(options.model, model)
@@ -184,6 +186,21 @@ def _with_cameras(data: str) -> str:
     for name, reason in report.unplaced.items():
         print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
     return str(report.folder)
+
+
+def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[str]]:
+    """The scene without training pictures that are blurred, and the names of these; says which."""
+    from vfr_bake.data.quality.sharpness import without_blurred
+
+    with Bar("looking for blur", processes.first) as bar:
+        train, names = without_blurred(scene.train, bar.count)
+    if names and processes.first:
+        print(
+            f"vfr-train: {len(names)} of {len(scene.train.cameras)} training pictures are blurred, compared "
+            f"with the others, and left out: {printable(', '.join(names))}",
+            file=sys.stderr,
+        )
+    return replace(scene, train=train), names
 
 
 def _warn_of_folds(scene: Scene) -> None:

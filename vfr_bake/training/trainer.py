@@ -41,6 +41,8 @@ from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 MINUTES = {False: 9.4, True: 12.0}
 """Training time on a CPU by whether the scene is unbounded, where none is asked for."""
+SOLID = 0.9
+"""Opacity above which the exposure of a picture is looked at."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""
 
@@ -278,8 +280,15 @@ class Trainer:
         seen_colours[hit] = colours.detach()
         rgba, background = batch.rgba[rays], batch.background[rays]
         wanted = rgba[:, :3] * rgba[:, 3:] + background * (seen_opacity[:, None] - rgba[:, 3:])
+        solid = (seen_opacity > SOLID) & (rgba[:, 3] > SOLID)
         return Seen(
-            batch.pictures[rays], batch.places[rays], seen_colours, seen_opacity, wanted, errors.detach()
+            batch.pictures[rays],
+            batch.places[rays],
+            seen_colours,
+            seen_opacity,
+            wanted,
+            solid,
+            errors.detach(),
         )
 
     def _colours(

@@ -46,6 +46,9 @@ class Seen:
     """[n_rays]."""
     wanted: Tensor
     """[n_rays, 3]: the photographs' colours without the background's part in them."""
+    solid: Tensor
+    """[n_rays] bool: where both the photograph and the field are nearly opaque. At the edges of an object the
+    errors are those of its outline, which no gain explains."""
     errors: Tensor
     """[n_rays, 3]: what was shown, less what was to be shown."""
 
@@ -111,9 +114,9 @@ class CaptureEffects:
         cells.index_add_(0, cell, torch.cat([torch.ones_like(squares), errors, squares], dim=1))
         terms = products(seen.colours, seen.opacity, seen.wanted)
         learned = self.learned(seen.pictures, seen.places)
-        if learned is not None:
-            terms = terms * learned[:, None, None]
-        halves.index_add_(0, 2 * seen.pictures + (seen.places[:, 0] >= 0.5), terms)
+        fits = seen.solid if learned is None else seen.solid & learned
+        half = 2 * seen.pictures + (seen.places[:, 0] >= 0.5)
+        halves.index_add_(0, half[fits], terms[fits])
         self._n_steps += 1
         self._n_rays += n_rays
         if self._n_steps % STEPS_PER_UPDATE == 0:

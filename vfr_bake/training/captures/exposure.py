@@ -21,8 +21,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-PRIOR_PIXELS = 50
-"""So many pixels of black and of white that need no correction count as part of every picture."""
+PRIOR_PIXELS = 1.0
+"""So many pixels of black and of white that need no correction count as part of every picture: enough for a
+picture that shows nothing yet, and too few to pull the gains of others towards 1."""
 LEAST_GAIN_DB = 0.2
 """Gains and offsets are learned where they reduce the error on the other half of the pictures by so much."""
 N_SUMS = 6

@@ -1,0 +1,1 @@
+"""What is measured of pictures before anything is learned from them."""

@@ -1,0 +1,95 @@
+"""Which pictures of a capture are blurred: shaken, or out of focus.
+
+The measure is that of Crete et al., "The blur effect", 2007, as scikit-image has it: blur a picture once
+more, and see how much of its differences from pixel to pixel is lost. A sharp picture loses much, a blurred
+one has little to lose. It lies between 0 (sharp) and 1, and depends on the subject as well. So a picture is
+compared with the others of its capture, and with none from elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from player.errors import MissingExtraError, ShapeError
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.threads import Progress, in_threads
+
+SIDE = 512
+"""Pixels of the longest side on which blur is measured: what is blurred there is so at any size."""
+WINDOW = 11
+"""Pixels that the picture is blurred over once more."""
+SMALLEST = 2 * WINDOW
+"""Pixels of the shortest side from which on blur can be told."""
+FAR_OFF, LEAST_DIFFERENCE = 5.0, 0.08
+"""A picture is blurred if it is above the median by so many median absolute deviations, and by so much."""
+FEWEST = 8
+"""Fewer pictures have no typical one to be compared with."""
+
+
+def blur(image: np.ndarray) -> float:
+    """How blurred an image [height, width, 3 or 4] uint8 is, from 0 (sharp) to 1, along its worse direction.
+
+    0 where the picture is too small to tell. Raises ShapeError: it is no such image; MissingExtraError: no
+    scikit-image.
+
+    >>> noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    >>> smooth = np.cumsum(noise // 64, axis=1).astype(np.uint8)
+    >>> blur(noise) < blur(np.repeat(np.repeat(noise[:16, :16], 4, axis=0), 4, axis=1))
+    True
+    """
+    if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8:
+        raise ShapeError(
+            f"image: expected [height, width, 3 or 4] uint8, got {list(image.shape)} {image.dtype}"
+        )
+    try:
+        from skimage.measure import blur_effect
+    except ImportError as error:
+        raise MissingExtraError("blur: needs scikit-image: pip install vfr-bake[train]") from error
+    every = -(-max(image.shape[:2]) // SIDE)
+    height, width = (side // every * every for side in image.shape[:2])
+    if min(height, width) < SMALLEST * every:
+        return 0.0
+    grey = image[:height, :width, :3].astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) / 255
+    if image.shape[2] == 4:
+        grey = grey * (image[:height, :width, 3] / np.float32(255))
+    small = grey.reshape(height // every, every, width // every, every).mean(axis=(1, 3))
+    if small.min() == small.max():
+        return 0.0  # a plain picture has nothing to be blurred
+    return np.asarray(blur_effect(small, h_size=WINDOW)).item()
+
+
+def blurred(blurs: Sequence[float]) -> list[int]:
+    """The numbers of the pictures that are blurred among those of one capture, ascending, of each one's
+    `blur`.
+
+    None of fewer than FEWEST pictures, and none where they are all alike.
+
+    >>> blurred([0.3, 0.31, 0.29, 0.3, 0.33, 0.3, 0.6, 0.28, 0.3])
+    [6]
+    >>> blurred([0.6] * 9), blurred([0.1, 0.9])
+    ([], [])
+    """
+    if len(blurs) < FEWEST:
+        return []
+    values = np.asarray(blurs, np.float64)
+    median = float(np.median(values))
+    deviation = float(np.median(np.abs(values - median)))
+    limit = median + max(LEAST_DIFFERENCE, FAR_OFF * deviation)
+    return np.flatnonzero(values > limit).tolist()
+
+
+def without_blurred(views: PosedImages, progress: Progress | None = None) -> tuple[PosedImages, list[str]]:
+    """The views without those that are blurred, and the names of these.
+
+    `progress`: called with the number of pictures done and to do.
+
+    >>> from vfr_bake.data.demo import demo_views
+    >>> views, _ = demo_views(size=64, n_train=10, n_test=0)
+    >>> len(without_blurred(views)[0].images), without_blurred(views)[1]
+    (10, [])
+    """
+    found = set(blurred(in_threads(blur, views.images, progress)))
+    sharp = views.some(set(range(len(views.images))) - found)
+    return sharp, [views.cameras[number].name for number in sorted(found)]
