@@ -281,15 +281,8 @@ class Trainer:
         rgba, background = batch.rgba[rays], batch.background[rays]
         wanted = rgba[:, :3] * rgba[:, 3:] + background * (seen_opacity[:, None] - rgba[:, 3:])
         solid = (seen_opacity > SOLID) & (rgba[:, 3] > SOLID)
-        return Seen(
-            batch.pictures[rays],
-            batch.places[rays],
-            seen_colours,
-            seen_opacity,
-            wanted,
-            solid,
-            errors.detach(),
-        )
+        pictures, places = batch.pictures[rays], batch.places[rays]
+        return Seen(pictures, places, seen_colours, seen_opacity, wanted, solid, errors.detach())
 
     def _colours(
         self, samples: RaySamples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
