@@ -383,9 +383,10 @@ def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Se
         places = np.flatnonzero((entries >= 0) & (entries & 7 == level))
         n = 1 << min(level, 3)  # parts of a brick along an axis, each one place wide or wider
         cells = stored_bits(masks[level]).reshape(-1, n, 8 // n, n, 8 // n, n, 8 // n)
+        alive: np.ndarray = np.asarray(cells.any(axis=(2, 4, 6)))
         at = np.stack(np.unravel_index(places, table.shape))
         part = (at & ((1 << level) - 1)) >> max(level - 3, 0)
-        live = cells.any(axis=(2, 4, 6))[((entries[places] >> 3) - first, *part)]
+        live = alive[((entries[places] >> 3) - first, *part)]
         dead = places[~live]
         entries[dead], taken[dead] = -1, level if level_steps[level] > 1 else 0
         first += len(masks[level])

@@ -39,6 +39,7 @@ def test_one_picture_a_frame_and_figures(
     got = json.loads(figures.read_text())
     assert set(got) == {
         "ms_median", "ms_p95", "frames", "width", "height", "threads", "march", "peak_rss_mb", "n_fetches",
+        "quality",
     }  # fmt: skip
     assert (got["frames"], got["width"], got["height"], got["threads"], got["n_fetches"]) == (5, 48, 40, 2, 5)
     assert got["march"] == ("numba" if compiling.available() else "numpy")

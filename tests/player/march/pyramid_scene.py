@@ -112,14 +112,14 @@ class PyramidScene:
 
     @property
     def grid(self) -> SparseGrid:
-        return self._grid(skip_dead=False)
+        return self._built(skip_dead=False)
 
     @property
     def grid_that_skips(self) -> SparseGrid:
         """The same, whose table has no bricks where their cells are dead, as an asset's."""
-        return self._grid(skip_dead=True)
+        return self._built(skip_dead=True)
 
-    def _grid(self, skip_dead: bool) -> SparseGrid:
+    def _built(self, skip_dead: bool) -> SparseGrid:
         edge = 2.0 if self.contracted else 1.0
         box = np.array([[-edge] * 3, [edge] * 3])
         return build_grid(
