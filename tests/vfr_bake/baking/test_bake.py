@@ -348,7 +348,8 @@ def test_a_budget_is_kept_by_storing_less_of_each_value(model: Model, tmp_path: 
     half = Asset.open(tmp_path / "half").manifest
     assert (half.n_channels, half.resolution) == (manifest.n_channels, manifest.resolution)
     assert 0.5 * limit < result.n_bytes / 1e6 <= limit
-    assert result.loss.db > whole.loss.db
+    agreed = [baked.figures["psnr_to_full_model"] for baked in (whole, result)]
+    assert agreed[1] < agreed[0], "the witnesses of so small a scene do not tell so little"
 
 
 def test_views_between_lie_between(model: Model) -> None:
