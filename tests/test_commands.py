@@ -66,7 +66,7 @@ TYPED = [
 
 def test_every_option_with_a_value_is_here() -> None:
     """A reader is one of `player.app.option_types`: none is Python's own."""
-    assert len(TYPED) == 24
+    assert len(TYPED) == 25
     for _, action in TYPED:
         assert action.choices or getattr(action.type, "__module__", "") == "player.app.option_types", action
 
@@ -141,8 +141,8 @@ def given(name: str) -> list[str]:
     """An option of `vfr-play` on a command line, with a value that it takes."""
     values = {"cameras": "c.json", "orbit": "2", "view": "1", "output": "o", "format": "png", "frames": "1:2",
               "fps": "5", "json": "j.json", "dask": "tcp://127.0.0.1:1", "size": "8x8", "background": "white",
-              "samples": "0", "threads": "1", "march": "auto", "host": "127.0.0.1", "port": "1",
-              "max_memory": "4"}  # fmt: skip
+              "samples": "0", "quality": "fast", "threads": "1", "march": "auto", "host": "127.0.0.1",
+              "port": "1", "max_memory": "4"}  # fmt: skip
     if name == "others":
         return ["more"]
     option = f"--{name.replace('_', '-')}"

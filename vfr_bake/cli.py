@@ -26,6 +26,7 @@ from vfr_bake.config import BakeConfig, TrainConfig
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.model_file import Model
+    from vfr_bake.training.preview import Preview
     from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
@@ -87,14 +88,21 @@ def _train(options: Any) -> int:
     check_target(options.model, options.force)
     config = options.config
     processes = Processes.from_environment()
-    glance = _glance(options.data, config) if processes.first else None
+    # The pictures of a ZIP or a video are looked at when they are there.
+    packed = not Path(options.data).is_dir()
+    glance = _glance(options.data, config) if processes.first and not packed else None
     data = processes.in_turn(lambda: _with_cameras(options.data))
+    if processes.first and packed:
+        glance = _glance(data, config)
     if glance is not None:
         glance()  # pictures that were no good have found their cameras all the same
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
-        scene = load_scene(data, bar.count, downscale=config.downscale, kind=config.kind)
+        scene = processes.in_turn(
+            lambda: load_scene(data, bar.count, kind=config.kind, scale=config.scale, reader=reader)
+        )
+    config = replace(config, max_side=reader.size.max_side)
     scene, blurred = _without_blurred(scene, processes)
     if processes.first:
         _warn_of_folds(scene)
@@ -394,7 +402,7 @@ def _eval(options: Any) -> int:
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
         scene = load_scene(
-            options.data, bar.count, downscale=model.train.get("downscale", 1), scale=model.train.get("scale")
+            options.data, bar.count, reader=reader_as(model.train), scale=model.train.get("scale")
         )
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")

@@ -192,8 +192,12 @@ class TrainConfig:
     proposals. Auto: an object if the pictures have alpha or a plain background."""
     device: Device = "auto"
     """Where to train: a GPU that CUDA runs on, or the CPU. Auto: the GPU if there is one."""
-    downscale: int = 1
-    """Pictures are reduced by this factor along each side before training."""
+    max_side: int | None = None
+    """Pictures whose longest side has more pixels are reduced to so many; 1600, or fewer where the disk has
+    no room for the pictures."""
+    downscale: int | None = None
+    """Reduce all pictures by this factor along each side instead, whatever their size is; 1 for pictures as
+    they are."""
     scale: tuple[str, str, float] | None = None
     """Two pictures and how far apart their cameras were, for example `IMG_1.jpg IMG_9.jpg 2.5`: the world is
     then in the unit of that distance, metres for glTF and USD, in every export. Pictures alone do not tell
@@ -241,7 +245,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check(self, "kind", self.kind in get_args(SceneKind), f"one of {get_args(SceneKind)}")
-        check(self, "downscale", 1 <= self.downscale <= 64, "1 to 64")
+        check(self, "max_side", self.max_side is None or 16 <= self.max_side <= 65536, "16 to 65,536")
+        check(self, "downscale", self.downscale is None or 1 <= self.downscale <= 64, "1 to 64")
         known = self.scale is None or 0 < self.scale[2] < 1e9
         check(self, "scale", known, "two pictures, and a distance of more than 0")
         check(self, "device", self.device in get_args(Device), f"one of {get_args(Device)}")

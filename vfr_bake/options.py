@@ -23,8 +23,13 @@ class Train:
     """Folder with transforms_train.json (NeRF-synthetic), transforms.json or a COLMAP model (sparse/0), or
     `demo` for the built-in scene; a folder of photographs, a ZIP of them or a video without cameras has them
     estimated first."""
-    model: Positional[Path]
-    """The model file to write, for example model.pt."""
+    model: Positional[Path | None] = None
+    """The model file to write, for example model.pt; none with --check."""
+    check: bool = False
+    """Train nothing: look at the pictures for some ten seconds, and say what is likely to come out and what
+    to photograph in addition. Writes a page, with --json the same as data."""
+    html: Path | None = None
+    """With --check: the page to write; DATA_check.html in the current folder if not given."""
     config: TrainConfig = field(default_factory=TrainConfig)
     force: bool = False
     """Replace the model file, or the page of --check, if it exists."""

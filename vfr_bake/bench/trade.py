@@ -263,7 +263,7 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) ->
     scene = load_scene(
         config.data,
         lambda done, of: progress("reading pictures", done, of),
-        train.get("downscale", 1),
+        reader=reader_as(train),
         scale=train.get("scale"),
     )
     if not scene.test.cameras:

@@ -20,15 +20,25 @@ from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.threads import Progress
 from vfr_bake.data.world import scaled
 
-__all__ = ["PosedImages", "Scene", "load_scene", "needs_cameras", "unpacked"]
+__all__ = [
+    "PosedImages",
+    "Scene",
+    "load_scene",
+    "needs_cameras",
+    "reader_as",
+    "training_reader",
+    "unpacked",
+    "working_size",
+]
 
 
 def load_scene(
     data: str | Path,
     progress: Progress | None = None,
-    downscale: int = 1,
+    downscale: int | None = None,
     kind: SceneKind = "auto",
     scale: tuple[str, str, float] | None = None,
+    reader: PictureReader | None = None,
 ) -> Scene:
     """Load the posed pictures that `data` names.
 
@@ -37,19 +47,45 @@ def load_scene(
     the word `demo` for the built-in scene (a folder of that name is `./demo`). `progress`: called with the
     number of pictures done and to do. `downscale`: pictures are reduced by this factor along each side.
     `kind`: object or unbounded, or found from the pictures. `scale`: two pictures and the distance between
-    their cameras, which the world then has.
+    their cameras, which the world then has. `reader`: what reads the pictures, in place of `downscale`; None
+    holds all of them in memory.
 
     Raises DataError or FormatError in one line that names the file and what was expected, OutputError where
     the disk has no room for what the reader would keep there.
     """
+    reader = reader or PictureReader(WorkingSize(downscale=downscale))
     if str(data) == "demo":
         capture = demo_capture(progress=progress)
+        train, test = reader.size.of(capture.train), reader.size.of(capture.test)
+        capture = replace(capture, train=train, test=test)
     else:
         folder = unpacked(data)
-        capture = load_folder(frames_folder(folder) if is_video(folder) else folder, progress)
+        capture = load_folder(frames_folder(folder) if is_video(folder) else folder, progress, reader)
     if scale is not None:
         capture = scaled(capture, *scale)
-    return build_scene(capture, kind, downscale)
+    return build_scene(capture, kind)
+
+
+def working_size(config: TrainConfig) -> WorkingSize:
+    """The size that pictures are trained on where the disk has room for them."""
+    default = config.max_side is None and config.downscale is None
+    return WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
+
+
+def training_reader(
+    config: TrainConfig, model: Path, kept: bool, say: Callable[[str], object] | None
+) -> PictureReader:
+    """What reads pictures for the training of `model`; with `kept` it leaves them for the next
+    run."""
+    default = config.max_side is None and config.downscale is None
+    return PictureReader(working_size(config), model, on_disk=True, kept=kept, may_shrink=default, say=say)
+
+
+def reader_as(settings: dict[str, Any]) -> PictureReader:
+    """What reads pictures as they were for a training with these `settings`, as a model or an asset has
+    them."""
+    size = WorkingSize(settings.get("max_side"), settings.get("downscale"))
+    return PictureReader(size, on_disk=True)
 
 
 def unpacked(data: str | Path, progress: Progress | None = None) -> Path:

@@ -20,7 +20,8 @@ from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.orientation import Layout, is_taken_upright, read_layout
-from vfr_bake.data.files.pictures import DescribedView, read_pictures
+from vfr_bake.data.files.pictures import DescribedView
+from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -193,7 +194,7 @@ def load_colmap_folder(
                 mask_of(folder, image.name),
             )
         )
-    train, test = held_out(read_pictures(described, progress))
+    train, test = held_out((reader or PictureReader()).read(described, progress))
     return _capture(folder, described, train, test, points)
 
 

@@ -4,8 +4,8 @@ An estimation that was interrupted goes on where it was, and one of more picture
 
 Two files of records, one after the other, little-endian; a last record that is cut short does not count.
 
-- `features.bin`: stamp of the picture (16 bytes), width, height and number of features n (uint32 each),
-  thumbnail (32 x 32 bytes, grey), n points (2 float32), n descriptors (128 bytes).
+- `features.bin`: stamp of the picture (16 bytes), sharpness (float64), width, height and number of features n
+  (uint32 each), thumbnail (32 x 32 bytes, grey), n points (2 float32), n descriptors (128 bytes).
 - `matches.bin`: stamps of the two pictures, number of matches n (uint32), n pairs of indices (2 uint32).
 """
 
@@ -30,25 +30,29 @@ SIDE = 32
 STAMP = 16
 MOST_SECONDS = 30 * 24 * 3600
 """What nobody came back to for so long is deleted."""
-_LOOK = struct.Struct(f"<{STAMP}sIII")
+_LOOK = struct.Struct(f"<{STAMP}sdIII")
 _MATCHES = struct.Struct(f"<{STAMP}s{STAMP}sI")
 _BYTES_A_FEATURE, _BYTES_A_MATCH = 8 + 128, 8
 
 
-class Look(NamedTuple):
-    """What one look at a picture tells."""
+class Found(NamedTuple):
+    """What is found in one picture, turned upright."""
 
     width: int
     height: int
     features: Features
     thumbnail: np.ndarray
-    """[32, 32] uint8, grey."""
+    """[32 * 32] uint8, grey."""
+    sharpness: float
 
 
-def stamp(*files: Path) -> bytes:
-    """16 bytes that change with the path, the size or the time of change of any of the `files`."""
+def stamp(*files: Path | None) -> bytes:
+    """16 bytes that change with the path, the size or the time of change of any of the `files`; None for one
+    that is not there."""
     told = hashlib.blake2b(VERSION, digest_size=STAMP)
     for path in files:
+        if path is None:
+            continue
         found = path.stat()
         told.update(f"{path.resolve()}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
     return told.digest()
@@ -98,23 +102,23 @@ class KeptMatches:
     def _matches_path(self) -> Path:
         return self._folder / "matches.bin"
 
-    def look(self, of: bytes) -> Look | None:
+    def look(self, of: bytes) -> Found | None:
         """What was found in the picture with the stamp `of`; None if nothing is kept."""
         at = self._looks.get(of)
         if at is None:
             return None
         with self._looks_path.open("rb") as file:
             file.seek(at)
-            _, width, height, n = _LOOK.unpack(file.read(_LOOK.size))
-            thumbnail = np.frombuffer(file.read(SIDE * SIDE), np.uint8).reshape(SIDE, SIDE)
+            _, sharpness, width, height, n = _LOOK.unpack(file.read(_LOOK.size))
+            thumbnail = np.frombuffer(file.read(SIDE * SIDE), np.uint8)
             points = np.frombuffer(file.read(8 * n), "<f4").reshape(n, 2).astype(np.float64)
             sift = np.frombuffer(file.read(128 * n), np.uint8).reshape(n, 128)
-        return Look(width, height, Features(points, sift), thumbnail)
+        return Found(width, height, Features(points, sift), thumbnail, sharpness)
 
-    def keep_look(self, of: bytes, look: Look) -> None:
+    def keep_look(self, of: bytes, look: Found) -> None:
         """Keep what was found in the picture with the stamp `of`."""
         points, sift = look.features.points.astype("<f4"), look.features.sift
-        header = _LOOK.pack(of, look.width, look.height, len(points))
+        header = _LOOK.pack(of, look.sharpness, look.width, look.height, len(points))
         record = b"".join((header, look.thumbnail.tobytes(), points.tobytes(), sift.tobytes()))
         self._append(self._looks_path, self._looks, of, record)
 

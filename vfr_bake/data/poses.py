@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.misc.appdirs import AppDirs
 
 from player.cameras.colmap import MAX_FILE_BYTES
 from player.cameras.rotations import OPENGL_FROM_OPENCV
@@ -24,7 +25,7 @@ from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
-from vfr_bake.data.kept_matches import SIDE, KeptMatches, Look, stamp
+from vfr_bake.data.kept_matches import KeptMatches, stamp
 from vfr_bake.data.mapping import (
     Pair,
     Sensor,
@@ -71,7 +72,6 @@ class PoseReport:
     """Pictures a point is seen in, on average."""
     unplaced: Mapping[str, str] = field(default_factory=dict)
     """Why a picture found no place, by its name; empty where the cameras were there already."""
-
     repeated: dict[str, str] = field(default_factory=dict)
     """Pictures that were left out because another shows the same, and which."""
 
@@ -146,32 +146,72 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     pycolmap_module()  # said at once if it is missing, not after minutes
     names = [path.relative_to(place).as_posix() for path in pictures]
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
-    looks = look_at(masked, lambda done, of: progress("features", done, of))
+    known = KeptMatches.of(photos, cache_root())
+    looks = look_at(masked, known, lambda done, of: progress("features", done, of))
     repeated = _repeated(photos, looks)
     kept = [number for number in range(len(names)) if number not in repeated]
     record = EstimateRecord(True, {names[number]: names[other] for number, other in repeated.items()})
+    stamps = [stamp(*masked[number]) for number in kept]
     names, looks = [names[number] for number in kept], [looks[number] for number in kept]
     sensors, features = [look.sensor for look in looks], [look.features for look in looks]
     pairs = match_pictures(
         sensors,
         features,
         pairs_to_match(features),
-        lambda *n: progress("matches", *n),
-        known,
-        lambda i, j, matches: kept.keep_matches(stamps[i], stamps[j], matches),
+        lambda done, of: progress("matches", done, of),
+        lambda i, j: known.matches(stamps[i], stamps[j], len(features[i].points), len(features[j].points)),
+        lambda i, j, matches: known.keep_matches(stamps[i], stamps[j], matches),
     )
-    result = _placed(place, names, sensors, features, pairs, progress)
-    n_registered = result.num_reg_images() if result is not None else 0
-    if result is None or n_registered < _n_needed(len(names)):
+    models = _placed(place, names, sensors, features, pairs, progress)
+    n_registered = models[0].num_reg_images() if models else 0
+    if n_registered < _n_needed(len(names)):
         raise DataError(
             f"{photos}: cameras: expected to find those of at least {_n_needed(len(names))} of "
             f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}{ADVICE}"
         )
-    _turn_upright(result)
+    _turn_upright(models[0])
     with new_folder(model) as new:
-        result.write_binary(str(new))
+        models[0].write_binary(str(new))
         write_record(new, record)
-    return _read_report(model, photos, len(pictures))
+    known.remove()
+    reasons = why_unplaced(names, features, pairs, models)
+    return replace(_read_report(model, photos, len(pictures)), unplaced=reasons)
+
+
+def cache_root() -> Path:
+    """The user's folder of what is kept of sets of pictures whose cameras are not known yet."""
+    return Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir) / "matches"
+
+
+def why_unplaced(
+    names: Sequence[str], features: Sequence[Features], pairs: Sequence[Pair], models: Sequence[Any]
+) -> dict[str, str]:
+    """Why pictures are not in the first of the `models`, by their names."""
+    placed = _names_in(models[0])
+    partners: dict[str, set[str]] = {name: set() for name in names}
+    for pair in pairs:
+        partners[names[pair.i]].add(names[pair.j])
+        partners[names[pair.j]].add(names[pair.i])
+    reasons = {}
+    for name, found in zip(names, features, strict=True):
+        others = [len(group) for group in map(_names_in, models[1:]) if name in group]
+        if name in placed:
+            continue
+        if len(found.points) < MIN_FEATURES:
+            reasons[name] = f"blank, blurred or out of focus: {len(found.points)} features"
+        elif not partners[name]:
+            reasons[name] = "nothing in common with any other picture"
+        elif others:
+            reasons[name] = f"in a group of {others[0]} with too little in common with the others"
+        elif partners[name] & placed:
+            reasons[name] = f"too little in common with {min(partners[name] & placed)}"
+        else:
+            reasons[name] = f"something in common with {min(partners[name])} alone, which has no place either"
+    return reasons
+
+
+def _names_in(model: Any) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _turn_upright(model: Any) -> None:
@@ -190,11 +230,11 @@ def _placed(
     features: Sequence[Features],
     pairs: Sequence[Pair],
     progress: Progress,
-) -> Any:
-    """The `pycolmap.Reconstruction` of the pictures in the folder `place`, or None; if that is folded, one
-    that is not."""
+) -> list[Any]:
+    """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first; if that is
+    folded, others that are not."""
 
-    def built(some: Sequence[Pair], stage: str) -> Any:
+    def built(some: Sequence[Pair], stage: str) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
@@ -206,13 +246,13 @@ def _placed(
     def enough(models: list[Any]) -> bool:
         return bool(models) and models[0].num_reg_images() >= _n_needed(len(names))
 
-    model = built(pairs, "cameras")
-    if model is None or not n_torn(model):
-        return model
+    models = built(pairs, "cameras")
+    if not models or not n_torn(models):
+        return models
     walk = built(near_pairs(pairs), "walk")
-    if not enough(walk) or n_torn(walk) >= n_torn(model):
-        return model  # no walk
-    agreeing = agreeing_pairs(walk, names, features, pairs, lambda *n: progress("turns", *n))
+    if not enough(walk) or n_torn(walk) >= n_torn(models):
+        return models  # no walk
+    agreeing = agreeing_pairs(walk[0], names, features, pairs, lambda *n: progress("turns", *n))
     closed = built(agreeing, "cameras again")
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
@@ -298,5 +338,5 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
         n_registered,
         error_sum / max(n_points, 1),
         n_seen / max(n_points, 1),
-        repeated,
+        repeated=repeated,
     )

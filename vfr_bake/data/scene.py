@@ -67,7 +67,7 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     """
     train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
     _check_cameras(capture.name, train.cameras)
-    has_alpha = not all(train.opaque(number) for number in range(len(train.cameras)))
+    has_alpha = not capture.masked and not all(train.opaque(number) for number in range(len(train.cameras)))
     some = _spread(train)
     unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(some))
     if unbounded:

@@ -28,7 +28,9 @@ class RenderedView:
     rgb: np.ndarray
     """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
     photograph: np.ndarray
-    """[height, width, 3] float32 in [0, 1], over the same background."""
+    """[height, width, 3] float32 in [0, 1], over the same background; as rendered where it is masked."""
+    seen: float = 1.0
+    """Share of the pixels that are scored which is not masked."""
     first_column: int = 0
     """Columns from this one on are scored: on those before it the exposure was fitted."""
 
@@ -38,7 +40,7 @@ class RenderedView:
         Raises ShapeError: they are smaller than SSIM's window.
         """
         rgb, photograph = self.rgb[:, self.first_column :], self.photograph[:, self.first_column :]
-        return score_view(self.name, rgb, photograph, lpips)
+        return score_view(self.name, rgb, photograph, lpips, self.seen)
 
 
 def render_views(
@@ -52,16 +54,22 @@ def render_views(
     if 0 < n_views < len(chosen):
         chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
     for index in chosen:
-        camera, rgba = views.cameras[index], views.images[index]
+        camera, rgba = views.cameras[index], views.images[int(index)]
         colours, opacity = render_rays(model.field, model.sampler, *camera.rays())
         first_column = 0
         if model.exposure is not None:
             first_column = camera.width // 2
-            left = np.flatnonzero(np.arange(len(opacity)) % camera.width < first_column)
+            learned = np.arange(len(opacity)) % camera.width < first_column
+            left = np.flatnonzero(learned & (rgba[..., 3].reshape(-1) == 255) if masked else learned)
             gains, offsets = fitted(colours[left], opacity[left], rgba.reshape(-1, 4)[left])
             colours = (colours * gains + opacity[:, None] * offsets).clip(0, opacity[:, None])
         rgb = (colours + (1 - opacity[:, None]) * model.background).reshape(camera.height, camera.width, 3)
-        yield RenderedView(camera.name, rgb, over_background(rgba, model.background), first_column)
+        photograph, seen = over_background(rgba, model.background), 1.0
+        if masked:
+            opaque = rgba[..., 3] == 255
+            photograph = np.where(opaque[..., None], photograph, rgb)
+            seen = float(opaque[:, first_column:].mean())
+        yield RenderedView(camera.name, rgb, photograph, seen, first_column)
 
 
 def evaluate(
@@ -75,5 +83,5 @@ def evaluate(
 
     Raises ShapeError: a picture is smaller than SSIM's window.
     """
-    for view in render_views(model, views, n_views):
+    for view in render_views(model, views, n_views, masked):
         yield view.score(lpips)

@@ -93,7 +93,7 @@ class Pixels(NamedTuple):
         poses = self.poses[view]
         return x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
 
-    def places(self, view: Any, row: Any, column: Any) -> tuple[Any, Any]:
+    def shares(self, view: Any, row: Any, column: Any) -> tuple[Any, Any]:
         """Shares [n_rays] of the width and of the height at the centres of pixels of the pictures `view`."""
         return (column + 0.5) / self.widths[view], (row + 0.5) / self.heights[view]
 
@@ -155,7 +155,7 @@ class PixelSampler:
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator).numpy()
         index += np.searchsorted(self._n_before, index, side="right")
         view = np.searchsorted(pixels.ends, index, side="right")
-        row, column = np.divmod(index - pixels.starts[view], pixels.widths[view])
+        row, column = np.divmod(pixels.numbers(view, index), pixels.widths[view])
         row, column = row.astype(np.float32), column.astype(np.float32)
         rays_d = pixels.directions(view, row, column)
         rays_d /= np.sqrt((rays_d * rays_d).sum(axis=-1, keepdims=True))
@@ -164,9 +164,9 @@ class PixelSampler:
         return RayBatch(
             rays_o=torch.from_numpy(pixels.poses[view, :, 3]),
             rays_d=torch.from_numpy(rays_d),
-            rgba=torch.from_numpy(pixels.rgba[index] * np.float32(1 / 255)),
+            rgba=torch.from_numpy(rgba),
             pictures=torch.from_numpy(view),
-            places=torch.from_numpy(np.stack(pixels.places(view, row, column), axis=1).astype(np.float32)),
+            places=torch.from_numpy(np.stack(pixels.shares(view, row, column), axis=1).astype(np.float32)),
         )
 
 
@@ -185,15 +185,17 @@ class DevicePixelSampler(PixelSampler):
         index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator, device=device)
         index += torch.searchsorted(self._n_before, index, right=True)
         view = torch.searchsorted(pixels.ends, index, right=True)
-        inside, width = index - pixels.starts[view], pixels.widths[view]
-        row, column = inside // width, inside % width
+        number, width = pixels.numbers(view, index), pixels.widths[view]
+        row, column = number // width, number % width
         rays_d = pixels.directions(view, row, column)
+        rgba = torch.ones((n_rays, 4), device=device)
+        rgba[:, : pixels.rgba.shape[1]] = pixels.rgba[index] * (1 / 255)
         return RayBatch(
             rays_o=pixels.poses[view, :, 3],
             rays_d=torch.nn.functional.normalize(rays_d, dim=-1),
-            rgba=pixels.rgba[index] * (1 / 255),
+            rgba=rgba,
             pictures=view,
-            places=torch.stack(pixels.places(view, row, column), dim=1).float(),
+            places=torch.stack(pixels.shares(view, row, column), dim=1).float(),
         )
 
 

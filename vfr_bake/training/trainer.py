@@ -23,6 +23,7 @@ from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
+from vfr_bake.training.captures.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.optimiser import (
@@ -36,7 +37,6 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
-from vfr_bake.training.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 MINUTES = {False: 9.4, True: 12.0}
@@ -343,6 +343,7 @@ class Trainer:
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
             "witnesses": witness_content(self.witnesses),
+            "pixels": self._pixels.position,
             "effects": self.effects.state(),
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
@@ -358,6 +359,7 @@ class Trainer:
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
         self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
+        self._pixels.restore(state["pixels"])
         self.effects.restore(state["effects"])
 
 

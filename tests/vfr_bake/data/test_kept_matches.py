@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.features import Features
-from vfr_bake.data.kept_matches import MOST_SECONDS, SIDE, KeptMatches, Look, stamp
+from vfr_bake.data.kept_matches import MOST_SECONDS, SIDE, Found, KeptMatches, stamp
 
 A, B, C = (bytes([number]) * 16 for number in range(3))
 
 
-def made(seed: int, n: int) -> Look:
+def made(seed: int, n: int) -> Found:
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 4000, (n, 2)).astype(np.float32).astype(np.float64)
     features = Features(points, rng.integers(0, 256, (n, 128), np.uint8))
-    return Look(4000, 3000, features, rng.integers(0, 256, (SIDE, SIDE), np.uint8))
+    return Found(4000, 3000, features, rng.integers(0, 256, SIDE * SIDE, np.uint8), rng.uniform())
 
 
-def same(a: Look | None, b: Look) -> bool:
+def same(a: Found | None, b: Found) -> bool:
     return (
         a is not None
-        and (a.width, a.height) == (b.width, b.height)
+        and (a.width, a.height, a.sharpness) == (b.width, b.height, b.sharpness)
         and np.array_equal(a.thumbnail, b.thumbnail)
         and np.array_equal(a.features.points, b.features.points)
         and np.array_equal(a.features.sift, b.features.sift)
@@ -70,7 +70,7 @@ def test_a_record_that_is_cut_short_is_left_out_wherever_it_is_cut(folder: Path,
 def test_a_number_that_cannot_be_ends_the_file(folder: Path):
     path = folder / "features.bin"
     content = bytearray(path.read_bytes())
-    content[24:28] = b"\xff" * 4
+    content[32:36] = b"\xff" * 4
     path.write_bytes(content)
     assert KeptMatches(folder).look(A) is None
     assert path.stat().st_size == 0

@@ -172,7 +172,7 @@ def test_a_model_that_cannot_be_finished_leaves_none(can, tmp_path: Path, monkey
             Path(folder, "cameras.bin").write_bytes(b"x")
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(poses, "map_pictures", lambda *_: HalfWritten())
+    monkeypatch.setattr(poses, "map_pictures", lambda *_: [HalfWritten()])
     monkeypatch.setattr(poses, "_turn_upright", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
         estimate_cameras(tmp_path, quiet)
@@ -196,7 +196,9 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
         estimate_cameras(photos, interrupt)
     shutil.copy(sorted(can[0].glob("*.jpg"))[5], photos)
     looked, matched = [], []
-    monkeypatch.setattr(poses, "find_features", lambda rgba: looked.append(1) or find_features(rgba))
+    monkeypatch.setattr(
+        "vfr_bake.data.files.looks.find_features", lambda rgba: looked.append(1) or find_features(rgba)
+    )
     monkeypatch.setattr(mapping, "match", lambda a, b: matched.append(1) or match(a, b))
     assert estimate_cameras(photos, quiet).n_registered == 6
     assert (len(looked), len(matched)) == (1, 5)  # only what the new picture brings

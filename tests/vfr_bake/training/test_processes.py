@@ -13,6 +13,7 @@ import pytest
 PROGRAM = """
 import json, sys
 import numba, torch
+from dataclasses import replace
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
@@ -23,7 +24,8 @@ kind, out, n_threads = sys.argv[1], sys.argv[2], int(sys.argv[3])
 torch.set_num_threads(n_threads)
 numba.set_num_threads(n_threads)
 processes = Processes.from_environment()
-scene = build_scene(demo_capture(size=32, n_train=12, n_test=2), kind)
+# What is transparent is learned from in contracted space, too: a few steps show it.
+scene = replace(build_scene(demo_capture(size=32, n_train=12, n_test=2), kind), has_alpha=True, masked=False)
 field = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
 config = TrainConfig(device="cpu", steps=40, pilot_steps=10, batch_samples=2048, batch_rays=64,
                      field=field, occupancy_resolution=32)

@@ -17,10 +17,12 @@ from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
+from vfr_bake.data.files.archives import is_archive, unpack
+from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE, is_video, list_pictures
+from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE, is_video
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import Progress
@@ -184,6 +186,8 @@ def _listed(data: str) -> _Set:
     folder = Path(data)
     if data == "demo":
         raise ConfigError("demo: expected a folder of pictures or a video to check, got the built-in scene")
+    if is_archive(folder):
+        folder = unpack(folder, lambda done, of: None)
     if is_video(folder):
         folder = extract_frames(folder, lambda done, of: None)
     if folder.is_dir() and (has_transforms(folder) or colmap_folder(folder) is not None):
@@ -195,21 +199,25 @@ def _listed(data: str) -> _Set:
         kind = "transforms.json" if has_transforms(folder) else "COLMAP"
         found: list[bool | None] = [True] * len(paths)
         if kind == "COLMAP":
-            others = [path for path in list_pictures(folder) if path not in set(paths)]
-            paths, names = paths + others, names + [path.name for path in others]
+            place, there = find_pictures(folder)
+            others = [path for path in there if path not in set(paths)]
+            names += [path.relative_to(place).as_posix() for path in others]
+            paths = paths + others
             found += [False] * len(others)
         return _Set(kind, names, paths, found, cameras)
-    paths = list_pictures(folder) if folder.is_dir() else []
+    place, paths = find_pictures(folder)
     if not paths:
         raise DataError(f"{folder}: expected a folder of pictures or a video, got none")
-    return _Set("none yet", [path.name for path in paths], paths, [None] * len(paths))
+    return _Set(
+        "none yet", [path.relative_to(place).as_posix() for path in paths], paths, [None] * len(paths)
+    )
 
 
 def _size(path: Path) -> tuple[int, int] | None:
     from vfr_bake.data.files.pictures import picture_size
 
     try:
-        return picture_size(path)
+        return picture_size(path, upright=True)
     except DataError:
         return None
 

@@ -60,8 +60,8 @@ class Shared(NamedTuple):
 def look(path: Path) -> Look:
     """Look at one picture. Raises DataError, MissingExtraError."""
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it", "train")
-    size = picture_size(path)
-    rgba = read_picture(path, _least(size))
+    size = picture_size(path, upright=True)
+    rgba = read_picture(path, True, _least(size))
     small = shrunk(cv2, rgba, SHARPNESS_SIDE)
     grey = cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY)
     seen = small[..., 3] > 127

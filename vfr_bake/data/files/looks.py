@@ -16,10 +16,8 @@ from vfr_bake.data.features import Features, find_features
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.pictures import opencv, read_picture, sharpness
+from vfr_bake.data.kept_matches import SIDE, Found, KeptMatches, stamp
 from vfr_bake.data.mapping import Sensor
-
-THUMBNAIL = 32
-"""Pixels of either side of a thumbnail."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +31,38 @@ class Look:
     sharpness: float
 
 
-def look_at(pictures: Sequence[tuple[Path, Path | None]], progress: threads.Progress | None) -> list[Look]:
-    """What is seen in each picture; `pictures`: each with its mask, where it has one. Raises DataError."""
+def look_at(
+    pictures: Sequence[tuple[Path, Path | None]], kept: KeptMatches, progress: threads.Progress | None
+) -> list[Look]:
+    """What is seen in each picture; `pictures`: each with its mask, where it has one; `kept`: what is known
+    of some of them, to which the others are added. Raises DataError."""
 
     def look(picture: tuple[Path, Path | None]) -> Look:
         path, mask = picture
-        rgba = read_picture(path, upright=True)
-        if mask is not None:
-            rgba = apply_mask(rgba, path, mask, upright=True)
-        grey = Image.fromarray(rgba).convert("L").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
-        return Look(
-            sensor_of(path, rgba.shape[1], rgba.shape[0]),
-            find_features(rgba),
-            np.asarray(grey, np.float32).reshape(-1),
-            sharpness(opencv(f"{path}: picture: expected OpenCV to look at it"), rgba[..., :3]),
-        )
+        of = stamp(path, mask)
+        found = kept.look(of)
+        if found is None:
+            found = _found_in(path, mask)
+            kept.keep_look(of, found)
+        sensor = sensor_of(path, found.width, found.height)
+        return Look(sensor, found.features, found.thumbnail.astype(np.float32), found.sharpness)
 
     return threads.in_threads(look, pictures, progress)
+
+
+def _found_in(path: Path, mask: Path | None) -> Found:
+    rgba = read_picture(path, upright=True)
+    if mask is not None:
+        rgba = apply_mask(rgba, path, mask, upright=True)
+    grey = Image.fromarray(rgba).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
+    cv2 = opencv(f"{path}: picture: expected OpenCV to look at it")
+    return Found(
+        rgba.shape[1],
+        rgba.shape[0],
+        find_features(rgba),
+        np.asarray(grey).reshape(-1),
+        sharpness(cv2, rgba[..., :3]),
+    )
 
 
 def sensor_of(path: Path, width: int, height: int) -> Sensor:

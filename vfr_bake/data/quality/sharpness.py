@@ -51,13 +51,13 @@ def blur(image: np.ndarray) -> float:
     height, width = (side // every * every for side in image.shape[:2])
     if min(height, width) < SMALLEST * every:
         return 0.0
-    grey = image[:height, :width, :3].astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) / 255
+    grey = image[:height, :width, :3].astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / 255
     if image.shape[2] == 4:
         grey = grey * (image[:height, :width, 3] / np.float32(255))
     small = grey.reshape(height // every, every, width // every, every).mean(axis=(1, 3))
     if small.min() == small.max():
         return 0.0  # a plain picture has nothing to be blurred
-    return np.asarray(blur_effect(small, h_size=WINDOW)).item()
+    return float(np.max(blur_effect(small, h_size=WINDOW)))
 
 
 def blurred(blurs: Sequence[float]) -> list[int]:

@@ -19,7 +19,7 @@ from player.errors import OutputError
 from player.files.memory import allowed_bytes
 from player.files.replace import PART
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.files.pictures import DescribedView, picture_size
+from vfr_bake.data.files.pictures import DescribedView, viewed_size
 from vfr_bake.data.store import cache
 from vfr_bake.data.store.stored import Layout, in_order, write_picture
 from vfr_bake.data.store.working import WorkingSize
@@ -75,7 +75,7 @@ class PictureReader:
 
         Raises DataError (a picture), OutputError (a disk without room for them; what is missing).
         """
-        sizes = in_threads(lambda view: picture_size(view.path), described, None)
+        sizes = in_threads(viewed_size, described, None)
         if not self._on_disk or self._n_bytes(sizes, 4) <= held_bytes():
             self._tell(sizes, "")
             return self._held(described, sizes, progress)

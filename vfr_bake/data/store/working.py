@@ -12,15 +12,16 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
     DescribedView,
     opencv,
-    picture_size,
     premultiplied,
     read_picture,
     reduced,
     straight,
     undistort,
+    viewed_size,
 )
 
 MAX_SIDE = 1600
@@ -62,11 +63,14 @@ class WorkingSize:
         return max(size[0] * size[1] * BYTES_DECODED, undone)
 
     def read(self, view: DescribedView) -> tuple[Camera, np.ndarray]:
-        """A picture as [height, width, 4] uint8 at the working size, its lens undone, with its pinhole
-        camera. Raises DataError."""
-        width, height = picture_size(view.path)
+        """A picture as [height, width, 4] uint8 at the working size, transparent where it is masked, its lens
+        undone, with its pinhole camera. Raises DataError."""
+        width, height = viewed_size(view)
         target = self.size(width, height)
-        image = read_picture(view.path, None if self.downscale is not None else target)
+        whole = self.downscale is not None or view.mask is not None
+        image = read_picture(view.path, view.upright, None if whole else target)
+        if view.mask is not None:
+            image = apply_mask(image, view.path, view.mask, view.upright)
         # A JPEG decoder that leaves out the finest frequencies gives half, a quarter or an eighth, rounded
         # up: the camera is divided by the whole number, and what is rounded up repeats the picture's edge.
         step = max(1, round(width / image.shape[1]))

@@ -17,10 +17,10 @@ from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.features import find_features
 from vfr_bake.data.files.masks import apply_mask, mask_of
+from vfr_bake.training.captures.unmasked import draw_unmasked
 from vfr_bake.training.metrics import score_view
 from vfr_bake.training.rays import PixelSampler
 from vfr_bake.training.trainer import Trainer
-from vfr_bake.training.unmasked import draw_unmasked
 
 
 def masked_folder(folder: Path, share: float = 0.5) -> Path:

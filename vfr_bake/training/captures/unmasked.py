@@ -8,8 +8,11 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from player.errors import TrainingError
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.rays import RayBatch
+
+MOST_DRAWS = 100
 
 
 class Draws(Protocol):
@@ -21,10 +24,14 @@ class Draws(Protocol):
 def draw_unmasked(sampler: Draws, n_rays: int) -> RayBatch:
     """`n_rays` random pixels of those that are opaque; what is masked is drawn again until none is left.
 
-    Some of the pixels have to be opaque (`vfr_bake.data.files.masks.check_masked`).
+    Some of the pixels have to be opaque (`vfr_bake.data.files.masks.check_masked`). Raises TrainingError:
+    none of MOST_DRAWS times as many were.
     """
-    batch = _opaque(sampler.draw(n_rays))
+    batch, n_draws = _opaque(sampler.draw(n_rays)), 1
     while (missing := n_rays - len(batch.rgba)) > 0:
+        if n_draws == MOST_DRAWS and not len(batch.rgba):
+            raise TrainingError("training pictures: expected pixels that are not masked, found none")
+        n_draws += 1
         more = _opaque(sampler.draw(n_rays))
         batch = RayBatch(
             *(
@@ -37,7 +44,7 @@ def draw_unmasked(sampler: Draws, n_rays: int) -> RayBatch:
 
 def _opaque(batch: RayBatch) -> RayBatch:
     seen = batch.rgba[:, 3] == 1
-    return RayBatch(batch.rays_o[seen], batch.rays_d[seen], batch.rgba[seen])
+    return RayBatch(*(rows[seen] for rows in vars(batch).values()))
 
 
 def unmasked_witnesses(witnesses: Witnesses) -> Witnesses:
