@@ -42,7 +42,8 @@ def test_the_commands_and_the_python_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     seen = set()
-    for line in blocks("bash")[0].splitlines():
+    (commands,) = (block for block in blocks("bash") if "DATA" in block)
+    for line in commands.splitlines():
         words = [
             {"DATA": str(small_data), "transforms_test.json": str(small_data / "transforms_test.json")}.get(
                 word, word
