@@ -16,7 +16,6 @@ from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.files.masks import check_masked
-from vfr_bake.data.files.pictures import reduced
 
 BORDER = 2
 """Pixels along a picture's edge that tell a plain background."""
@@ -54,7 +53,7 @@ class Scene:
     """Whether pixels that are not opaque are masked: they are neither drawn nor scored."""
 
 
-def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) -> Scene:
+def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     """A `Scene` out of pictures with cameras in the world: finds its kind and moves the cameras to the model
     frame, which the training views alone decide.
 
@@ -65,7 +64,7 @@ def build_scene(capture: Capture, kind: SceneKind = "auto", downscale: int = 1) 
     >>> scene.has_alpha, scene.unbounded, scene.train.images[0].shape
     (True, False, (16, 16, 4))
     """
-    train, test = reduced(capture.train, downscale), reduced(capture.test, downscale)
+    train, test = capture.train, capture.test
     _check_cameras(capture.name, train.cameras)
     has_alpha = not capture.masked and not all(train.opaque(number) for number in range(len(train.cameras)))
     some = _spread(train)

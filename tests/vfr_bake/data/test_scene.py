@@ -11,6 +11,7 @@ from player.errors import DataError, ShapeError
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
 from vfr_bake.data.scene import NEAR_CAMERA, build_scene
+from vfr_bake.data.store.working import WorkingSize
 
 
 def test_rays_are_the_same_rays_in_both_frames():
@@ -117,9 +118,9 @@ def test_parallel_views_still_have_a_frame():
 
 
 def test_downscaled_pictures_show_the_same_through_the_same_lens():
-    train, test = demo_views(25, 3, 1)
-    scene = build_scene(Capture("a", train, test), downscale=2)
-    camera, image = scene.train.cameras[0], scene.train.images[0]
+    train, _ = demo_views(25, 3, 1)
+    smaller = WorkingSize(downscale=2).of(train)
+    camera, image = smaller.cameras[0], smaller.images[0]
     assert (camera.width, camera.height) == (12, 12) == image.shape[:2]
     assert camera.fx == train.cameras[0].fx / 2 and camera.cx == train.cameras[0].cx / 2
     block = train.images[0][4:6, 6:8].reshape(-1, 4).astype(float)
@@ -127,4 +128,4 @@ def test_downscaled_pictures_show_the_same_through_the_same_lens():
     rgb = (block[:, :3] * block[:, 3:]).sum(axis=0) / max(block[:, 3].sum(), 1)
     np.testing.assert_allclose(image[2, 3], [*rgb, alpha], atol=1)
     with pytest.raises(DataError, match="downscale: expected at most 25, got 26"):
-        build_scene(Capture("a", train, test), downscale=26)
+        WorkingSize(downscale=26).of(train)

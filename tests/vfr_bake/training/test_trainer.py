@@ -19,6 +19,7 @@ from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.store import stored
 from vfr_bake.data.store.stored import Layout, in_order, map_pictures, write_picture
+from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
@@ -169,7 +170,10 @@ def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch:
     """Every picture's pixels carry their number, and what the steps were given is looked through."""
     capture = demo_capture(size=48, n_train=20, n_test=2)
     unbounded_kind: SceneKind = "unbounded" if kind == "unbounded" else "object"
-    scene = build_scene(capture, unbounded_kind, 2 if kind == "downscale" else 1)
+    if kind == "downscale":
+        size = WorkingSize(downscale=2)
+        capture = replace(capture, train=size.of(capture.train), test=size.of(capture.test))
+    scene = build_scene(capture, unbounded_kind)
     side = scene.train.images[0].shape[0]
     numbers = np.arange(20 * side * side).reshape(20, side, side)
     alpha = np.full_like(numbers, 255 if kind == "opaque" else 200)
