@@ -37,7 +37,7 @@ def test_changing_exposure_is_found_learned_and_kept(tmp_path: Path) -> None:
     learned = trainer.witnesses.learned()
     gains = changed_exposure(demo_views(8, 40, 1)[0], 1, 0.15)[1][learned]
     found = trainer.effects.correction.gains.numpy()
-    assert np.corrcoef(found[:, 1], gains[:, 1])[0, 1] > 0.5
+    assert np.corrcoef(found[:, 1], gains[:, 1])[0, 1] > 0.7, "0.82 to 0.86 with three seeds"
     np.testing.assert_allclose(found.mean(axis=0), 1, rtol=1e-9)
 
     model = trained_model(trainer, scene, {})
