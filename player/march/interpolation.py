@@ -36,7 +36,7 @@ class Agreement(NamedTuple):
     """In each channel, 0..1, over what is behind; over black if that is transparent."""
     opacity: np.float32
     depth: np.float32
-    """Of the nearest one's depth. Pixels that are all fainter than `opacity` may lie anywhere."""
+    """As a share of the nearest one's depth. Pixels that are all fainter than `opacity` may lie anywhere."""
 
 
 class Stage(NamedTuple):
@@ -137,5 +137,5 @@ def _spread(values: np.ndarray) -> np.ndarray:
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Of four [4, ...]."""
+    """The mean of four [4, ...]."""
     return ((values[0] + values[1]) + (values[2] + values[3])) * np.float32(0.25)

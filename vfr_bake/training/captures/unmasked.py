@@ -13,6 +13,7 @@ from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.rays import RayBatch
 
 MOST_DRAWS = 100
+"""So many batches without an opaque pixel mean that there is none."""
 
 
 class Draws(Protocol):
