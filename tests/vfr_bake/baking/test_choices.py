@@ -14,10 +14,10 @@ from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.held_out import Shown
-from vfr_bake.baking.witness_loss import Loss
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.witness_loss import Loss
 
 MAX_MB = 1.0
 
