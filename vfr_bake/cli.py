@@ -240,9 +240,11 @@ def _preview(options: Any, scene: Scene) -> Preview:
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
+    from vfr_bake.training.expectation import EXPECTED_AT, TIMED_FROM
 
     last = None
     interrupted = False
+    timed_from = None
     saved = time.monotonic()
     with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
@@ -259,6 +261,10 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                     last.progress,
                     f"loss {error:.5f}  PSNR {_decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
                 )
+                if trainer.next_step == TIMED_FROM:
+                    timed_from = last.seconds
+                if trainer.next_step == EXPECTED_AT and timed_from is not None:
+                    _expect(trainer, (last.seconds - timed_from) / (EXPECTED_AT - TIMED_FROM), bar)
                 if preview is not None:
                     preview.update(trainer)
                 due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
@@ -275,10 +281,23 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
         "effects": trainer.effects.figures(),
         "steps": trainer.next_step,
         "seconds": round(trainer.seconds, 1),
+        "ended_early": trainer.duration.ended_early,
         "skipped_steps": trainer.n_bad_steps,
         "training_psnr": round(_decibels(error), 3),
         "interrupted": interrupted,
     }
+
+
+def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
+    """Say what is likely to come out, on a line of its own."""
+    from vfr_bake.training.expectation import expectation
+
+    psnr = trainer.witness_psnr() if trainer.processes.first and trainer.device.type == "cpu" else None
+    if psnr is not None:
+        bar.close()
+        unbounded = trainer.field.config.unbounded
+        text = expectation(psnr, seconds_a_step, trainer.pace.steps, trainer.minutes, unbounded)
+        print(f"vfr-train: {text}", file=sys.stderr)
 
 
 def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
@@ -286,10 +305,11 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
     if "test_psnr" in figures:
         tested = f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
     skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
+    flat = ", which is all that pays" if figures["ended_early"] else ""
     write_result(
         options.json,
         figures | {"model": str(options.model)},
-        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{skipped}{tested}"
+        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{flat}{skipped}{tested}"
         + (" (stopped early)" if interrupted else ""),
     )
 

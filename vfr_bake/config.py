@@ -3,6 +3,7 @@ units."""
 
 from __future__ import annotations
 
+import math
 from argparse import ArgumentTypeError
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ Compositing = Literal["features", "colour"]
 Activation = Literal["gelu", "relu"]
 ViewEncoding = Literal["sh-features", "sh"]
 Device = Literal["auto", "cpu", "cuda"]
+Effort = Literal["draft", "good", "best"]
 CHOICES = {
     "compositing": get_args(Compositing),
     "activation": get_args(Activation),
@@ -154,7 +156,7 @@ class DeviceSettings:
     """Settings of a training that follow from the device where they are not given: the number of steps, the
     size of a batch, and the learning rates. `TrainConfig` says what each of them means."""
 
-    steps: int = 60_000
+    steps: int = 1_000_000
     batch_samples: int = 4096
     batch_rays: int = 512
     max_rays: int = 16_384
@@ -182,6 +184,10 @@ GPU_STEPS = {False: 20_000, True: 40_000}
 """The paper's number of steps, by whether the scene is unbounded."""
 
 
+EFFORT_MINUTES = {"draft": (2.0, 2.0), "good": (10.0, 12.0), "best": (60.0, 60.0)}
+"""Minutes of training on a CPU at most, of an object and of an unbounded scene, by the effort."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Settings of `vfr-train`. What is None follows from the device: the defaults of a CPU are made for two
@@ -202,12 +208,15 @@ class TrainConfig:
     """Two pictures and how far apart their cameras were, for example `IMG_1.jpg IMG_9.jpg 2.5`: the world is
     then in the unit of that distance, metres for glTF and USD, in every export. Pictures alone do not tell
     how large anything is."""
+    effort: Effort = "good"
+    """How long a training may take on a CPU: draft 2 minutes, good 10 (scenes 12), best 60. It ends earlier
+    when the error on pixels that it does not learn from is flat. A GPU takes its steps, a draft 2 minutes."""
     steps: int | None = None
-    """Optimiser steps at most; CPU 60,000, GPU 20,000 (scenes 40,000) with far larger batches, as in the
-    paper. Training ends here or when the minutes are over."""
+    """Optimiser steps: so many are taken if the minutes allow it. CPU: as many as they allow; GPU: 20,000
+    (scenes 40,000) with far larger batches, as in the paper."""
     minutes: float | None = None
-    """Wall-clock minutes at most; the learning-rate schedule runs on whichever of steps and minutes is
-    further. CPU: objects 9.4, scenes 12; GPU: no limit."""
+    """Minutes at most, instead of those of the effort; the learning-rate schedule runs on whichever of steps
+    and minutes is further."""
     batch_samples: int | None = None
     """Objects: samples along rays in a batch; GPU 262,144, CPU 4,096, because the time of a CPU step
     grows with it, and many small steps teach more than few large ones: the same 25 million samples gave lego
@@ -249,6 +258,7 @@ class TrainConfig:
         check(self, "downscale", self.downscale is None or 1 <= self.downscale <= 64, "1 to 64")
         known = self.scale is None or 0 < self.scale[2] < 1e9
         check(self, "scale", known, "two pictures, and a distance of more than 0")
+        check(self, "effort", self.effort in get_args(Effort), f"one of {get_args(Effort)}")
         check(self, "device", self.device in get_args(Device), f"one of {get_args(Device)}")
         check(self, "minutes", self.minutes is None or self.minutes > 0, "more than 0")
         check(self, "pilot_steps", self.pilot_steps >= 0, "at least 0")
@@ -259,6 +269,18 @@ class TrainConfig:
         check(self, "eval_views", self.eval_views is None or self.eval_views >= 0, "at least 0")
         check(self, "checkpoint_minutes", self.checkpoint_minutes > 0, "more than 0")
         self.for_device("cpu", False)  # so that what is out of range is refused before pictures are read
+
+    def minutes_for(self, device: str, unbounded: bool) -> float:
+        """Minutes of training at most on `device` ("cpu" or "cuda").
+
+        >>> TrainConfig().minutes_for("cpu", True), TrainConfig(effort="draft").minutes_for("cuda", True)
+        (12.0, 2.0)
+        """
+        if self.minutes is not None:
+            return self.minutes
+        if device == "cuda" and self.effort != "draft":
+            return math.inf
+        return EFFORT_MINUTES[self.effort][unbounded]
 
     def for_device(self, device: str, unbounded: bool) -> DeviceSettings:
         """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.

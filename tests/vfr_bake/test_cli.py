@@ -22,14 +22,13 @@ from PIL import Image
 from player.asset.asset import Asset
 from player.errors import DataError
 from vfr_bake.cli import EVAL_VIEWS, bake_main, eval_main, train_main
-from vfr_bake.config import TrainConfig
+from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import PosedImages
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.evaluation import RenderedView
 from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 from vfr_bake.training.model_file import Model, load_model, save_model
-from vfr_bake.training.trainer import MINUTES
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -73,11 +72,12 @@ def test_the_help_names_the_defaults_that_hold(
     said = re.sub(r"[\s│]+", "", capsys.readouterr().out)
     cpu, gpu = (TrainConfig().for_device(device, False) for device in ("cpu", "cuda"))
     scenes = TrainConfig().for_device("cuda", True)
+    draft, good, best = EFFORT_MINUTES.values()
     assert cpu.grid_rate == gpu.grid_rate
     for text in (
         f"Objects {EVAL_VIEWS[False]}, scenes {EVAL_VIEWS[True]}, a view of which",
-        f"CPU: objects {MINUTES[False]:g}, scenes {MINUTES[True]:g}; GPU",
-        f"CPU {cpu.steps:,}, GPU {gpu.steps:,} (scenes {scenes.steps:,})",
+        f"GPU: {gpu.steps:,} (scenes {scenes.steps:,})",
+        f"draft {draft[0]:g} minutes, good {good[0]:g} (scenes {good[1]:g}), best {best[0]:g}.",
         f"GPU {gpu.batch_samples:,}, CPU {cpu.batch_samples:,},",
         f"GPU {gpu.batch_rays:,}, CPU {cpu.batch_rays:,},",
         f"GPU {gpu.max_rays:,}, CPU {cpu.max_rays:,}.",

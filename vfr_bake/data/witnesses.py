@@ -11,10 +11,13 @@ on pixels of the training split that are kept apart before training begins, of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from player.cameras.camera import Camera
+from player.march.pixels import rays_of_pixels
 from vfr_bake.data.capture import PosedImages
 
 N_WITNESSES = 60_000
@@ -47,6 +50,23 @@ class Witnesses:
     def learned(self) -> np.ndarray:
         """[n_learned] int64, ascending: the views that training draws from."""
         return np.setdiff1d(np.arange(len(self.counts)), self.whole)
+
+    def rays(self, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions of the witnesses' rays, [n_witnesses, 3] float32 each, in the frame of
+        the `cameras`, one for each training view."""
+        of_views = np.split(self.pixels, np.cumsum(self.counts)[:-1])
+        rays = []
+        for camera, pixels in zip(cameras, of_views, strict=True):
+            rows, columns = np.divmod(pixels, camera.width)
+            rays.append(rays_of_pixels(camera, columns, rows, 0.0))
+        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
+        return rays_o, rays_d
+
+    def some(self, n: int) -> Witnesses:
+        """About `n` of the witnesses, spread evenly, or all if there are fewer."""
+        kept = np.arange(0, len(self.pixels), max(1, len(self.pixels) // n))
+        counts = np.bincount(self.views()[kept], minlength=len(self.counts)).astype(np.int32)
+        return Witnesses(counts, self.pixels[kept], self.rgba[kept], self.whole)
 
 
 def choose_witnesses(views: PosedImages) -> Witnesses:

@@ -14,8 +14,8 @@ from vfr_bake.training.tensor_files import read_tensors, write_tensors
 from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-checkpoint"
-VERSION = [1, 2]
-LENGTH_SETTINGS = {"steps", "minutes", "eval_views", "checkpoint_minutes"}
+VERSION = [1, 3]
+LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that goes on."""
 
 

@@ -26,7 +26,6 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import parse_transforms, transforms_cameras, write_cameras
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
-from player.march.pixels import rays_of_pixels
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
@@ -111,13 +110,7 @@ class Model:
             raise ConfigError(
                 "model: witnesses: expected some, got none: it was trained before there were any"
             )
-        of_views = np.split(self.witnesses.pixels, np.cumsum(self.witnesses.counts)[:-1])
-        rays = []
-        for camera, pixels in zip(self._in_model_frame(), of_views, strict=True):
-            rows, columns = np.divmod(pixels, camera.width)
-            rays.append(rays_of_pixels(camera, columns, rows, 0.0))
-        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
-        return rays_o, rays_d
+        return self.witnesses.rays(self._in_model_frame())
 
     def neutral_witnesses(self) -> Witnesses | None:
         """The witnesses with the colours that the field should have, whatever their picture's exposure."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,6 +26,7 @@ from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.captures.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
+from vfr_bake.training.duration import Duration
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.optimiser import (
     BETAS,
@@ -37,10 +39,10 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
+from vfr_bake.training.witness_errors import WitnessErrors
+from vfr_bake.training.witness_loss import WitnessLoss
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
-MINUTES = {False: 9.4, True: 12.0}
-"""Training time on a CPU by whether the scene is unbounded, where none is asked for."""
 SOLID = 0.9
 """Opacity above which the exposure of a picture is looked at."""
 MOST_BAD_STEPS = 20
@@ -107,9 +109,6 @@ class Trainer:
         self._field.grid.backend = self._backend
         self.pilot = Pilot(self._field.config).to(self.device)
         self.n_bad_steps = 0
-        # A GPU is done with its steps in minutes.
-        minutes = MINUTES[scene.unbounded] if self.device.type == "cpu" else float("inf")
-        self._minutes = minutes if config.minutes is None else config.minutes
         self.next_step = 0
         """Number of the next step, which is how many are done."""
         self.seconds = 0.0
@@ -119,8 +118,15 @@ class Trainer:
         self._random_background = scene.has_alpha or scene.unbounded
         self._views = scene.train
         self._masked = scene.masked
+        self._background = None if scene.unbounded and not scene.has_alpha else np.ones(3)
         witnesses = choose_witnesses(scene.train)
         self._keep_apart(unmasked_witnesses(witnesses) if scene.masked else witnesses)
+        self.minutes = config.minutes_for(self.device.type, scene.unbounded)
+        """Minutes of training at most."""
+        self.duration = Duration(self.pace.steps, self.minutes)
+        """How long the training takes."""
+        # Steps that are asked for are taken, and a GPU is done with its own in minutes.
+        self._looks = self._backend == "numba" and config.steps is None and len(self.witnesses.pixels) > 0
         self._guide: Guide
         self._grid_adam: TableAdam
         if self._backend == "torch":
@@ -162,6 +168,7 @@ class Trainer:
         self.witnesses = witnesses
         """The pixels of the training views that no step learns from."""
         self._pixels = sampler(self._views, self._generator, witnesses)
+        self._probe: WitnessErrors | None = None
         self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
         """Changing exposure, and things that move; its pictures are the views that are learned from."""
 
@@ -188,8 +195,9 @@ class Trainer:
         begin = time.monotonic() - self.seconds
         bad_in_a_row = 0
         for step in range(self.next_step, self.pace.steps):
-            seconds = self.processes.agree(time.monotonic() - begin)
-            progress = max(step / self.pace.steps, seconds / (60 * self._minutes))
+            seconds = time.monotonic() - begin
+            self._look(step, seconds)
+            progress = self.processes.agree(self.duration.progress(step, seconds))
             if progress >= 1:
                 return
             self._guide.prepare(step, self._field)
@@ -203,6 +211,24 @@ class Trainer:
                 )
             self.next_step, self.seconds = step + 1, time.monotonic() - begin
             yield StepReport(step, progress, loss, n_rays, n_samples, self.seconds)
+
+    def _look(self, step: int, seconds: float) -> None:
+        """Shorten the training if the error is flat; the first process decides for all."""
+        # What effects take out of the pictures stays among the errors of the witnesses, as if it were flat.
+        unclear = self.effects.exposure_on or self.effects.moving_on
+        if self.processes.first and self._looks and not unclear:
+            self.duration.look(step, seconds, self._measured)
+
+    def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
+        if self._probe is None:
+            self._probe = WitnessErrors(self.witnesses, self._views.cameras, self._background)
+        return self._probe.loss, self._probe.errors(self.field, self.sampler)
+
+    def witness_psnr(self) -> float | None:
+        """PSNR in dB at some of the witnesses by now; None for a scene too small to have any."""
+        if not len(self.witnesses.pixels):
+            return None
+        return -10 * float(np.log10(max(self._measured()[1].mean(), 1e-12)))
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
@@ -345,6 +371,7 @@ class Trainer:
             "witnesses": witness_content(self.witnesses),
             "pixels": self._pixels.position,
             "effects": self.effects.state(),
+            "duration": self.duration.state(),
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
 
@@ -361,6 +388,7 @@ class Trainer:
         self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
         self._pixels.restore(state["pixels"])
         self.effects.restore(state["effects"])
+        self.duration.restore(state["duration"])
 
 
 def choose_device(name: str) -> torch.device:

@@ -156,7 +156,7 @@ def test_several_processes_stay_on_the_cpu() -> None:
 
 def test_what_is_not_given_follows_from_the_device() -> None:
     cpu, gpu = (TrainConfig().for_device(device, False) for device in ("cpu", "cuda"))
-    assert (cpu.steps, cpu.batch_rays, cpu.max_rays, cpu.network_rate) == (60_000, 512, 16_384, 4e-3)
+    assert (cpu.steps, cpu.batch_rays, cpu.max_rays, cpu.network_rate) == (1_000_000, 512, 16_384, 4e-3)
     assert (gpu.steps, gpu.batch_samples, gpu.batch_rays) == (20_000, 2**18, 2**13)
     assert (gpu.network_rate, gpu.grid_rate) == (0.01, 0.01)
     assert TrainConfig().for_device("cuda", True).steps == 40_000

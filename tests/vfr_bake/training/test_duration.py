@@ -1,0 +1,108 @@
+"""When a training ends, and what is said of it at its start."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vfr_bake.config import Effort, TrainConfig
+from vfr_bake.data.demo import demo_scene, demo_views
+from vfr_bake.data.witnesses import choose_witnesses
+from vfr_bake.training.duration import FIRST_LOOK, GROWTH, Duration
+from vfr_bake.training.expectation import expectation
+from vfr_bake.training.trainer import Trainer
+from vfr_bake.training.witness_loss import WitnessLoss
+
+CHOSEN = choose_witnesses(demo_views(32, 24, 1)[0])
+WITNESSES, N = WitnessLoss(CHOSEN, np.ones(3)), len(CHOSEN.pixels)
+
+
+def looks(duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 0.0) -> list[float]:
+    """Let the error fall by so many dB with each doubling of the time; the times [s] of `n` looks."""
+    random = np.random.default_rng(0)
+    times, now = [], 0.0
+
+    def measure() -> tuple[WitnessLoss, np.ndarray]:
+        times.append(now)
+        errors = np.full(N, 1e-2 * 10 ** (-gain_of_a_doubling * math.log2(now) / 10))
+        return WITNESSES, errors * np.exp(noise * random.normal(size=N))
+
+    for number in range(n):
+        now = FIRST_LOOK * GROWTH**number * (1 + 1e-9 * number)  # in spite of rounding
+        duration.look(1, now - 1e-3, measure)  # not yet
+        duration.look(1, now, measure)
+    return times
+
+
+@pytest.mark.parametrize(
+    ("gain", "ends"), [(0.0, True), (0.1, True), (-0.5, True), (0.2, False), (3.0, False)]
+)
+def test_a_flat_error_ends_it_and_a_falling_one_does_not(gain: float, ends: bool) -> None:
+    duration = Duration(10**6, 60.0)
+    times = looks(duration, gain, 4)
+    assert np.allclose(np.diff(np.log2(times)), 0.5)
+    assert duration.ended_early == ends
+    # The second half takes as long as the first did.
+    assert math.isclose(duration.progress(1, times[-1]), 0.5 if ends else times[-1] / 3600)
+
+
+def test_one_flat_look_is_chance_and_so_is_an_error_that_varies_as_much() -> None:
+    duration = Duration(10**6, 60.0)
+    looks(duration, 0.0, 3)
+    assert not duration.ended_early
+    noisy = Duration(10**6, 60.0)
+    looks(noisy, 0.1, 6, noise=1.0)
+    assert not noisy.ended_early
+
+
+def test_nobody_looks_in_the_second_half() -> None:
+    duration = Duration(10**6, 4.0)
+    assert looks(duration, 0.0, 2) and not duration.ended_early
+    assert len(looks(Duration(10**6, 2.0), 0.0, 5)) == 0
+
+
+def test_what_was_seen_is_kept_and_the_length_may_change() -> None:
+    one, other = Duration(10**6, 60.0), Duration(10**6, 60.0)
+    looks(one, 0.0, 3)
+    other.restore(one.state())
+    for duration in (one, other):
+        duration.look(1, 1.01 * FIRST_LOOK * GROWTH**3, lambda: (WITNESSES, np.full(N, 1e-2)))
+    assert one.ended_early and other.ended_early
+    assert one.progress(1, 100.0) == other.progress(1, 100.0)
+    longer = Duration(10**6, 1.0)
+    longer.restore(one.state())
+    assert longer.progress(1, 60.0) == 1.0
+
+
+def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock of a second a look, with a field whose rates are too small to learn anything."""
+    clock = itertools.count()
+    monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr("vfr_bake.training.duration.FIRST_LOOK", 6.0)
+    scene = demo_scene(size=32, n_train=20, n_test=1)
+    settings = {"minutes": 20.0, "grid_rate": 1e-9, "network_rate": 1e-9, "batch_samples": 1024}
+    trainer = Trainer(scene, TrainConfig(device="cpu", **settings))
+    reports = list(trainer.run())
+    assert trainer.duration.ended_early
+    assert reports[-1].progress < 1 and reports[-1].seconds < 100
+    asked = Trainer(scene, TrainConfig(device="cpu", steps=60, **settings))
+    assert len(list(asked.run())) == 60 and not asked.duration.ended_early
+
+
+def test_the_expectation_counts_the_steps_that_come_first() -> None:
+    assert "about 1,000 steps in 0.42 minutes" in expectation(18.0, 0.025, 1000, 10.0, True)
+    assert "about 400 steps" in expectation(18.0, 0.025, 400, 10.0, True)
+    assert "18 to 18 dB" in expectation(18.0, 0.025, 10, 10.0, True)
+
+
+def test_efforts_are_minutes_at_most() -> None:
+    wanted: dict[Effort, tuple[int, int]] = {"draft": (2, 2), "good": (10, 12), "best": (60, 60)}
+    for effort, minutes in wanted.items():
+        config = TrainConfig(effort=effort)
+        assert tuple(config.minutes_for("cpu", kind) for kind in (False, True)) == minutes
+        assert TrainConfig(effort=effort, minutes=7.0).minutes_for("cpu", False) == 7
+        assert config.minutes_for("cuda", False) == (2 if effort == "draft" else math.inf)

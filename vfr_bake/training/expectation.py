@@ -1,0 +1,35 @@
+"""What a training is likely to reach, told from its first steps.
+
+PSNR grows by much the same number of decibels whenever the number of steps doubles, so that what a look after
+EXPECTED_AT steps finds can be carried forward. By how many decibels differs from scene to scene: the result
+is a range.
+"""
+
+from __future__ import annotations
+
+import math
+
+TIMED_FROM, EXPECTED_AT = 300, 400
+"""The speed is that of the steps between these two: before them kernels are compiled, and the pilot network
+learns."""
+DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.3)}
+"""Gain in dB at the least and at the most, by whether the scene is unbounded: of lego and the built-in scene,
+and of fox and can, from 400 steps to the end of 2 to 10 minutes."""
+
+
+def expectation(psnr: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool) -> str:
+    """What to expect of a training that has `psnr` dB after EXPECTED_AT steps and ends after `n_steps` or
+    `minutes`.
+
+    >>> expectation(18.0, 0.025, 1_000_000, 10.0, False)
+    '25 ms a step: about 24,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
+    """
+    possible = min(n_steps, round(60 * minutes / seconds_a_step))
+    doublings = max(0.0, math.log2(possible / EXPECTED_AT))
+    low, high = (round(psnr + gain * doublings) for gain in DB_PER_DOUBLING[unbounded])
+    rounded = round(possible, 1 - len(str(possible)) + 1)
+    taken = min(minutes, possible * seconds_a_step / 60)
+    return (
+        f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {taken:.2g} minutes at most, "
+        f"which give scenes like this {low} to {high} dB"
+    )
