@@ -19,7 +19,8 @@ SYSTEM_LIBRARIES := libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:l
 # Programs that open our exports or look at the viewer in the tests, as check:package. Debian's Blender, because it works
 # beside any Python of the tests and is half of what the `bpy` wheel is (160 MB against 370 MB), which in turn wants one
 # Python and numpy 1.
-OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium glslangValidator:glslang-tools
+OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium glslangValidator:glslang-tools \
+  firefox-esr:firefox-esr Xvfb:xvfb xauth:xauth
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
