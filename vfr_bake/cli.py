@@ -240,7 +240,7 @@ def _preview(options: Any, scene: Scene) -> Preview:
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
-    from vfr_bake.training.expectation import EXPECTED_AT, TIMED_FROM
+    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM
 
     last = None
     interrupted = False
@@ -290,7 +290,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
 
 def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
     """Say what is likely to come out, on a line of its own."""
-    from vfr_bake.training.expectation import expectation
+    from vfr_bake.training.length.expectation import expectation
 
     psnr = trainer.witness_psnr() if trainer.processes.first and trainer.device.type == "cpu" else None
     if psnr is not None:

@@ -71,8 +71,8 @@ from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
 from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.witness_loss import Loss
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""

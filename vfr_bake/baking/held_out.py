@@ -27,8 +27,8 @@ from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
 from vfr_bake.rendering.render import head_colours
+from vfr_bake.training.length.witness_loss import Loss, WitnessLoss
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.witness_loss import Loss, WitnessLoss
 
 LARGEST_TURN = np.deg2rad(15.0)
 """Largest angle between a view and a training camera: farther away the model is not trained."""

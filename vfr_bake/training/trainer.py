@@ -26,8 +26,10 @@ from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.captures.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
-from vfr_bake.training.duration import Duration
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
+from vfr_bake.training.length.duration import Duration
+from vfr_bake.training.length.witness_errors import WitnessErrors
+from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.optimiser import (
     BETAS,
     EPSILON,
@@ -39,8 +41,6 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
-from vfr_bake.training.witness_errors import WitnessErrors
-from vfr_bake.training.witness_loss import WitnessLoss
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 SOLID = 0.9

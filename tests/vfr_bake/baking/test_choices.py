@@ -16,8 +16,8 @@ from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.presets import PRESETS
+from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.witness_loss import Loss
 
 MAX_MB = 1.0
 

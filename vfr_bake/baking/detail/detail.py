@@ -36,7 +36,7 @@ from vfr_bake.baking.detail.shown import (
 from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout, encode_features
 from vfr_bake.baking.held_out import Head, HeldOut, Shown
-from vfr_bake.training.witness_loss import Loss
+from vfr_bake.training.length.witness_loss import Loss
 
 N_SEEING = 4_000_000
 """Rays whose weights tell which cells are seen, roughly, where the views have as many pixels."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from vfr_bake.training.witness_loss import Loss
+from vfr_bake.training.length.witness_loss import Loss
 
 N_TRIES = 6
 """Halvings of the range in which an amount is looked for."""

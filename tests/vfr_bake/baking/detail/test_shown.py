@@ -25,7 +25,7 @@ from vfr_bake.baking.detail.shown import Choice, Wanted, mean_values, wanted_val
 from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout, encode_features
 from vfr_bake.baking.rate import Choices
-from vfr_bake.training.witness_loss import Loss
+from vfr_bake.training.length.witness_loss import Loss
 
 
 def rays_of(n_views: int) -> TeacherRays:

@@ -12,10 +12,10 @@ import pytest
 from vfr_bake.config import Effort, TrainConfig
 from vfr_bake.data.demo import demo_scene, demo_views
 from vfr_bake.data.witnesses import choose_witnesses
-from vfr_bake.training.duration import FIRST_LOOK, GROWTH, Duration
-from vfr_bake.training.expectation import expectation
+from vfr_bake.training.length.duration import FIRST_LOOK, GROWTH, Duration
+from vfr_bake.training.length.expectation import expectation
+from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.trainer import Trainer
-from vfr_bake.training.witness_loss import WitnessLoss
 
 CHOSEN = choose_witnesses(demo_views(32, 24, 1)[0])
 WITNESSES, N = WitnessLoss(CHOSEN, np.ones(3)), len(CHOSEN.pixels)
@@ -82,7 +82,7 @@ def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.Mo
     """By a clock of a second a look, with a field whose rates are too small to learn anything."""
     clock = itertools.count()
     monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    monkeypatch.setattr("vfr_bake.training.duration.FIRST_LOOK", 6.0)
+    monkeypatch.setattr("vfr_bake.training.length.duration.FIRST_LOOK", 6.0)
     scene = demo_scene(size=32, n_train=20, n_test=1)
     settings = {"minutes": 20.0, "grid_rate": 1e-9, "network_rate": 1e-9, "batch_samples": 1024}
     trainer = Trainer(scene, TrainConfig(device="cpu", **settings))

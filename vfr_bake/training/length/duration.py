@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vfr_bake.training.witness_loss import WitnessLoss
+from vfr_bake.training.length.witness_loss import WitnessLoss
 
 FIRST_LOOK = 60.0
 """Seconds of training before the first look."""

@@ -10,7 +10,7 @@ from player.cameras.camera import Camera
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.render import Sampler, render_rays
-from vfr_bake.training.witness_loss import WitnessLoss
+from vfr_bake.training.length.witness_loss import WitnessLoss
 
 N_LOOKED_AT = 15_000
 """Witnesses at most: a look at them takes half a second of an object, one or two of a capture."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.witness_loss import BLOCKS_OF_A_VIEW, SINGLE_WEIGHT, Loss, WitnessLoss
+from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, SINGLE_WEIGHT, Loss, WitnessLoss
 
 WHITE = np.ones(3, np.float32)
 

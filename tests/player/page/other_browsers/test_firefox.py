@@ -11,7 +11,7 @@ from PIL import Image
 from player.page.page import page
 from player.render import Renderer
 from tests.player.page import scenes
-from tests.player.page.firefox import firefox_page
+from tests.player.page.other_browsers.firefox import firefox_page
 from tests.player.page.test_renderer import LEAST_DB, MOST_OFF
 
 
