@@ -174,7 +174,7 @@ class Renderer:
             red, green, blue = self.asset.manifest.background
             background = (red, green, blue)
         picture = self._blank(camera, background, min(k, self._grid.most_samples), layers)
-        for stage in stages(quality):
+        for stage in stages(quality, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
         planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
         normals = self._all_normals(picture.view, self._pool.map) if layers else None

@@ -54,13 +54,21 @@ _NOTHING = Agreement(np.float32(0), np.float32(0), np.float32(0))
 _NONE = np.zeros((0, 2), np.int64)
 
 
-def stages(quality: Quality) -> tuple[Stage, ...]:
+def stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
     """The stages of a picture, in their order.
 
+    Args:
+        quality: of the picture.
+        contracted: whether it shows all of space. The pictures of a capture are smooth over several pixels,
+            and a lattice of every fourth pays. An object's seldom are: of a wider lattice than every second
+            pixel's, rays that lie far apart cost more time than there are fewer of them.
+
     >>> [len(stage.within) for stage in stages("exact")], [len(stage.within) for stage in stages("fast")]
-    ([64], [4, 4, 8, 16, 32])
+    ([64], [16, 16, 32])
+    >>> [len(stage.within) for stage in stages("fast", contracted=True)]
+    [4, 4, 8, 16, 32]
     """
-    return _STAGES[quality]
+    return (_OF_SPACE if contracted else _OF_BOX)[quality]
 
 
 def _pattern(spacing: int, agreements: tuple[Agreement, ...]) -> tuple[Stage, ...]:
@@ -84,8 +92,14 @@ def _agreement(levels: float) -> Agreement:
     return Agreement(np.float32(levels / 255), np.float32(levels / 255), np.float32(0.1))
 
 
-_STAGES: dict[Quality, tuple[Stage, ...]] = {
-    "exact": (Stage(EVERY, _NONE, _NOTHING),),
+_EXACT = (Stage(EVERY, _NONE, _NOTHING),)
+_OF_BOX: dict[Quality, tuple[Stage, ...]] = {
+    "exact": _EXACT,
+    "high": _pattern(2, (_agreement(16),)),
+    "fast": _pattern(2, (_agreement(30),)),
+}
+_OF_SPACE: dict[Quality, tuple[Stage, ...]] = {
+    "exact": _EXACT,
     "high": _pattern(4, (_agreement(5), _agreement(10))),
     "fast": _pattern(4, (_agreement(10), _agreement(20))),
 }

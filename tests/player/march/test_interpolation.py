@@ -69,10 +69,11 @@ def expected_pixel(
     return *mean, opacity, sum(t) / 4 if min(t) > 0 else 0.0
 
 
+@pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality) -> None:
+def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality, contracted: bool) -> None:
     found = np.full((3 * BLOCK, 3 * BLOCK), -1)
-    for number, stage in enumerate(stages(quality)):
+    for number, stage in enumerate(stages(quality, contracted)):
         rows, columns = (
             (axis[:, None] + BLOCK * np.arange(3)).reshape(len(axis), 3) for axis in stage.within.T
         )
@@ -81,7 +82,7 @@ def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality) -> No
                 assert found[y, x] == -1
                 found[y, x] = number
     assert (found >= 0).all()
-    for number, stage in enumerate(stages(quality)):
+    for number, stage in enumerate(stages(quality, contracted)):
         for row, column in stage.within + BLOCK:
             assert all(found[row + down, column + right] < number for down, right in stage.neighbours)
 
@@ -94,7 +95,7 @@ def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality) -> No
 def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int, int]) -> None:  # type: ignore[no-untyped-def]
     random = np.random.default_rng(3)
     kept = filled = 0
-    for stage in [stage for quality in LOSSY for stage in stages(quality)]:
+    for stage in [stage for quality in LOSSY for kind in (False, True) for stage in stages(quality, kind)]:
         planes = random_planes(size[0] * size[1], random)
         before = Planes(*(plane.copy() for plane in planes))
         pixels = all_pixels(*size, stage)
@@ -121,7 +122,7 @@ def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int,
 @pytest.mark.parametrize("transparent", [False, True])
 def test_compiled_code_gives_the_same_bits(transparent: bool) -> None:
     for seed in range(5):
-        for stage in stages("fast"):
+        for stage in (*stages("fast"), *stages("fast", contracted=True)):
             both = []
             for function in (interpolate, compiled.interpolate):
                 planes = random_planes(40 * 30, np.random.default_rng(seed))
