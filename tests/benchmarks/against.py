@@ -31,8 +31,12 @@ _WORKER = """
 import json, resource, sys, time
 import numpy as np
 from pathlib import Path
-from player.asset.asset import Asset
-from player.cameras.camera import Camera
+try:
+    from player.asset.asset import Asset
+    from player.cameras.camera import Camera
+except ImportError:  # a version whose modules all lie in one folder
+    from player.asset import Asset
+    from player.cameras import Camera
 from player.render import Renderer
 folder, threads, march, quality, picture = sys.argv[1:]
 renderer = Renderer(Asset.open(Path(folder)), int(threads), march)
@@ -55,7 +59,7 @@ class Player:
     def __init__(
         self, checkout: Path, folder: Path, threads: int, march: str, quality: str, picture: Path
     ) -> None:
-        self._picture = picture
+        self._checkout, self._picture = checkout, picture
         self._process = subprocess.Popen(
             [
                 sys.executable,
@@ -81,7 +85,9 @@ class Player:
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         requests.write(json.dumps([camera.c2w.tolist(), lens]) + "\n")
         requests.flush()
-        return json.loads(answers.readline()), np.load(self._picture) / 255
+        if not (answer := answers.readline()):
+            raise SystemExit(f"{self._checkout}: expected a picture, got an end: see what it has said above")
+        return json.loads(answer), np.load(self._picture) / 255
 
     def close(self) -> None:
         self._process.kill()
