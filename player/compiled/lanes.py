@@ -31,6 +31,12 @@ EXP = (
 """exp(r) for |r| <= log(2) / 2, highest power first: the polynomial of Cephes."""
 
 
+SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
+COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
+"""(sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4 for |r| <= pi / 4, as polynomials in r^2, highest power
+first: those of Cephes."""
+
+
 def vector(element: Any) -> ir.VectorType:
     return ir.VectorType(element, LANES)
 
@@ -166,6 +172,25 @@ class Lanes:
         for part in (half, exponent - half):
             total = total * ((part + 127) << 23).as_float()
         return total
+
+    def sin_cos(self) -> tuple[Lanes, Lanes]:
+        """sin and cos, each to 1.2e-7, of angles up to a thousand."""
+        quarters = (self * (2 / np.pi)).call("rint")
+        rest = quarters.call("fma", -float(np.float32(np.pi / 2)), self)
+        rest = quarters.call("fma", float(np.float32(np.pi / 2)) - np.pi / 2, rest)
+        square = rest * rest
+        sine, cosine = self.like(SINE[0]), self.like(COSINE[0])
+        for of_sine, of_cosine in zip(SINE[1:], COSINE[1:], strict=True):
+            sine, cosine = square.call("fma", sine, of_sine), square.call("fma", cosine, of_cosine)
+        sine = (sine * square).call("fma", rest, rest)
+        cosine = (cosine * square).call("fma", square, square.call("fma", -0.5, square.like(1.0)))
+        number = quarters.to_int()
+        swap = (number & 1).is_not(0)
+        sin, cos = choose(swap, cosine, sine), choose(swap, sine, cosine)
+        return (
+            choose((number & 2).is_not(0), -sin, sin),
+            choose(((number + 1) & 2).is_not(0), -cos, cos),
+        )
 
     def greatest(self) -> Any:
         """The greatest of the lanes, one int32."""

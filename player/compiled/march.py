@@ -35,7 +35,7 @@ from player.compiled.packets import (
 from player.compiled.prefetch import prefetch
 from player.compiling import compiled, inlined
 from player.march.box import Bounds
-from player.march.contracted import MAX_SPEED, enter_space
+from player.march.contracted import MAX_SPEED, MIN_COS, lattice
 from player.march.fetches import MIN_TOTAL
 from player.march.march import MIN_OPACITY, MarchResult
 from player.scratch import check_scratch, scratch
@@ -165,20 +165,41 @@ def _enter_box(
 
 def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[SpaceSteps, np.ndarray]:
     """The packets of rays through contracted space, [n_packets, SPACE_ROWS, LANES] float32."""
-    path = enter_space(grid, rays_o, rays_d)
-    n_packets = -(-len(rays_o) // LANES)
-    rows = np.zeros((SPACE_ROWS, n_packets * LANES), F32)
-    rows[:, : len(rays_o)] = (
-        *path.nearest, *path.along, path.cos, path.sin, path.width, path.length, path.t_nearest
+    packets = scratch((-(-len(rays_o) // LANES), SPACE_ROWS, LANES), F32, 0)
+    _enter_curves(
+        np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), float(grid.near),
+        math.acos(float(MIN_COS)), packets,
     )  # fmt: skip
-    packets = scratch((n_packets, SPACE_ROWS, LANES), F32)
-    packets[:] = rows.reshape(SPACE_ROWS, n_packets, LANES).swapaxes(0, 1)
     angle = np.arange(grid.level_steps[-1] + 1).astype(F32) * grid.step
     angles = np.stack([np.cos(angle * F32(0.5)), np.sin(angle * F32(0.5)), np.sin(angle)])
-    middles, ends = (np.ascontiguousarray(path.table[1:, first::2].T) for first in (0, 1))
-    fastest = MAX_SPEED * grid.step * path.cells
+    table, cells = lattice(float(grid.step)), grid.cells_per_unit[0]
+    middles, ends = (np.ascontiguousarray(table[1:, first::2].T) for first in (0, 1))
+    fastest = MAX_SPEED * grid.step * cells
     sizes = len(middles), angles.shape[1]
-    return SpaceSteps(middles, ends, grid.step, angles, *sizes, fastest, path.cells), packets
+    return SpaceSteps(middles, ends, grid.step, angles, *sizes, fastest, cells), packets
+
+
+@compiled
+def _enter_curves(rays_o, rays_d, near, end, packets):
+    """Rays where they begin, as `player.march.contracted.enter_space`, into rows of packets; they end where
+    phi is `end`."""
+    for ray in range(len(rays_o)):
+        packet, lane = ray // LANES, ray % LANES
+        nearest, squares = 0.0, 0.0
+        for axis in range(3):
+            nearest -= np.float64(rays_o[ray, axis]) * np.float64(rays_d[ray, axis])
+        for axis in range(3):
+            p = np.float64(rays_o[ray, axis]) + nearest * np.float64(rays_d[ray, axis])
+            packets[packet, axis, lane] = p
+            squares += p * p
+        width = max(1.0, math.sqrt(squares))
+        for axis in range(3):
+            packets[packet, 3 + axis, lane] = width * np.float64(rays_d[ray, axis])
+        way = near - nearest
+        length = math.sqrt(width * width + way * way)
+        packets[packet, 6, lane], packets[packet, 7, lane] = width / length, way / length
+        packets[packet, 8, lane], packets[packet, 9, lane] = width, end - math.atan2(way, width)
+        packets[packet, 10, lane] = nearest
 
 
 @compiled

@@ -213,10 +213,12 @@ class _Space:
         return self._width * sin_angle / below
 
     def at(self, s: Lanes) -> Three:
-        return self._on_grid(*self._turned(s.call("cos"), s.call("sin")))
+        sin, cos = s.sin_cos()
+        return self._on_grid(*self._turned(cos, sin))
 
     def distance(self, s: Lanes) -> Lanes:
-        cos, sin = self._turned(s.call("cos"), s.call("sin"))
+        sin_s, cos_s = s.sin_cos()
+        cos, sin = self._turned(cos_s, sin_s)
         return self._t_nearest + self._width * sin / cos.most(float(MIN_COS))
 
     def _turned(self, cos_s: Lanes, sin_s: Lanes) -> tuple[Lanes, Lanes]:
