@@ -26,7 +26,7 @@ from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.bounds import block_bounds
-from player.march.interpolation import Quality, Stage, interpolate, stages
+from player.march.interpolation import OPAQUE_DEPTH, Quality, Stage, interpolate, stages
 from player.march.march import MarchResult
 from player.march.normals import composited_normals
 from player.march.pixels import EVERY, Planes, write_pixels
@@ -159,7 +159,7 @@ class Renderer:
                 can have.
             background: colour 0..1 or "transparent"; the asset's own if None.
             quality: "exact" marches every pixel; "high" and "fast" interpolate those between neighbours that
-                agree (`player.march.interpolation`).
+                agree, and end rays earlier (`player.march.interpolation`).
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
@@ -173,7 +173,8 @@ class Renderer:
         if background is None:
             red, green, blue = self.asset.manifest.background
             background = (red, green, blue)
-        picture = self._blank(camera, background, min(k, self._grid.most_samples), layers)
+        k, opaque_depth = min(k, self._grid.most_samples), OPAQUE_DEPTH[quality]
+        picture = self._blank(camera, background, k, opaque_depth, layers)
         for stage in stages(quality, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
         planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
@@ -188,7 +189,14 @@ class Renderer:
             lambda: self._all_normals(picture.view) if normals is None else normals,
         )
 
-    def _blank(self, camera: Camera, background: Background, n_fetches: int, layers: bool) -> _Picture:
+    def _blank(
+        self,
+        camera: Camera,
+        background: Background,
+        n_fetches: int,
+        opaque_depth: np.float32,
+        layers: bool,
+    ) -> _Picture:
         """A picture that shows what is behind."""
         n_pixels = camera.width * camera.height
         rgb = np.empty((n_pixels, 3), np.float32)
@@ -199,6 +207,7 @@ class Renderer:
             planes=Planes(rgb, *zeros, np.zeros(n_pixels, np.int32)),
             behind=None if background == "transparent" else background,
             n_fetches=n_fetches,
+            opaque_depth=opaque_depth,
             features=np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None,
         )
 
@@ -232,7 +241,9 @@ class Renderer:
                 return
         index = view.index(pixels)
         rays_o, rays_d, bounds = view.rays(pixels, self._directions)
-        result: MarchResult = self._module.march(view.grid, rays_o, rays_d, picture.n_fetches, bounds)
+        result: MarchResult = self._module.march(
+            view.grid, rays_o, rays_d, picture.n_fetches, bounds, picture.opaque_depth
+        )
         if picture.features is not None:
             picture.features[index[result.hits]] = result.features
         rgb = self._head(result.features, rays_d[result.hits])
@@ -262,6 +273,8 @@ class _Picture(NamedTuple):
     behind: tuple[float, float, float] | None
     """The background's colour, None for none."""
     n_fetches: int
+    opaque_depth: np.float32
+    """The optical depth at which rays stop."""
     features: np.ndarray | None
     """[n, n_channels] float32 what the head was given for each pixel, if anybody asked."""
 

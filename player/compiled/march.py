@@ -37,7 +37,7 @@ from player.compiling import compiled, inlined
 from player.march.box import Bounds
 from player.march.contracted import MAX_SPEED, MIN_COS, lattice
 from player.march.fetches import MIN_TOTAL
-from player.march.march import MIN_OPACITY, MarchResult
+from player.march.march import MAX_TAU, MIN_OPACITY, MarchResult
 from player.scratch import check_scratch, scratch
 
 F32 = np.float32
@@ -84,9 +84,10 @@ def march(
     rays_d: np.ndarray,
     n_fetches: int,
     bounds: Bounds | None = None,
+    opaque_depth: np.float32 = MAX_TAU,
 ) -> MarchResult:
     """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
-    lookup, steps, packets, capacity = enter(grid, rays_o, rays_d, bounds)
+    lookup, steps, packets, capacity = enter(grid, rays_o, rays_d, bounds, opaque_depth)
     n_rays, width = len(rays_o), -(-grid.n_channels // CHANNELS) * CHANNELS
     k = min(n_fetches, capacity)  # no ray has more samples
     work = Work(
@@ -132,11 +133,18 @@ class Entered(NamedTuple):
     """No ray has more samples."""
 
 
-def enter(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, bounds: Bounds | None = None) -> Entered:
+def enter(
+    grid: SparseGrid,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    bounds: Bounds | None = None,
+    opaque_depth: np.float32 = MAX_TAU,
+) -> Entered:
     """Rays where they enter a grid of either kind; the arguments are those of `march`."""
     lookup = Lookup(
         grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
         int(grid.level_steps[0] == 1), grid.most_steps, grid.density_low, grid.density_slope,
+        F32(opaque_depth),
     )  # fmt: skip
     if grid.contracted:
         steps, packets = _enter_space(grid, rays_o, rays_d)

@@ -56,6 +56,8 @@ class Lookup(NamedTuple):
     """For how many base steps a sample stands at most."""
     density_low: np.float32
     density_slope: np.float32
+    opaque_depth: np.float32
+    """As the argument of `player.march.march.march`."""
 
 
 class BoxSteps(NamedTuple):
@@ -272,6 +274,8 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
     least_coarse = splat(b, b.trunc(grid.least_coarse, INT))
     multiple = 0 - splat(b, b.trunc(grid.most_steps, INT))
     one, there = multiple.like(1), Variable(multiple.like(0))
+    opaque_depth = splat(b, grid.opaque_depth)
+    closing = opaque_depth < float(MAX_TAU)  # whether the sample that passes it counts as opaque
 
     def look_up(g: Three, where: Lanes) -> tuple[list[Lanes], Lanes]:
         """Cells of the finest level, and the table's entries."""
@@ -323,6 +327,9 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
                 behind = (-depth).exp()
                 series = 1.0 - optical * (1 / 2 - optical * (1 / 6 - optical * (1 / 24)))
                 weight = choose(optical > 0.1, before - behind, before * optical * series)
+                last = live & (depth > opaque_depth)
+                weight = choose(last & closing, before, weight)
+                depth = choose(last & closing, zero.like(float("inf")), depth)
                 counts = live & (weight > 0)
                 weight = choose(counts, weight, zero)
                 tau.set(depth)
@@ -331,7 +338,7 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
                 n_weights.set(choose(counts, n_weights.get() + 1, n_weights.get()))
                 total.add(weight, counts)
                 moment.add(weight * s, counts)
-                active.set(inside & ~(depth > float(MAX_TAU)))
+                active.set(inside & ~last)
                 row = b.load(n_rows)
                 place = b.mul(row, LONG(LANES))
                 store(samples, place, s)

@@ -24,9 +24,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from player.march.march import MAX_TAU
 from player.march.pixels import EVERY, Pixels, Planes
 
 Quality = Literal["exact", "high", "fast"]
+
+OPAQUE_DEPTH: dict[Quality, np.float32] = {
+    "exact": MAX_TAU,
+    "high": np.float32(np.log(25)),
+    "fast": np.float32(np.log(10)),
+}
+"""The optical depth at which the rays of a picture stop (`player.march.march.march`)."""
 
 
 class Agreement(NamedTuple):

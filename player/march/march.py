@@ -71,6 +71,7 @@ def march(
     rays_d: np.ndarray,
     n_fetches: int,
     bounds: Bounds | None = None,
+    opaque_depth: np.float32 = MAX_TAU,
 ) -> MarchResult:
     """March rays and fetch their features.
 
@@ -80,8 +81,10 @@ def march(
         rays_d: [n, 3] float32 unit directions, model frame.
         n_fetches: k, feature fetches a ray; 0 fetches at every sample.
         bounds: where live cells of a box can be, if that is known.
+        opaque_depth: the optical depth at which rays stop. If that is below MAX_TAU, the sample that passes
+            it counts as opaque, so that what is left of the light is not lost.
     """
-    path, samples, _, tau, counts = sample_rays(grid, rays_o, rays_d, bounds)
+    path, samples, _, tau, counts = sample_rays(grid, rays_o, rays_d, bounds, opaque_depth)
     n_rays = len(rays_o)
     opacity = -np.expm1(-tau)
     heavy = samples.weights.astype(np.float64)
@@ -114,6 +117,7 @@ def sample_rays(
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     bounds: Bounds | None = None,
+    opaque_depth: np.float32 = MAX_TAU,
 ) -> SampledRays:
     """The samples of rays; the arguments are those of `march`.
 
@@ -124,7 +128,7 @@ def sample_rays(
     ray, i = np.arange(len(rays_o)), path.first
     chunks: list[Taken] = []
     while True:
-        alive = np.flatnonzero((path.sample(i) < path.length[ray]) & ~(tau[ray] > MAX_TAU))
+        alive = np.flatnonzero((path.sample(i) < path.length[ray]) & ~(tau[ray] > opaque_depth))
         if not len(alive):
             return SampledRays(path, *_weigh(chunks, tau))
         ray, i = ray[alive], i[alive]
@@ -144,7 +148,7 @@ def sample_rays(
         busy = np.flatnonzero(busy)
         if len(busy):
             chunk = _chunk(grid, path, ray[busy], i[busy])
-            chunks.append(_take(grid, path, ray[busy], chunk, tau))
+            chunks.append(_take(grid, path, ray[busy], chunk, tau, opaque_depth))
             i[busy] = chunk.after
 
 
@@ -212,9 +216,16 @@ class Taken(NamedTuple):
     """[n_samples] float32, tau before the sample."""
 
 
-def _take(grid: SparseGrid, path: Path, ray: np.ndarray, chunk: Chunk, tau: np.ndarray) -> Taken:
-    """Take the samples of a chunk of the rays `ray` [n] in live cells, up to the one that passes MAX_TAU;
-    `tau` [n_rays] is updated."""
+def _take(
+    grid: SparseGrid,
+    path: Path,
+    ray: np.ndarray,
+    chunk: Chunk,
+    tau: np.ndarray,
+    opaque_depth: np.float32,
+) -> Taken:
+    """Take the samples of a chunk of the rays `ray` [n] in live cells, up to the one that passes
+    `opaque_depth`, which counts as opaque if that is below MAX_TAU; `tau` [n_rays] is updated."""
     at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
     row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
     size = chunk.size[at] if chunk.size.ndim else chunk.size
@@ -227,10 +238,14 @@ def _take(grid: SparseGrid, path: Path, ray: np.ndarray, chunk: Chunk, tau: np.n
     added[row, column + 1] = optical
     running = np.cumsum(added, axis=1, dtype=np.float32)
     before = running[row, column]
-    kept = before <= MAX_TAU
-    row, column = row[kept], column[kept]
-    tau[ray[row]] = running[row, column + 1]  # in order, so that the last sample of each ray stays
-    return Taken(ray[row], s[kept], way[kept], optical[kept], before[kept])
+    kept = before <= opaque_depth
+    row, column, optical = row[kept], column[kept], optical[kept]
+    after = running[row, column + 1]
+    if opaque_depth < MAX_TAU:
+        last = after > opaque_depth
+        after[last] = optical[last] = np.inf
+    tau[ray[row]] = after  # in order, so that the last sample of each ray stays
+    return Taken(ray[row], s[kept], way[kept], optical, before[kept])
 
 
 def trilinear(density: np.ndarray, corner: np.ndarray, fraction: np.ndarray) -> np.ndarray:

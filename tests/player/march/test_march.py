@@ -65,6 +65,41 @@ def special_rays() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("module", MARCHES)
+@pytest.mark.parametrize("k", [0, 3])
+def test_rays_that_end_earlier_lose_no_light(module: ModuleType, k: int, asset: Asset) -> None:
+    """Those that have not come to the depth at which others end are what they were; the others are opaque,
+    and one that meets the same feature everywhere composites just that."""
+    rays, limit = random_rays(300, seed=4), np.float32(np.log(10))
+    whole, ended = module.march(asset.grid, *rays, k), module.march(asset.grid, *rays, k, None, limit)
+    shorter = ended.opacity == 1
+    assert 0.1 < shorter.mean() < 0.9
+    assert (whole.opacity[shorter] > 0.9).all() and (whole.opacity[~shorter] <= 0.9 + OPACITY).all()
+    assert (ended.n_density_samples <= whole.n_density_samples).all()
+    assert ended.n_density_samples.sum() < 0.95 * whole.n_density_samples.sum()
+    for name in ("opacity", "depth", "n_density_samples"):
+        assert getattr(ended, name)[~shorter].tobytes() == getattr(whole, name)[~shorter].tobytes(), name
+    of_all, of_ended = (np.zeros((300, 4), np.float32) for _ in range(2))
+    of_all[whole.hits], of_ended[ended.hits] = whole.features, ended.features
+    assert of_ended[~shorter].tobytes() == of_all[~shorter].tobytes()
+    same = replace(asset.grid, features=np.full_like(asset.grid.features, 50))
+    found = module.march(same, *rays, k, None, limit)
+    of_rays = found.opacity[found.hits, None] * np.full(4, 50)
+    np.testing.assert_allclose(found.features, of_rays, rtol=1e-5)
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e-3, 1.0, 2.3])
+@pytest.mark.parametrize("k", [0, 1, 3])
+def test_both_marches_end_rays_alike(k: int, limit: float, asset: Asset) -> None:
+    rays = random_rays(200, seed=5)
+    a, b = (m.march(asset.grid, *rays, k, None, np.float32(limit)) for m in (march, march_compiled))
+    assert a.hits.tolist() == b.hits.tolist()
+    assert a.n_density_samples.tolist() == b.n_density_samples.tolist()
+    np.testing.assert_allclose(a.opacity, b.opacity, rtol=0, atol=OPACITY)
+    np.testing.assert_allclose(a.depth, b.depth, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(a.features, b.features, rtol=0, atol=FEATURES)
+
+
+@pytest.mark.parametrize("module", MARCHES)
 @pytest.mark.parametrize("k", [0, 1, 2, 5])
 @pytest.mark.parametrize("rays", [random_rays(150), special_rays()], ids=["random", "special"])
 def test_march_is_the_naive_loop(
