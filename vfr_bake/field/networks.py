@@ -24,6 +24,7 @@ from torch.nn.functional import gelu, relu
 
 from exporters.head.spherical_harmonics import sh_monomials
 from vfr_bake.config import FieldConfig
+from vfr_bake.field.fused_head import fused_head
 from vfr_bake.kernels.density import LARGEST_LOGIT, DensityArrays
 
 
@@ -134,6 +135,7 @@ class Head(nn.Module):
         self.width = width
         self.activation = {"gelu": gelu, "relu": relu}[config.activation]
         self.plain_sh = config.view_encoding == "sh"
+        self._is_fused = self.activation is gelu and not self.plain_sh
         self.n_sh_features = 1 if self.plain_sh else config.n_sh_features
         self.harmonics = SphericalHarmonics(config.sh_degree)
         n_sh = config.sh_degree**2 * self.n_sh_features
@@ -149,6 +151,9 @@ class Head(nn.Module):
 
     def forward(self, features: Tensor, dirs: Tensor) -> Tensor:
         """Colours [n, 3] in [0, 1], sRGB, from `features` [n, n_channels] and unit `dirs` [n, 3]."""
+        if self._is_fused and features.device.type == "cpu" and features.dtype == torch.float32:
+            basis = self.harmonics(dirs).repeat_interleave(self.n_sh_features, dim=-1)
+            return fused_head(features, basis, self.width, [*self.spatial, *self.directional, self.out])
         h = self.spatial[1](self.activation(self.spatial[0](features)))
         encoded = self.harmonics(dirs)
         if not self.plain_sh:
