@@ -59,6 +59,27 @@ def composite_backward(
             behind += weights[i] * inner
 
 
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def silence(gradients, faint):
+    """Set those rows of `gradients` [n_samples, n_channels] to 0 whose length is less than `faint` times the
+    root of the mean square length; NaN stays."""
+    n, n_channels = gradients.shape
+    kind = gradients.dtype.type
+    squares = np.empty(n, gradients.dtype)
+    total = kind(0)
+    for i in range(n):
+        square = kind(0)
+        for c in range(n_channels):
+            square += gradients[i, c] * gradients[i, c]
+        squares[i] = square
+        total += square
+    least = faint * faint * (total / kind(max(n, 1)))
+    for i in range(n):
+        if squares[i] < least:
+            for c in range(n_channels):
+                gradients[i, c] = 0
+
+
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def distortion(weights, mids, widths, starts, counts, losses, grad_weights):
     """Distortion of each ray (mip-NeRF 360, eq. 15) and its gradient, in one pass forth and one back.

@@ -65,10 +65,15 @@ def density_logit(feature, field, hidden):
         return total
     for j in range(b1.shape[0]):
         hidden[j] = b1[j]
-    for c in range(feature.shape[0]):
-        f = feature[c]
+    # Four channels at a time: each sum goes through memory, which takes longer than four products.
+    whole = feature.shape[0] // 4 * 4
+    for c in range(0, whole, 4):
+        f, g, h, k = feature[c], feature[c + 1], feature[c + 2], feature[c + 3]
         for j in range(b1.shape[0]):
-            hidden[j] += f * w1[c, j]
+            hidden[j] += (f * w1[c, j] + g * w1[c + 1, j]) + (h * w1[c + 2, j] + k * w1[c + 3, j])
+    for c in range(whole, feature.shape[0]):
+        for j in range(b1.shape[0]):
+            hidden[j] += feature[c] * w1[c, j]
     for j in range(b1.shape[0]):
         total += w2[j] * max(hidden[j], kind(0))
     return total

@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vfr_bake.field.networks import DensityNetwork
 from vfr_bake.kernels import compositing as kernels
+from vfr_bake.kernels.activations import relu_backward
+from vfr_bake.kernels.density import LARGEST_LOGIT
 from vfr_bake.torch_kernels.compositing import Composite
 
 
@@ -42,6 +45,8 @@ class RaySamples:
     """[n_served] first sample of each."""
     counts: Tensor
     """[n_served] number of samples of each, 0 where a ray meets nothing."""
+    sigmas: Tensor | None = None
+    """[n_samples] densities, where they were looked up on the way."""
 
 
 def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
@@ -57,6 +62,25 @@ def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, 
     (0.6321, 0.6321, 0.6321)
     """
     return Composite(*_Composite.apply(sigmas, features, deltas, starts, counts))  # type: ignore[misc]
+
+
+def composite_field(
+    density: DensityNetwork,
+    features: Tensor,
+    sigmas: Tensor | None,
+    deltas: Tensor,
+    starts: Tensor,
+    counts: Tensor,
+    faint: float = 0.0,
+) -> Composite:
+    """`composite` with the densities that `density` has at `features`, on a CPU, in float32.
+
+    Where a march has computed `sigmas` [n_samples] already they are taken as they are. Differentiable with
+    respect to the features and the network; `TruncatedExp` says how a saturated density learns. Samples whose
+    gradient is less than `faint` times the root mean square of all get none.
+    """
+    samples = features, sigmas, deltas, starts, counts
+    return Composite(*_CompositeField.apply(*samples, faint, density, *density.parameters()))  # type: ignore[misc]
 
 
 def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:
@@ -96,6 +120,54 @@ class _Composite(torch.autograd.Function):
             grad_out, grad_opacity, grad_weights, grad_sigmas.numpy(), grad_features.numpy(),
         )  # fmt: skip
         return grad_sigmas, grad_features, None, None, None
+
+
+class _CompositeField(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, features, sigmas, deltas, starts, counts, faint, density, *parameters):
+        ctx.faint = np.float32(faint)
+        if sigmas is None:
+            sigmas = density.logits(features).clamp_(-LARGEST_LOGIT, LARGEST_LOGIT).exp_()
+        else:
+            sigmas = sigmas.clamp(min=float(np.exp(-LARGEST_LOGIT)))
+        weights, taus = torch.zeros_like(sigmas), torch.empty_like(sigmas)
+        out = features.new_empty(len(starts), features.shape[1])
+        opacity = features.new_empty(len(starts))
+        kernels.composite(
+            _array(sigmas), _array(features), deltas.numpy(), starts.numpy(), counts.numpy(),
+            weights.numpy(), taus.numpy(), out.numpy(), opacity.numpy(),
+        )  # fmt: skip
+        ctx.save_for_backward(features, sigmas, deltas, starts, counts, weights, taus, *parameters)
+        return out, opacity, weights
+
+    @staticmethod
+    def backward(ctx, *grads):
+        features, sigmas, deltas, starts, counts, weights, taus, *parameters = ctx.saved_tensors
+        grad_logits, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
+        kernels.composite_backward(
+            _array(features), deltas.numpy(), starts.numpy(), counts.numpy(), weights.numpy(), taus.numpy(),
+            *(_array(grad) for grad in grads), grad_logits.numpy(), grad_features.numpy(),
+        )  # fmt: skip
+        grad_logits *= sigmas
+        nothing = [None] * 6
+        grad_bias = grad_logits.sum().reshape(1)
+        *hidden, weight, _ = parameters
+        if not hidden:
+            grad_weight = torch.mv(features.t(), grad_logits)[None]
+            grad_features.addr_(grad_logits, weight[0])
+            kernels.silence(grad_features.numpy(), ctx.faint)
+            return grad_features, *nothing, grad_weight, grad_bias
+        weight1, bias1 = hidden
+        grad_hidden = torch.mm(features, weight1.t())
+        grad_weight, grad_bias1 = torch.empty_like(weight), torch.empty_like(bias1)
+        relu_backward(
+            grad_hidden.numpy(), bias1.numpy(), weight.numpy()[0], grad_logits.numpy(),
+            grad_weight.numpy()[0], grad_bias1.numpy(),
+        )  # fmt: skip
+        grad_features.addmm_(grad_hidden, weight1)
+        grad_weight1 = torch.mm(grad_hidden.t(), features)
+        kernels.silence(grad_features.numpy(), ctx.faint)
+        return grad_features, *nothing, grad_weight1, grad_bias1, grad_weight, grad_bias
 
 
 class _Distortion(torch.autograd.Function):

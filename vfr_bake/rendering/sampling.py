@@ -60,7 +60,7 @@ def march(
         rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), distance, field.arrays(), LIMITS,
         counts, starts, t_mid, points, features, sigmas,
     )  # fmt: skip
-    first = np.concatenate([[0], np.cumsum(used)])
+    first, joined = np.concatenate([[0], np.cumsum(used)]), _join(sigmas, used)
     served = np.flatnonzero(counts >= 0)
     samples = RaySamples(
         t_mid=torch.from_numpy(_join(t_mid, used)),
@@ -70,8 +70,9 @@ def march(
         rays=torch.from_numpy(served),
         starts=torch.from_numpy(starts[served] + first[served % n_chunks]),
         counts=torch.from_numpy(counts[served]),
+        sigmas=torch.from_numpy(joined),
     )
-    return samples, _join(sigmas, used)
+    return samples, joined
 
 
 def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -135,6 +135,8 @@ class FusedGridAdam(GridAdam):
         if not self._pending:
             return
         points, gradient = (torch.cat(parts) for parts in zip(*self._pending, strict=True))
+        some = gradient.any(dim=1)
+        points, gradient = points[some], gradient[some]
         if self._rows.shape[1] < 8 * len(points) + 1:
             self._rows = np.empty((get_num_threads(), 8 * len(points) + 1), np.uint32)
         scatter_and_step(

@@ -19,7 +19,7 @@ from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
-from vfr_bake.rendering.compositing import RaySamples, composite
+from vfr_bake.rendering.compositing import RaySamples, composite, composite_field
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
@@ -45,6 +45,11 @@ from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 SOLID = 0.9
 """Opacity above which the exposure of a picture is looked at."""
+FAINT = 0.01
+"""Samples whose gradient is less than so many root mean squares are not learned from: four in ten, with a
+millionth of the sum of squares, for which as many rows of the table would be brought from memory."""
+CERTAIN = 0.5
+"""Rays whose error is at least so many root mean squares are learned from, the others by chance."""
 MOST_BAD_STEPS = 20
 """So many steps without a finite loss in a row mean that training has broken down."""
 
@@ -72,6 +77,8 @@ class Batch(RayBatch):
     """[n_rays, 3] in [0, 1)."""
     background: Tensor
     """[n_rays, 3] in [0, 1]."""
+    chances: Tensor
+    """[n_rays] in [0, 1): decides whether a ray with a small error is learned from."""
 
 
 class Trainer:
@@ -243,10 +250,12 @@ class Trainer:
         totals = self.processes.total(len(samples.rays), len(samples.t_mid), n_learned)
         n_rays, n_samples, n_learned = (int(total) for total in totals)
         self._guide.observe(n_rays, n_samples)
-        error, weights, seen = self._error(batch, samples, learned, pilot)
+        squares, weights, seen = self._error(batch, samples, learned, pilot)
         regulariser = self._guide.regulariser(samples, weights)
-        value = self.processes.total(float(error.detach()))[0] / (3 * max(n_learned, 1))
-        loss = error / (3 * max(n_learned, 1))
+        value = self.processes.total(float(squares.detach().sum()))[0] / (3 * max(n_learned, 1))
+        if self._skips(pilot):
+            squares = squares * chosen_rays(squares.detach(), batch.chances[samples.rays])
+        loss = squares.sum() / (3 * max(n_learned, 1))
         if regulariser is not None:
             loss = loss + regulariser / max(n_rays, 1)
         # A batch that met nothing (seen by no process) has nothing to teach.
@@ -271,14 +280,16 @@ class Trainer:
             background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         else:
             background = torch.ones(n_rays, 3, device=self.device)
+        chances = torch.rand(n_rays, generator=self._generator, device=self.device)
         share = self.processes.share
-        return Batch(*(share(rows) for rows in (*vars(rays).values(), jitter, background)))
+        return Batch(*(share(rows) for rows in (*vars(rays).values(), jitter, background, chances)))
 
     def _error(
         self, batch: Batch, samples: RaySamples, learned: Tensor | None, pilot: bool
     ) -> tuple[Tensor, Tensor, Seen | None]:
-        """(Squared error of the rays that were served and are `learned` from, a bool for each ray or all,
-        summed over rays and channels; weights [n_samples]; what was seen, if that is looked at)."""
+        """(Squared error [n_served], summed over the channels, of the rays that were served, 0 for those that
+        are not `learned` from, a bool for each ray or all; weights [n_samples]; what was seen, if that is
+        looked at)."""
         rgba, background = batch.rgba[samples.rays], batch.background[samples.rays]
         pictures = batch.pictures[samples.rays]
         target = rgba[:, :3] * rgba[:, 3:] + background * (1 - rgba[:, 3:])
@@ -291,9 +302,11 @@ class Trainer:
         shown = self.effects.shown(colours, opacity, pictures[hit])
         errors = background - target
         errors[hit] = shown + background[hit] * (1 - opacity[:, None]) - target[hit]
-        kept = errors if learned is None else errors[learned[samples.rays]]
+        squares = errors.square().sum(dim=1)
+        if learned is not None:
+            squares = squares.where(learned[samples.rays], 0)
         seen = self._seen(batch, samples, hit, colours, opacity, errors) if self.effects.looks else None
-        return kept.square().sum(), weights, seen
+        return squares, weights, seen
 
     def _seen(
         self, batch: Batch, samples: RaySamples, hit: Tensor, colours: Tensor, opacity: Tensor, errors: Tensor
@@ -317,6 +330,11 @@ class Trainer:
         features = self._field.grid(samples.points, samples.features)
         if self._field.config.unbounded and self.config.near_gradients > 0:
             features = scale_near_gradients(features, samples.t_mid, self.config.near_gradients)
+        if self._skips(pilot):
+            composited, opacity, weights = composite_field(
+                self._field.density, features, samples.sigmas, samples.deltas, starts, counts, FAINT
+            )
+            return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
         sigmas = self._field.density(features)
         if pilot or self._field.config.compositing == "colour":
             network = self.pilot if pilot else self._field.head
@@ -326,6 +344,10 @@ class Trainer:
             return self._composite(sigmas, values, samples.deltas, starts, counts)
         composited, opacity, weights = self._composite(sigmas, features, samples.deltas, starts, counts)
         return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
+
+    def _skips(self, pilot: bool) -> bool:
+        """Whether a step goes through functions that take no time for rays and samples without a gradient."""
+        return self._backend == "numba" and not pilot and self._field.config.compositing == "features"
 
     def _backward(
         self, loss: Tensor, value: float, samples: RaySamples, weights: Tensor, n_rays: int, pilot: bool
@@ -401,6 +423,23 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not there:
         raise ConfigError("device: expected a GPU that torch can run CUDA on, got none: pass --device cpu")
     return torch.device("cuda" if there and name != "cpu" else "cpu")
+
+
+def chosen_rays(squares: Tensor, chances: Tensor) -> Tensor:
+    """Weights [n_rays] of rays with the squared errors `squares` [n_rays]: 0 for those left out, and for the
+    others the inverse of how probable it was that they are kept, so that a sum is the same in the mean.
+
+    Rays are kept in proportion to their error, with certainty from CERTAIN root mean squares on: of a step's
+    rays most have been learned already, and what they add to a gradient is little and costs the same.
+    `chances` [n_rays] in [0, 1) decide.
+
+    >>> import torch
+    >>> squares, chances = torch.tensor([7.84, 0.08, 0.08, 0.0]), torch.tensor([0.9, 0.9, 0.3, 0.0])
+    >>> [round(weight, 3) for weight in chosen_rays(squares, chances).tolist()]
+    [1.0, 0.0, 2.5, 0.0]
+    """
+    share = (squares / (CERTAIN * CERTAIN * squares.mean())).sqrt().clamp(max=1)
+    return torch.where(chances < share, 1 / share, torch.zeros_like(share))
 
 
 def scale_near_gradients(features: Tensor, t_mid: Tensor, distance: float) -> Tensor:

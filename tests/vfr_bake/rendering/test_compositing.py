@@ -8,7 +8,10 @@ import torch
 
 from tests.reference import composite_ray
 from tests.vfr_bake import twins
-from vfr_bake.rendering.compositing import composite, distortion
+from vfr_bake.field.networks import DensityNetwork
+from vfr_bake.kernels.compositing import silence
+from vfr_bake.kernels.density import LARGEST_LOGIT
+from vfr_bake.rendering.compositing import composite, composite_field, distortion
 
 STEP = 0.25
 RAYS = {
@@ -124,3 +127,57 @@ def test_distortion_gradient_reaches_rays_out_of_order() -> None:
     backwards = distortion(weights, mids, widths, starts.flip(0), counts.flip(0))
     (gradient,) = torch.autograd.grad(backwards[1], weights)
     assert (gradient[:3] != 0).all() and (gradient[3:] == 0).all()
+
+
+@pytest.mark.parametrize("width", [0, 16])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_field_is_composited_as_its_parts_are(width: int, known: bool) -> None:
+    """In one function, against float64's density network and compositing one after the other."""
+    torch.manual_seed(1)
+    density, exact = DensityNetwork(6, width), DensityNetwork(6, width).double()
+    for parameter in density.parameters():
+        torch.nn.init.normal_(parameter, std=0.7)
+    exact.load_state_dict(density.state_dict())
+    counts = torch.tensor([3, 0, 1, 20])
+    starts = torch.cumsum(counts, 0) - counts
+    features = 2 * torch.randn(24, 6)
+    features[0], features[1], features[2] = 0, 60, -60  # saturated, and gone
+    deltas = torch.full((24,), STEP)
+    found = []
+    for network, dtype in ((density, torch.float32), (exact, torch.float64)):
+        f = features.detach().to(dtype, copy=True).requires_grad_()
+        if dtype == torch.float64:
+            outputs = twins.composite(network(f), f, deltas.double(), starts, counts)
+        else:
+            sigmas = network.logits(f).detach().clamp(max=LARGEST_LOGIT).exp() if known else None
+            outputs = composite_field(network, f, sigmas, deltas, starts, counts)
+        torch.manual_seed(2)
+        sum((out * torch.randn(out.shape)).sum() for out in outputs).backward()
+        found.append([*(out.detach() for out in outputs), f.grad, *(p.grad for p in network.parameters())])
+    for ours, theirs in zip(*found, strict=True):
+        scale = max(float(theirs.abs().max()), 1.0)
+        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=1e-5 * scale)
+
+
+def test_nothing_is_composited_of_nothing() -> None:
+    density, none = DensityNetwork(2, 4), torch.zeros(0, dtype=torch.int64)
+    features = torch.empty(0, 2, requires_grad=True)
+    outputs = composite_field(density, features, None, torch.empty(0), none, none)
+    sum(out.sum() for out in outputs).backward()
+    assert features.grad.shape == (0, 2)
+    assert not any(parameter.grad.any() for parameter in density.parameters())
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_faint_gradients_are_silenced(dtype: type) -> None:
+    rows = np.array([[3.0, 4.0], [0.3, 0.4], [1e-30, 0.0], [0.0, 0.0]], dtype)
+    root = np.sqrt((25 + 0.25) / 4)
+    for faint, n_kept in ((0.0, 3), (0.49 / root, 2), (0.51 / root, 1)):
+        gradients = rows.copy()
+        silence(gradients, dtype(faint))
+        np.testing.assert_array_equal(gradients[:n_kept], rows[:n_kept])
+        assert not gradients[n_kept:].any()
+    bad = np.array([[np.nan, 0.0], [1.0, 0.0]], dtype)
+    silence(bad, dtype(0.5))
+    assert np.isnan(bad[0, 0]) and bad[1, 0] == 1, "a bad step is seen, not hidden"
+    silence(rows[:0], dtype(0.5))

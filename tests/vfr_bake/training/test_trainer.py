@@ -25,7 +25,7 @@ from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.rays import RayBatch
-from vfr_bake.training.trainer import Trainer, scale_near_gradients
+from vfr_bake.training.trainer import CERTAIN, Trainer, chosen_rays, scale_near_gradients
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
 
@@ -276,3 +276,23 @@ class Poison(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads: torch.Tensor) -> torch.Tensor:
         return grads[0] * math.nan
+
+
+def test_rays_are_left_out_by_chance_and_sums_stay_the_same_in_the_mean() -> None:
+    torch.manual_seed(0)
+    squares = torch.tensor([4.0, 1.0, 1e-2, 1e-4, 1e-6, 0.0])
+    weights = torch.stack([chosen_rays(squares, chances) for chances in torch.rand(20_000, 6)])
+    kept = (weights > 0).float().mean(dim=0)
+    least = CERTAIN * squares.mean().sqrt()
+    expected = (squares.sqrt() / least).clamp(max=1)
+    torch.testing.assert_close(kept, expected, rtol=0, atol=0.02)  # five standard deviations of 20,000 draws
+    assert kept[0] == 1 and kept[-1] == 0
+    # The rarest of these is kept some 440 times, so that its mean is 1 to a twentieth of itself.
+    torch.testing.assert_close(weights.mean(dim=0)[:4], torch.ones(4), rtol=0, atol=0.25)
+
+
+def test_the_choice_of_rays_hides_no_bad_step() -> None:
+    squares = torch.tensor([1.0, math.nan])
+    assert torch.isnan((squares * chosen_rays(squares, torch.zeros(2))).sum())
+    assert not chosen_rays(torch.zeros(3), torch.zeros(3)).any()
+    assert chosen_rays(torch.zeros(0), torch.zeros(0)).shape == (0,)
