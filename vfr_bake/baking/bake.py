@@ -70,7 +70,7 @@ from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
-from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
@@ -214,7 +214,7 @@ class _Bake:
                 f"do not fit into {room}; part of the loss after 'grid'"
             )
             step = lattice_step(resolutions.densities) if unbounded else step
-        near = model.sampler.near if isinstance(model.sampler, ProposalSampler) else 0.0
+        near = 0.0 if isinstance(model.sampler, OccupancyGrid) else model.sampler.near
         layout = make_layout(fitted.cells, step, resolutions, unbounded, near, self.choice.density_step)
         return layout, plan.n_rays(fitted.n_cells)
 

@@ -6,7 +6,7 @@ counts is the sum along a ray. So cells whose samples weigh less than a floor in
 where the pictures without them lose next to nothing, measured on what nothing is learned from.
 
 An unbounded scene has no occupancy grid: where no view has ever put a sample, the field holds untrained
-values. A cell is stored only if the intervals that the proposals chose on some ray have weight in it.
+values. A cell is stored only if the samples that the model's sampler chose on some ray have weight in it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
 from vfr_bake.kernels.visibility import mark_visible_cells, mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
-from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.space_grid import SpaceGrid, steps_around
 from vfr_bake.training.model_file import Model
 
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
@@ -41,9 +41,9 @@ there are and wherever they stand. Fox needs 1.2 million for as many hits."""
 VIEWS_OF_A_CELL = 0.4
 """Share of the training views that see a given piece of surface, roughly."""
 BLOCK = 2
-"""Cells along each edge of a block. Blocks are found whole in an unbounded scene: the model's proposals take
-their time, 4,000 rays a second of one core, and so a quarter of the rays is enough. Surfaces are some cells
-thick anyway."""
+"""Cells along each edge of a block. Blocks are found whole in an unbounded scene: samples take their time (of
+a model with proposals 4,000 rays a second of one core), and so a quarter of the rays is enough. Surfaces are
+some cells thick anyway."""
 FASTEST_CELLS = 2.0
 """Cells between two samples of a ray where it is fastest in contracted space; where it is slowest there are
 two fifths of that."""
@@ -343,7 +343,6 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     they are: another camera of the scene sees beyond their border, where the model goes on. Raises
     TrainingError when nothing is seen.
     """
-    assert isinstance(model.sampler, ProposalSampler)
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
     cameras = [widened(camera) for camera in model.model_cameras()]
@@ -384,7 +383,10 @@ def _mark(model: Model, rays_o: np.ndarray, rays_d: np.ndarray, floor: float, vi
     samples = model.sampler.sample_all(model.field, rays_o, rays_d)
     sigmas = model.field.density(samples.features)
     _, _, weights = composite(sigmas, samples.features, samples.deltas, samples.starts, samples.counts)
+    lengths = samples.deltas.numpy()
+    if isinstance(model.sampler, SpaceGrid):
+        lengths = steps_around(samples, rays_o, rays_d)
     mark_weighty_cells(
-        rays_o, rays_d, samples.t_mid.numpy(), samples.deltas.numpy(), weights.numpy(),
+        rays_o, rays_d, samples.t_mid.numpy(), lengths, weights.numpy(),
         samples.starts.numpy(), samples.counts.numpy(), np.float32(floor), visible,
     )  # fmt: skip

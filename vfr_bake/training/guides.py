@@ -1,11 +1,13 @@
-"""What finds the geometry while a field is trained: an occupancy grid for objects, proposals for scenes.
+"""What finds the geometry while a field is trained: an occupancy grid for objects, a grid of contracted space
+or proposals for scenes.
 
-Both give the trainer the samples of rays, learn from what came of them, and are at last the sampler that the
+All give the trainer the samples of rays, learn from what came of them, and are at last the sampler that the
 trained field is rendered with. Those of a GPU are in `vfr_bake.training.device_guides`.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -21,6 +23,7 @@ from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
+from vfr_bake.rendering.space_grid import Intervals, SpaceGrid
 from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
@@ -144,6 +147,52 @@ class OccupancyGuide(BoxGuide):
         if grid.n_updates > 0:
             grid.observe(samples.points.numpy(), sigmas)
         return samples
+
+
+class SpaceGridGuide(Guide):
+    """Marches an unbounded scene on a CPU and keeps its grid of contracted space."""
+
+    _intervals: Intervals
+
+    def __init__(
+        self, config: TrainConfig, settings: DeviceSettings, near: float, processes: Processes
+    ) -> None:
+        self._config, self._settings, self._processes = config, settings, processes
+        self._grid = SpaceGrid(near, config.seed)
+
+    @property
+    def sampler(self) -> SpaceGrid:
+        return self._grid
+
+    def n_rays(self, pilot: bool) -> int:
+        return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
+
+    def prepare(self, step: int, field: VfrField) -> None:
+        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
+            # Every process has seen its own rays.
+            self._processes.add_up([torch.from_numpy(self._grid.gathered)])
+            self._grid.update(field)
+
+    def sample(
+        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
+    ) -> RaySamples:
+        samples, sigmas, self._intervals = self._grid.march(field, rays_o, rays_d, jitter[:, 0].contiguous())
+        self._grid.observe(samples.points.numpy(), sigmas)
+        return samples
+
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
+        if self._config.distortion == 0:
+            return None
+        # In angles, from 0 to 1 over the longest ray.
+        mids, widths = (part / math.pi for part in self._intervals)
+        losses = distortion(weights, mids, widths, samples.starts, samples.counts)
+        return self._config.distortion * losses.sum()
+
+    def state(self) -> dict[str, Any]:
+        return {"grid": self._grid.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._grid.restore(state["grid"])
 
 
 class SpaceGuide(Guide):

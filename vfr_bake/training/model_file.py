@@ -8,7 +8,8 @@ measured), since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), wh
 files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where
 all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
 occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
-tensors).
+tensors), or, since version 2.3, its grid of contracted space: near, threshold (optical depth), densities
+[128, 128, 128] float32.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, ProposalSampler
 from vfr_bake.rendering.render import Sampler, mean_colour, render_rays
+from vfr_bake.rendering.space_grid import RESOLUTION, THRESHOLD, SpaceGrid
 from vfr_bake.training.captures.exposure import Correction
 from vfr_bake.training.captures.picture_colours import (
     GAINS,
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 2)
+VERSION = (2, 3)
 N_MEAN_VIEWS = 16
 """Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
@@ -82,7 +84,7 @@ class Model:
     def occupancy(self) -> OccupancyGrid:
         """The occupancy grid of an object. Raises ConfigError for an unbounded scene, which has none."""
         if not isinstance(self.sampler, OccupancyGrid):
-            raise ConfigError("model: sampler: expected an object's occupancy grid, got a scene's proposals")
+            raise ConfigError("model: sampler: expected an object's occupancy grid, got a scene's sampler")
         return self.sampler
 
     @cached_property
@@ -191,7 +193,7 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
     _check_table(config, content["state"], f"{path}: state")
     field = VfrField(config)
     _restore(field, content["state"], f"{path}: state")
-    restore_sampler = _restore_proposals if config.unbounded else _restore_occupancy
+    restore_sampler = _restore_space if config.unbounded else _restore_occupancy
     sampler = restore_sampler(content["sampler"], f"{path}: sampler")
     matrix = content["world_from_model"]
     check_plain(matrix, matrix.is_floating_point(), "floats", f"{path}: world_from_model")
@@ -244,6 +246,9 @@ def _read(path: Path, max_memory: float | None) -> dict[str, Any]:
 def _sampler_content(sampler: Sampler) -> dict[str, Any]:
     if isinstance(sampler, ProposalSampler):
         return {"near": sampler.near, "state": sampler.state_dict()}
+    if isinstance(sampler, SpaceGrid):
+        densities = torch.from_numpy(sampler.densities)
+        return {"near": sampler.near, "threshold": sampler.threshold, "densities": densities}
     bits = torch.from_numpy(np.packbits(sampler.occupied.reshape(-1)))
     return {"step": sampler.step, "occupied": bits, "resolution": sampler.resolution}
 
@@ -281,13 +286,38 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
     return occupancy
 
 
-def _restore_proposals(content: dict[str, Any], where: str) -> ProposalSampler:
+def _restore_space(content: dict[str, Any], where: str) -> SpaceGrid | ProposalSampler:
+    if "densities" in content:
+        return _restore_grid(content, where)
     check_kinds(content, {"near": float, "state": dict}, where)
-    if not 0 <= content["near"] < FAR:
-        raise FormatError(f"{where}: near: expected 0 to {FAR}, got {content['near']}")
+    _check_near(content["near"], where)
     sampler = ProposalSampler(content["near"])
     _restore(sampler, content["state"], where)
     return sampler
+
+
+def _restore_grid(content: dict[str, Any], where: str) -> SpaceGrid:
+    check_kinds(content, {"near": float, "threshold": float, "densities": torch.Tensor}, where)
+    _check_near(content["near"], where)
+    threshold, densities = content["threshold"], content["densities"]
+    if not 0 <= threshold <= THRESHOLD:
+        raise FormatError(f"{where}: threshold: expected 0 to {THRESHOLD}, got {threshold}")
+    check_plain(densities, densities.dtype == torch.float32, "32-bit floats", f"{where}: densities")
+    if list(densities.shape) != [RESOLUTION] * 3:
+        raise FormatError(
+            f"{where}: densities: expected {[RESOLUTION] * 3}, got {brief(list(densities.shape))}"
+        )
+    if not (densities.isfinite() & (densities >= 0)).all():
+        raise FormatError(f"{where}: densities: expected finite numbers of at least 0")
+    grid = SpaceGrid(content["near"], seed=0)
+    grid.densities[:] = densities.numpy()
+    grid.threshold = threshold
+    return grid
+
+
+def _check_near(near: float, where: str) -> None:
+    if not 0 <= near < FAR:
+        raise FormatError(f"{where}: near: expected 0 to {FAR}, got {near}")
 
 
 def _restore(module: nn.Module, state: dict[str, Any], where: str) -> None:

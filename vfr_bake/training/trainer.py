@@ -26,7 +26,7 @@ from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.captures.unmasked import draw_unmasked, unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
-from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
+from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide, SpaceGridGuide
 from vfr_bake.training.length.duration import Duration
 from vfr_bake.training.length.witness_errors import WitnessErrors
 from vfr_bake.training.length.witness_loss import WitnessLoss
@@ -147,8 +147,10 @@ class Trainer:
 
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
-        if scene.unbounded:
+        if scene.unbounded and self.config.sampling == "proposals":
             self._guide = ProposalGuide(self.config, self.pace, scene.near)
+        elif scene.unbounded:
+            self._guide = SpaceGridGuide(self.config, self.pace, scene.near, self.processes)
         else:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
         grid = self._field.grid
@@ -157,6 +159,8 @@ class Trainer:
 
     def _use_torch(self, scene: Scene) -> None:
         self._composite = composite_on_device
+        if scene.unbounded and self.config.sampling == "grid":
+            raise ConfigError("sampling: on a GPU: expected auto or proposals, got grid")
         if scene.unbounded:
             self._guide = DeviceProposalGuide(self.config, self.pace, scene.near, self.device)
         else:

@@ -19,9 +19,11 @@ from numba import config
 from vfr_bake.config import FieldOptions
 from vfr_bake.kernels import adam, hash_grid
 from vfr_bake.field.field import VfrField
+from vfr_bake.kernels.space import settle
 from vfr_bake.kernels.visibility import mark_visible_cells
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.space_grid import SpaceGrid
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import FusedGridAdam, GridAdam
@@ -35,10 +37,19 @@ generator = torch.Generator().manual_seed(2)
 rays_o = torch.randn(5, 3, generator=generator) * 1.5
 rays_d = torch.nn.functional.normalize(torch.rand(5, 3, generator=generator) - 0.5 - rays_o, dim=-1)
 options = FieldOptions(n_levels=7, base_resolution=4, max_resolution=20, log2_table_size=10, head_width=8)
-for unbounded in (False, True):
+for kind in ("object", "grid", "proposals"):
+    unbounded = kind != "object"
     field = VfrField(options.resolved(unbounded))
     torch.nn.init.uniform_(field.grid.table, -1, 1)
-    if unbounded:
+    if kind == "grid":
+        sampler = SpaceGrid(0.05, seed=0)
+        sampler.densities[:] = 0.5
+        sampler.threshold = 0.01
+        samples, sigmas, _ = sampler.march(field, rays_o[:2], rays_d[:2], torch.full((2,), 0.3))
+        sampler.observe(samples.points.numpy(), sigmas)
+        settle(*sampler.gathered, np.float32(0.5), sampler.densities)
+        found["densities"] = sampler.densities
+    elif unbounded:
         sampler = ProposalSampler(0.05)
         for grid in sampler.grids:
             torch.nn.init.uniform_(grid.table, -2, 2)
@@ -53,13 +64,13 @@ for unbounded in (False, True):
         mark_visible_cells(rays_o.numpy(), rays_d.numpy(), *arguments, np.float32([0.01, 0.2]), visible)
         found["visible"] = visible
     for name in ("t_mid", "deltas", "points", "features", "counts"):
-        found[f"{unbounded} {name}"] = getattr(samples, name).detach().numpy()
+        found[f"{kind} {name}"] = getattr(samples, name).detach().numpy()
     features, opacity, depth = sampler.composited_features(field, rays_o[:2].numpy(), rays_d[:2].numpy())
-    found |= {f"{unbounded} rgb": features, f"{unbounded} opacity": opacity, f"{unbounded} depth": depth}
+    found |= {f"{kind} rgb": features, f"{kind} opacity": opacity, f"{kind} depth": depth}
     optimiser = (GridAdam if unbounded else FusedGridAdam)(field.grid.table if unbounded else field.grid)
     field.grid(samples.points[:20]).square().sum().backward()
     optimiser.step(0.01)
-    found[f"{unbounded} table"] = field.grid.table.detach().numpy()
+    found[f"{kind} table"] = field.grid.table.detach().numpy()
 np.savez(sys.argv[1], **found)
 """
 
@@ -81,6 +92,6 @@ def test_kernels_stay_within_their_arrays_and_are_what_they_say(tmp_path: Path) 
     assert set(plain) == set(compiled) and len(plain) > 15
     for name, values in plain.items():
         # In float32 flat parts of a proposal magnify rounding a thousandfold in each round.
-        rtol, atol = (0.05, 5e-3) if name.startswith("True") else (1e-3, 2e-4)
+        rtol, atol = (0.05, 5e-3) if name.startswith("proposals") else (1e-3, 2e-4)
         np.testing.assert_allclose(compiled[name], values, rtol=rtol, atol=atol, err_msg=name)
         assert values.any(), name

@@ -18,6 +18,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.rendering.render import render_image
+from vfr_bake.rendering.space_grid import RESOLUTION, SpaceGrid
 from vfr_bake.training.model_file import Model, load_model, save_model
 from vfr_bake.training.witness_tensors import witness_content
 
@@ -205,6 +206,56 @@ def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:
     change(saved, **values)
     with pytest.raises(VersionError if "2.x" in message else FormatError, match=message):
         load_model(saved)
+
+
+def scenes_grid(**values: object) -> dict[str, object]:
+    return {"near": 0.1, "threshold": 0.01, "densities": torch.zeros((RESOLUTION,) * 3)} | values
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"near": -1.0}, "near: expected 0 to"),
+        ({"near": float("nan")}, "near: expected 0 to"),
+        ({"threshold": 0.5}, "threshold: expected 0 to"),
+        ({"threshold": float("nan")}, "threshold: expected 0 to"),
+        ({"threshold": None}, "threshold: expected float"),
+        ({"densities": [1.0]}, "densities: expected Tensor"),
+        ({"densities": torch.zeros(8, 8, 8)}, r"densities: expected \[128, 128, 128\], got \[8, 8, 8\]"),
+        (
+            {"densities": torch.zeros((128,) * 3, dtype=torch.float64)},
+            "densities: expected a plain tensor",
+        ),
+        ({"densities": torch.full((128,) * 3, -1.0)}, "densities: expected finite numbers of at least 0"),
+        ({"densities": torch.full((128,) * 3, torch.inf)}, "densities: expected finite numbers"),
+        ({"densities": torch.full((128,) * 3, torch.nan)}, "densities: expected finite numbers"),
+    ],
+)
+def test_a_broken_grid_of_a_scene_is_named(
+    saved: Path, model: Model, values: dict[str, object], message: str
+) -> None:
+    field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
+    save_model(saved, replace(model, field=field, sampler=SpaceGrid(0.1, seed=0)))
+    change(saved, sampler=scenes_grid(**values))
+    with pytest.raises(FormatError, match=message):
+        load_model(saved)
+
+
+def test_samplers_of_scenes_come_back(saved: Path, model: Model) -> None:
+    """The grid, and the proposals of a GPU and of the models of version 2.2."""
+    field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
+    torch.nn.init.uniform_(field.grid.table, -1, 1)
+    grid = SpaceGrid(0.1, seed=0)
+    grid.densities[:] = np.random.default_rng(0).random((RESOLUTION,) * 3)
+    grid.threshold = 0.005
+    rays_o, rays_d = np.zeros((3, 3), np.float32), np.eye(3, dtype=np.float32)
+    for sampler in (grid, ProposalSampler(0.1)):
+        save_model(saved, replace(model, field=field, sampler=sampler))
+        found = load_model(saved).sampler
+        assert type(found) is type(sampler) and found.near == 0.1  # type: ignore[union-attr]
+        expected = sampler.composited_features(field, rays_o, rays_d)
+        for ours, theirs in zip(found.composited_features(field, rays_o, rays_d), expected, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
 
 
 def test_nan_in_the_weights_is_named(saved: Path) -> None:
