@@ -37,7 +37,7 @@ generator = torch.Generator().manual_seed(2)
 rays_o = torch.randn(5, 3, generator=generator) * 1.5
 rays_d = torch.nn.functional.normalize(torch.rand(5, 3, generator=generator) - 0.5 - rays_o, dim=-1)
 options = FieldOptions(n_levels=7, base_resolution=4, max_resolution=20, log2_table_size=10, head_width=8)
-for kind in ("object", "grid", "proposals"):
+for kind in ("object", "proposals", "grid"):
     unbounded = kind != "object"
     field = VfrField(options.resolved(unbounded))
     torch.nn.init.uniform_(field.grid.table, -1, 1)
