@@ -1,4 +1,5 @@
-"""Random pixels of the training pictures, all but the witnesses, as rays with their colours."""
+"""Random pixels of the training pictures, all but the witnesses and what is masked, as rays with their
+colours."""
 
 from __future__ import annotations
 
@@ -9,12 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from player.errors import TrainingError
 from vfr_bake.data.capture import PosedImages, StoredImages
 from vfr_bake.data.witnesses import Witnesses
+from vfr_bake.training.detail import detail_lots
 
 CHUNK_SHARE = 0.25
 """Pixels that are drawn from a chunk, as a share of those in it: few are drawn twice, and what is read from a
 disk is four times what is used."""
+RUN = 64
+"""Pixels whose lots are summed in one number; as many as a line of the cache has bytes."""
 
 
 @dataclass(frozen=True)
@@ -98,25 +103,73 @@ class Pixels(NamedTuple):
         return (column + 0.5) / self.widths[view], (row + 0.5) / self.heights[view]
 
 
+class Lottery:
+    """Draws whole numbers, each as often as it has lots.
+
+    >>> lottery = Lottery(np.array([0, 3, 1], np.uint8))
+    >>> lottery.n_lots, lottery.numbers(np.arange(4)).tolist()
+    (4, [1, 1, 1, 2])
+    """
+
+    def __init__(self, lots: np.ndarray) -> None:
+        """`lots` [n] uint8 of the numbers below n."""
+        runs = np.zeros((-(-len(lots) // RUN), RUN), np.uint8)
+        runs.reshape(-1)[: len(lots)] = lots
+        sums = runs.sum(axis=1, dtype=np.int64)
+        self.runs: Any = runs
+        self.ends: Any = np.cumsum(sums)
+        """[n_runs] int64: the lot behind the last of each run of numbers."""
+        self.n_lots = int(sums.sum())
+
+    def to(self, device: torch.device) -> Lottery:
+        """Work with tensors on a device from now on."""
+        self.runs, self.ends = (torch.from_numpy(a).to(device) for a in (self.runs, self.ends))
+        return self
+
+    def numbers(self, lots: Any) -> Any:
+        """[n] int64: whose the `lots` [n] int64 are, counted from 0 to n_lots - 1."""
+        if isinstance(lots, Tensor):
+            run = torch.searchsorted(self.ends, lots, right=True)
+            sums = self.runs[run].cumsum(1, dtype=torch.int16)
+        else:
+            run = np.searchsorted(self.ends, lots, side="right")
+            sums = self.runs[run].cumsum(1, dtype=np.int16)
+        left = lots - self.ends[run] + sums[:, -1]
+        return RUN * run + (sums <= left[:, None]).sum(1)
+
+
 class PixelSampler:
-    """Draws pixels uniformly from all pixels of all training pictures that are no witnesses.
+    """Draws pixels at random from all training pictures, but for witnesses and what is masked: all alike
+    often, or more often where pictures show detail (`vfr_bake.training.detail`).
 
     Of pictures on a disk it draws from one chunk after the other, for CHUNK_SHARE as many pixels as that has:
-    each is an even sample of all pictures, and the disk is read in long runs.
+    each is an even sample of all pictures, and the disk is read in long runs. There, a pixel's neighbours are
+    not at hand, and all pixels are drawn alike often.
 
     In numpy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
     the step itself.
     """
 
     def __init__(
-        self, views: PosedImages, generator: torch.Generator, witnesses: Witnesses | None = None
+        self,
+        views: PosedImages,
+        generator: torch.Generator,
+        witnesses: Witnesses | None = None,
+        masked: bool = False,
+        by_detail: bool = False,
     ) -> None:
-        """`witnesses`: of `views`; with None all pixels are drawn."""
+        """`witnesses`: of `views`; with None all pixels are drawn. `masked`: whether pixels that are not
+        opaque are masked; some must not be (`vfr_bake.data.files.masks.check_masked`). `by_detail`: whether
+        detail of pictures in memory is drawn more often.
+
+        Raises TrainingError: there is nothing to draw.
+        """
         learned = range(len(views.cameras)) if witnesses is None else witnesses.learned()
-        self._views, self._generator = views.some(learned), generator
+        self._views, self._generator, self._masked = views.some(learned), generator, masked
         self._singles = _single_pixels(witnesses, len(self._views.cameras))
         images = self._views.images
         self._n_chunks = images.n_chunks if isinstance(images, StoredImages) else 1
+        self._by_detail = by_detail and not isinstance(images, StoredImages)
         self._go_to(0)
 
     @property
@@ -132,28 +185,41 @@ class PixelSampler:
         self._n_left = n_left
 
     def _go_to(self, chunk: int) -> None:
-        self._chunk = chunk
-        self._pixels = Pixels.of(self._views, chunk)
-        view, number = self._singles
-        kept = np.sort(_indices(self._pixels, view, number))
-        self._n_drawn = len(self._pixels.rgba) - len(kept)
-        self._n_before: Any = kept - np.arange(len(kept))
-        """[n_single] int64, ascending: the number of pixels that are drawn before each single witness."""
-        self._n_left = max(1, int(CHUNK_SHARE * self._n_drawn))
+        """Draw from a `chunk`, or from the next one that has something to draw."""
+        for ahead in range(self._n_chunks):
+            self._chunk = (chunk + ahead) % self._n_chunks
+            self._pixels = Pixels.of(self._views, self._chunk)
+            self._lottery = self._new_lottery()
+            if self._lottery.n_lots:
+                self._n_left = max(1, int(CHUNK_SHARE * self._lottery.n_lots))
+                return
+        raise TrainingError("training pictures: expected pixels that are not masked, found none")
 
-    def _count(self, n_rays: int) -> None:
-        """So many pixels are about to be drawn."""
+    def _new_lottery(self) -> Lottery:
+        """The lots of the pixels that are there."""
+        pixels = self._pixels
+        if self._by_detail:
+            lots = np.concatenate([detail_lots(image).reshape(-1) for image in self._views.images])
+        else:
+            lots = np.ones(len(pixels.rgba), np.uint8)
+        if self._masked and pixels.rgba.shape[1] == 4:
+            lots[pixels.rgba[:, 3] < 255] = 0
+        lots[_indices(pixels, *self._singles)] = 0
+        return Lottery(lots)
+
+    def _lots_drawn(self, n_rays: int) -> Tensor:
+        """[n_rays] int64 random lots of the chunk that it is the turn of."""
         if self._n_chunks > 1:
             if self._n_left <= 0:
                 self._go_to((self._chunk + 1) % self._n_chunks)
             self._n_left -= n_rays
+        generator = self._generator
+        return torch.randint(self._lottery.n_lots, (n_rays,), generator=generator, device=generator.device)
 
     def draw(self, n_rays: int) -> RayBatch:
         """`n_rays` pixels, with replacement."""
-        self._count(n_rays)
-        pixels = self._pixels
-        index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator).numpy()
-        index += np.searchsorted(self._n_before, index, side="right")
+        lots, pixels = self._lots_drawn(n_rays).numpy(), self._pixels
+        index = self._lottery.numbers(lots)
         view = np.searchsorted(pixels.ends, index, side="right")
         row, column = np.divmod(pixels.numbers(view, index), pixels.widths[view])
         row, column = row.astype(np.float32), column.astype(np.float32)
@@ -171,19 +237,17 @@ class PixelSampler:
 
 
 class DevicePixelSampler(PixelSampler):
-    """`PixelSampler` with the pixels on a GPU, 4 bytes each; `generator` is of that device."""
+    """`PixelSampler` with the pixels on a GPU, 5 bytes each; `generator` is of that device."""
 
     def _go_to(self, chunk: int) -> None:
         super()._go_to(chunk)
         device = self._generator.device
         self._pixels = Pixels(*(torch.from_numpy(array).to(device) for array in self._pixels))
-        self._n_before = torch.from_numpy(self._n_before).to(device)
+        self._lottery.to(device)
 
     def draw(self, n_rays: int) -> RayBatch:
-        self._count(n_rays)
-        pixels, device = self._pixels, self._generator.device
-        index = torch.randint(self._n_drawn, (n_rays,), generator=self._generator, device=device)
-        index += torch.searchsorted(self._n_before, index, right=True)
+        lots, pixels, device = self._lots_drawn(n_rays), self._pixels, self._generator.device
+        index = self._lottery.numbers(lots)
         view = torch.searchsorted(pixels.ends, index, right=True)
         number, width = pixels.numbers(view, index), pixels.widths[view]
         row, column = number // width, number % width

@@ -24,7 +24,7 @@ from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
-from vfr_bake.training.captures.unmasked import draw_unmasked, unmasked_witnesses
+from vfr_bake.training.captures.unmasked import unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide, SpaceGridGuide
 from vfr_bake.training.length.duration import Duration
@@ -126,6 +126,9 @@ class Trainer:
         self._views = scene.train
         self._masked = scene.masked
         self._background = None if scene.unbounded and not scene.has_alpha else np.ones(3)
+        # Where no alpha tells background from matter, plain pixels are what shows that space is empty; and
+        # the batches of a GPU have detail enough.
+        self._by_detail = scene.has_alpha and self.device.type == "cpu"
         witnesses = choose_witnesses(scene.train)
         self._keep_apart(unmasked_witnesses(witnesses) if scene.masked else witnesses)
         self.minutes = config.minutes_for(self.device.type, scene.unbounded)
@@ -178,7 +181,7 @@ class Trainer:
         sampler = DevicePixelSampler if self._backend == "torch" else PixelSampler
         self.witnesses = witnesses
         """The pixels of the training views that no step learns from."""
-        self._pixels = sampler(self._views, self._generator, witnesses)
+        self._pixels = sampler(self._views, self._generator, witnesses, self._masked, self._by_detail)
         self._probe: WitnessErrors | None = None
         self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
         """Changing exposure, and things that move; its pictures are the views that are learned from."""
@@ -278,7 +281,7 @@ class Trainer:
 
     def _draw(self, n_rays: int) -> Batch:
         """This process' share of a joint batch, drawn alike in all of them."""
-        rays = draw_unmasked(self._pixels, n_rays) if self._masked else self._pixels.draw(n_rays)
+        rays = self._pixels.draw(n_rays)
         jitter = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         if self._random_background:
             background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)

@@ -1,16 +1,20 @@
-"""Random pixels: the right rays, the right colours, every pixel but a witness as often as any other."""
+"""Random pixels: the right rays, the right colours, every pixel but a witness as often as any other,
+or as its detail asks for."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
+from player.errors import TrainingError
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.rays import DevicePixelSampler, PixelSampler
+from vfr_bake.training.detail import detail_lots
+from vfr_bake.training.rays import RUN, DevicePixelSampler, Lottery, PixelSampler, RayBatch
 
 
 def mixed_views() -> PosedImages:
@@ -58,12 +62,57 @@ def test_a_gpus_sampler_draws_the_same(device: torch.device) -> None:
         torch.testing.assert_close(ours.rays_d, numpys.rays_d, rtol=0, atol=1e-6)
 
 
-def test_every_pixel_is_as_likely_as_any_other() -> None:
-    n_rays = 59_000
-    batch = PixelSampler(mixed_views(), torch.Generator().manual_seed(1)).draw(n_rays)
-    counts = np.bincount((batch.rgba[:, 0] * 255).round().long().numpy(), minlength=59)
-    # 1000 expected, standard deviation 31: five of them, for 59 pixels.
-    assert np.abs(counts - 1000).max() < 5 * 31.4
+def number_of(batch: RayBatch) -> np.ndarray:
+    return (batch.rgba[:, 0] * 255).round().long().cpu().numpy()
+
+
+def check_draws(batch: RayBatch, lots: np.ndarray) -> None:
+    """Every pixel has been drawn as often as its `lots` [n] say."""
+    counts = np.bincount(number_of(batch), minlength=len(lots))
+    expected = len(batch.rgba) * lots / lots.sum()
+    # Five standard deviations of the counts, which are Poisson distributed.
+    assert (np.abs(counts - expected) <= 5 * np.sqrt(expected)).all()
+
+
+def lots_by_detail(views: PosedImages) -> np.ndarray:
+    return np.concatenate([detail_lots(image).reshape(-1) for image in views.images]).astype(float)
+
+
+def test_pixels_are_drawn_alike_or_by_their_detail(device: torch.device) -> None:
+    views = mixed_views()
+    views.images[1][2:, :, 3] = 0
+    views.images[2][0, 0, 2] = 250
+    lots = lots_by_detail(views)
+    assert lots.max() > 2 * lots.min() > 0
+    for kind, place in ((PixelSampler, torch.device("cpu")), (DevicePixelSampler, device)):
+        for by_detail, expected in ((False, np.ones(59)), (True, lots)):
+            generator = torch.Generator(place).manual_seed(1)
+            check_draws(kind(views, generator, by_detail=by_detail).draw(59_000), expected)
+
+
+def test_a_lottery_draws_each_number_as_often_as_it_has_lots(device: torch.device) -> None:
+    random = np.random.default_rng(0)
+    most = np.full(3 * RUN, 255)  # the largest sums of a run
+    gaps = np.where(np.arange(700) % 300 == 299, 7, 0)  # runs without a lot, and an incomplete last one
+    for lots in (random.integers(0, 256, 1000), most, gaps, np.array([0, 0, 1]), np.array([5])):
+        lottery = Lottery(lots.astype(np.uint8))
+        every = np.arange(lots.sum())
+        assert lottery.n_lots == len(every)
+        numbers = lottery.numbers(every)
+        np.testing.assert_array_equal(numbers, np.repeat(np.arange(len(lots)), lots))
+        assert lottery.numbers(every[:0]).shape == (0,)
+        lottery.to(device)
+        np.testing.assert_array_equal(
+            lottery.numbers(torch.from_numpy(every).to(device)).cpu().numpy(), numbers
+        )
+
+
+def test_pictures_without_a_pixel_to_draw() -> None:
+    views = mixed_views()
+    for image in views.images:
+        image[..., 3] = 0
+    with pytest.raises(TrainingError, match="expected pixels that are not masked, found none"):
+        PixelSampler(views, torch.Generator(), masked=True)
 
 
 def some_witnesses() -> Witnesses:
@@ -77,22 +126,23 @@ def some_witnesses() -> Witnesses:
     )
 
 
-def test_no_witness_is_ever_drawn_and_every_other_pixel_alike_often(device: torch.device) -> None:
+def test_no_witness_and_nothing_masked_is_ever_drawn(device: torch.device) -> None:
     views, witnesses = mixed_views(), some_witnesses()
-    drawn = [
-        *(n for n in range(12) if n not in (0, 1, 2, 7, 11)),
-        *(47 + n for n in (1, 2, 3, 4, 7, 8, 9, 10)),
-    ]
-    assert len(drawn) == 15
     rays_d = np.concatenate([camera.rays()[1] for camera in views.cameras])
-    for kind, place in ((PixelSampler, torch.device("cpu")), (DevicePixelSampler, device)):
-        batch = kind(views, torch.Generator(place).manual_seed(3), witnesses).draw(15_000)
-        number = (batch.rgba[:, 0] * 255).round().long().cpu().numpy()
-        counts = np.bincount(number, minlength=59)
-        assert np.flatnonzero(counts).tolist() == drawn
-        # 1000 expected, standard deviation 31: five of them, for 15 pixels.
-        assert np.abs(counts[drawn] - 1000).max() < 5 * 31
-        np.testing.assert_allclose(batch.rays_d.cpu().numpy(), rays_d[number], atol=1e-6)
+    kept = [0, 1, 2, 7, 11, *range(12, 47), *(47 + n for n in (0, 5, 6, 11))]
+    for image in views.images:
+        image[..., 3] = 255
+    hidden = [4, 5, 57]
+    views.images[0].reshape(-1, 4)[[4, 5], 3] = 0
+    views.images[2].reshape(-1, 4)[10, 3] = 254
+    for masked, by_detail in ((False, False), (True, False), (False, True), (True, True)):
+        lots = lots_by_detail(views) if by_detail else np.ones(59)
+        lots[kept + hidden if masked else kept] = 0
+        for kind, place in ((PixelSampler, torch.device("cpu")), (DevicePixelSampler, device)):
+            generator = torch.Generator(place).manual_seed(3)
+            batch = kind(views, generator, witnesses, masked, by_detail).draw(15_000)
+            check_draws(batch, lots)
+            np.testing.assert_allclose(batch.rays_d.cpu().numpy(), rays_d[number_of(batch)], atol=1e-6)
 
 
 def test_witnesses_of_no_pixels_leave_nothing_out() -> None:

@@ -17,7 +17,6 @@ from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.features import find_features
 from vfr_bake.data.files.masks import apply_mask, mask_of
-from vfr_bake.training.captures.unmasked import draw_unmasked
 from vfr_bake.training.metrics import score_view
 from vfr_bake.training.rays import PixelSampler
 from vfr_bake.training.trainer import Trainer
@@ -48,8 +47,8 @@ def test_what_is_masked_is_not_drawn(tmp_path: Path) -> None:
     assert all(
         (image[:, :16, 3] == 0).all() and (image[:, 16:, 3] == 255).all() for image in scene.train.images
     )
-    sampler = PixelSampler(scene.train, torch.Generator().manual_seed(0))
-    batch = draw_unmasked(sampler, 3000)
+    sampler = PixelSampler(scene.train, torch.Generator().manual_seed(0), masked=True)
+    batch = sampler.draw(3000)
     assert len(batch.rgba) == len(batch.rays_o) == len(batch.rays_d) == 3000
     assert (batch.rgba[:, 3] == 1).all() and not ((batch.rgba[:, 0] == 1) & (batch.rgba[:, 1] == 0)).any()
     trainer = Trainer(scene, TrainConfig(device="cpu", batch_rays=64))

@@ -1,0 +1,51 @@
+"""Which pixels of an object teach most: those of its detail, which are drawn more often.
+
+The gradient of a step is a sum over random pixels of the training pictures. It varies least where pixels are
+drawn in proportion to the size of their own gradients, hence of their errors (importance sampling;
+Katharopoulos and Fleuret, "Not all samples are created equal", 2018). Errors are where the pictures have
+edges and texture, and the plain middle of a surface is learned from a few rays. So the chance q of a pixel
+that is not transparent follows the contrast around it, which the pictures tell before training begins:
+
+    q ~ MIX + (1 - MIX) g / mean(g),   g = (mean of the squared differences around the pixel) ^ POWER.
+
+A map of the errors themselves, in blocks of 8x8 pixels, is no better: detail is finer than blocks. The
+background is drawn as often as if all pixels were drawn alike: its rays cost little and say what is empty.
+
+Importance sampling would also divide each error by its pixel's chance, so that the loss stays the plain mean
+over all pixels. That is not done here: Adam undoes most of such factors, and what is left of them is noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vfr_bake.kernels.detail import neighbour_squares, window_powers
+
+MIX = 0.1
+"""Share of the draws that falls on all pixels alike that are not transparent."""
+POWER = 0.3
+"""Of the contrast's square, about the power with which errors grow with it."""
+WINDOW = 3
+"""Side of the square of pixels over which contrast is averaged."""
+MEAN_LOTS = 24
+"""Lots of a pixel on average: whole numbers from 1 to 255, coarse enough for a byte."""
+
+
+def detail_lots(rgba: np.ndarray) -> np.ndarray:
+    """[height, width] uint8, 1 to 255 and about MEAN_LOTS on average, of the transparent and of the other
+    pixels: how often each pixel of `rgba` [height, width, 4] uint8, with straight alpha, is drawn relative to
+    others.
+
+    >>> rgba = np.full((64, 64, 4), 255, np.uint8)
+    >>> rgba[:, 16:, :3], rgba[:, 32:, 3] = 90, 0
+    >>> detail_lots(rgba)[5, [5, 14, 15, 16, 22, 30, 31, 32, 40]].tolist()
+    [2, 105, 128, 128, 2, 108, 132, 24, 24]
+    """
+    squares, powers = (np.empty(rgba.shape[:2], np.float32) for _ in range(2))
+    neighbour_squares(rgba, squares)
+    window_powers(squares, WINDOW // 2, np.float32(POWER), powers)
+    lots, matter = np.full_like(powers, MEAN_LOTS), rgba[..., 3] > 0
+    found = powers[matter]
+    if found.any():
+        lots[matter] = MEAN_LOTS * (MIX + (1 - MIX) / found.mean() * found)
+    return np.clip(np.rint(lots), 1, 255).astype(np.uint8)
