@@ -13,7 +13,7 @@ from PIL import Image
 from exporters.cli import main as export
 from player.app.cli import main as play
 from vfr_bake.cli import bake_main, eval_main, train_main
-from vfr_bake.training.metrics import over_background, psnr
+from vfr_bake.training.scores.metrics import over_background, psnr
 
 SHORT = [
     *("--steps", "500", "--batch-samples", "8192", "--pilot-steps", "100", "--eval-views", "2"),

@@ -17,8 +17,8 @@ from player.render import Renderer
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import load_model
+from vfr_bake.training.scores.metrics import psnr
 
 TRAIN = [
     *(

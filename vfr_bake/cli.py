@@ -322,7 +322,7 @@ def _decibels(error: float) -> float:
 def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
     import numpy as np
 
-    from vfr_bake.training.evaluation import evaluate
+    from vfr_bake.training.scores.evaluation import evaluate
 
     scores = []
     n_views = min(n_views, len(scene.test.cameras))
@@ -413,10 +413,10 @@ def _eval(options: Any) -> int:
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
     from vfr_bake.data import load_scene, reader_as
-    from vfr_bake.training.evaluation import render_views
-    from vfr_bake.training.lpips import Lpips
-    from vfr_bake.training.metrics import comparison, mean_scores
     from vfr_bake.training.model_file import load_model
+    from vfr_bake.training.scores.evaluation import render_views
+    from vfr_bake.training.scores.lpips import Lpips
+    from vfr_bake.training.scores.metrics import comparison, mean_scores
 
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
@@ -461,7 +461,7 @@ def _eval(options: Any) -> int:
 def _bench(options: Any) -> int:
     from vfr_bake.bench.page import table_lines, trade_page
     from vfr_bake.bench.trade import measure_trade
-    from vfr_bake.training.lpips import Lpips
+    from vfr_bake.training.scores.lpips import Lpips
 
     options.check()
     for target in (options.html, options.json):

@@ -89,7 +89,7 @@ def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path
 
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
-    from vfr_bake.training.metrics import over_background, psnr, to_8_bit
+    from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 
     names = frame_names(scene.test.cameras)
     photographs = [to_8_bit(over_background(image, background)) for image in scene.test.images]

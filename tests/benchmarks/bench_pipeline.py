@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from player.cameras.transforms import frame_names, read_cameras
-from vfr_bake.training.metrics import over_background, psnr, to_8_bit
+from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 
 COMMANDS = {
     "vfr-train": "import vfr_bake.cli as c; c.train_main()",

@@ -31,8 +31,8 @@ from player.render import Renderer
 from vfr_bake.bench.specks import speck_mask
 from vfr_bake.data import load_scene, reader_as
 from vfr_bake.rendering.render import head_colours
-from vfr_bake.training.metrics import over_background
 from vfr_bake.training.model_file import Model, load_model
+from vfr_bake.training.scores.metrics import over_background
 
 THRESHOLDS = (0.05, 0.1, 0.2)
 AROUND, TIMES = 12, 8

@@ -26,9 +26,9 @@ from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import PosedImages
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.evaluation import RenderedView
-from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 from vfr_bake.training.model_file import Model, load_model, save_model
+from vfr_bake.training.scores.evaluation import RenderedView
+from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -155,7 +155,7 @@ def test_eval_measures_lpips(
         def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
             return 0.125
 
-    monkeypatch.setattr("vfr_bake.training.lpips.Lpips", Distance)
+    monkeypatch.setattr("vfr_bake.training.scores.lpips.Lpips", Distance)
     target = tmp_path / "eval.json"
     assert eval_main([str(model), str(small_data), "--lpips", "vgg", "--json", str(target)]) == 0
     figures = json.loads(target.read_text())
@@ -167,7 +167,7 @@ def test_eval_measures_lpips(
 def test_eval_says_what_lpips_lacks_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vfr_bake.training.lpips.find_spec", lambda name: None)
+    monkeypatch.setattr("vfr_bake.training.scores.lpips.find_spec", lambda name: None)
     assert eval_main([str(tmp_path / "none.pt"), "nowhere", "--lpips", "alex"]) == 1
     one_error(capsys, "lpips is not installed", "pip install vfr-bake[lpips]")
 
@@ -180,7 +180,7 @@ def test_a_view_without_error_is_null_in_json(
             rgb = over_background(image, model.background)
             yield RenderedView(camera.name, rgb, rgb)
 
-    monkeypatch.setattr("vfr_bake.training.evaluation.render_views", perfect)
+    monkeypatch.setattr("vfr_bake.training.scores.evaluation.render_views", perfect)
     target = tmp_path / "eval.json"
     assert eval_main([str(model), str(small_data), "--json", str(target)]) == 0
     figures = json.loads(target.read_text(), parse_constant=pytest.fail)

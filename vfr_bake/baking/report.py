@@ -19,8 +19,8 @@ from player.files.images import png_bytes
 from player.render import Renderer
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import BRIGHTEST_ERROR, comparison
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import BRIGHTEST_ERROR, comparison
 
 N_PICTURES = 2
 """Views shown side by side in the report."""

@@ -9,7 +9,7 @@ from vfr_bake.bench.plot import Mark, plot
 from vfr_bake.bench.result import Setting, Trade
 from vfr_bake.bench.timing import Size, Times
 from vfr_bake.bench.worst import WorstPixel
-from vfr_bake.training.metrics import BRIGHTEST_ERROR
+from vfr_bake.training.scores.metrics import BRIGHTEST_ERROR
 
 SCORES = {"psnr": 2, "loss_db": 2, "ssim": 4, "lpips": 4, "psnr_to_model": 2, "ssim_to_model": 4}
 """Decimal places of each score that the table of all settings shows."""

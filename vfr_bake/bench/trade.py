@@ -32,7 +32,7 @@ from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene, reader_as
-from vfr_bake.training.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
+from vfr_bake.training.scores.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
 
 N_FIRST_PICTURES = 3
 """Number of times that an asset is opened for its first picture; the median counts."""

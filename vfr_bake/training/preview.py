@@ -10,7 +10,7 @@ from PIL import Image
 from player.files.images import to_8_bit, write_png
 from vfr_bake.data.scene import Scene
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import comparison, over_background
+from vfr_bake.training.scores.metrics import comparison, over_background
 from vfr_bake.training.trainer import Trainer
 
 SECONDS = 60.0

@@ -16,8 +16,8 @@ from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import psnr
 from vfr_bake.training.trainer import Trainer
 
 

@@ -45,8 +45,8 @@ from vfr_bake.data import demo
 from vfr_bake.field.networks import Head
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import psnr
 
 
 def quiet(stage: str, done: int, of: int) -> None:

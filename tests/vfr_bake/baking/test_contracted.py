@@ -29,8 +29,8 @@ from vfr_bake.data.scene import build_scene
 from vfr_bake.kernels.visibility import mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.metrics import psnr
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import psnr
 
 SETTINGS = BakeConfig(
     resolution=64, feature_resolution=64, mesh_resolution=24, refine_steps=20, head_width=0, check_views=1,

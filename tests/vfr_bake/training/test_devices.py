@@ -17,9 +17,9 @@ from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.networks import Pilot
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
-from vfr_bake.training.evaluation import evaluate
 from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
+from vfr_bake.training.scores.evaluation import evaluate
 from vfr_bake.training.trainer import Trainer, choose_device
 
 

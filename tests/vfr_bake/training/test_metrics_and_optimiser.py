@@ -8,8 +8,8 @@ import torch
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.training.metrics import over_background, psnr, to_8_bit
 from vfr_bake.training.optimiser import FusedGridAdam, GridAdam, rate_factor
+from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 
 
 def test_psnr_of_known_errors() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from player.files.images import to_8_bit
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.metrics import over_background
+from vfr_bake.training.scores.metrics import over_background
 
 SINGLE_WEIGHT = 2 / 3
 """Weight of the single pixels, where there are whole views too."""

@@ -17,8 +17,8 @@ from vfr_bake.baking.held_out import HeldOut, Shown, expected_loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.length.witness_loss import SINGLE_WEIGHT, Loss
-from vfr_bake.training.metrics import over_background
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import over_background
 
 SMALL = BakeConfig(
     preset="fast", resolution=64, mesh_resolution=16, refine_steps=40, check_views=1, n_channels=2, k=1

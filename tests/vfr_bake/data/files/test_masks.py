@@ -17,8 +17,8 @@ from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.features import find_features
 from vfr_bake.data.files.masks import apply_mask, mask_of
-from vfr_bake.training.metrics import score_view
 from vfr_bake.training.rays import PixelSampler
+from vfr_bake.training.scores.metrics import score_view
 from vfr_bake.training.trainer import Trainer
 
 

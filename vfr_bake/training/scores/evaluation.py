@@ -15,8 +15,8 @@ import numpy as np
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.rendering.render import render_rays
 from vfr_bake.training.captures.picture_colours import fitted
-from vfr_bake.training.metrics import Distance, ViewScore, over_background, score_view
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import Distance, ViewScore, over_background, score_view
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from player.errors import MissingExtraError, ShapeError
-from vfr_bake.training.metrics import (
+from vfr_bake.training.scores.metrics import (
     BRIGHTEST_ERROR,
     ViewScore,
     comparison,

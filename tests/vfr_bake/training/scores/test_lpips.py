@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
-from vfr_bake.training.lpips import Lpips
+from vfr_bake.training.scores.lpips import Lpips
 
 CONVOLUTIONS = {
     "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
@@ -117,7 +117,7 @@ def test_missing_weights_say_which_file_goes_where(home: Path, network: str) -> 
 
 @pytest.mark.usefixtures("home")
 def test_missing_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vfr_bake.training.lpips.find_spec", lambda name: None)
+    monkeypatch.setattr("vfr_bake.training.scores.lpips.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install vfr-bake\[lpips\]"):
         Lpips()
 
