@@ -100,6 +100,7 @@ class SpaceGrid:
             rays=torch.arange(n_rays),
             starts=torch.from_numpy(np.cumsum(counts) - counts),
             counts=torch.from_numpy(counts),
+            sigmas=torch.from_numpy(sigmas),
         )
         return samples, sigmas, Intervals(torch.from_numpy(angles), torch.from_numpy(widths))
 

@@ -22,10 +22,11 @@ from vfr_bake.data.store.stored import Layout, in_order, map_pictures, write_pic
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
+from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradients
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.rays import RayBatch
 from vfr_bake.training.scores.evaluation import evaluate
-from vfr_bake.training.trainer import CERTAIN, Trainer, chosen_rays, scale_near_gradients
+from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
 
