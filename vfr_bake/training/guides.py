@@ -23,8 +23,8 @@ from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
-from vfr_bake.rendering.space_grid import Intervals, SpaceGrid
-from vfr_bake.training.optimiser import GridAdam, TableAdam
+from vfr_bake.rendering.space_grid import FINER, Intervals, SpaceGrid
+from vfr_bake.training.optimiser import MILESTONES, GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
@@ -51,8 +51,8 @@ class Guide(ABC):
         """Rays to draw for the next batch, over all processes."""
 
     @abstractmethod
-    def prepare(self, step: int, field: VfrField) -> None:
-        """Before a step: look at what the field has become."""
+    def prepare(self, step: int, progress: float, field: VfrField) -> None:
+        """Before a step, with a share `progress` of the training done: look at what the field has become."""
 
     @abstractmethod
     def sample(
@@ -101,7 +101,7 @@ class BoxGuide(Guide):
         # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
         return self._settings.batch_samples // 2 if pilot else self._settings.batch_samples
 
-    def prepare(self, step: int, field: VfrField) -> None:
+    def prepare(self, step: int, progress: float, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             self._grid.update(field)
 
@@ -132,11 +132,11 @@ class OccupancyGuide(BoxGuide):
     def sampler(self) -> OccupancyGrid:
         return self._grid
 
-    def prepare(self, step: int, field: VfrField) -> None:
+    def prepare(self, step: int, progress: float, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             # Every process has seen its own rays.
             self._processes.take_largest(torch.from_numpy(self._grid.densities))
-        super().prepare(step, field)
+        super().prepare(step, progress, field)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
@@ -159,6 +159,7 @@ class SpaceGridGuide(Guide):
     ) -> None:
         self._config, self._settings, self._processes = config, settings, processes
         self._grid = SpaceGrid(near, config.seed)
+        self._finer = 1
 
     @property
     def sampler(self) -> SpaceGrid:
@@ -167,16 +168,20 @@ class SpaceGridGuide(Guide):
     def n_rays(self, pilot: bool) -> int:
         return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
 
-    def prepare(self, step: int, field: VfrField) -> None:
+    def prepare(self, step: int, progress: float, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             # Every process has seen its own rays.
             self._processes.add_up([torch.from_numpy(self._grid.gathered)])
             self._grid.update(field)
+        # While the learning rate is high, few samples on many rays teach more; later their noise is what is
+        # left of the error.
+        self._finer = FINER if progress >= MILESTONES[0] else 1
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
-        samples, sigmas, self._intervals = self._grid.march(field, rays_o, rays_d, jitter[:, 0].contiguous())
+        first = jitter[:, 0].contiguous()
+        samples, sigmas, self._intervals = self._grid.march(field, rays_o, rays_d, first, self._finer)
         self._grid.observe(samples.points.numpy(), sigmas)
         return samples
 
@@ -221,7 +226,7 @@ class SpaceGuide(Guide):
     def n_rays(self, pilot: bool) -> int:
         return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
 
-    def prepare(self, step: int, field: VfrField) -> None:
+    def prepare(self, step: int, progress: float, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0

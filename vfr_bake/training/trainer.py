@@ -213,7 +213,7 @@ class Trainer:
             progress = self.processes.agree(self.duration.progress(step, seconds))
             if progress >= 1:
                 return
-            self._guide.prepare(step, self._field)
+            self._guide.prepare(step, progress, self._field)
             loss, n_rays, n_samples = self._step(step, progress)
             bad_in_a_row = bad_in_a_row + 1 if loss != loss else 0
             if bad_in_a_row == MOST_BAD_STEPS:

@@ -113,7 +113,7 @@ def test_rounds_and_samples_are_the_kernels_in_float64(step: int, device: torch.
     expected, guide = guides(device)
     for module in (field, expected.sampler, guide._sampler):
         module.double()
-    guide.prepare(step, field)
+    guide.prepare(step, 0.0, field)
     grids = [grid.layout.grid(grid.table) for grid in expected.sampler.grids]
     arrays, limits = [a.numpy() for a in rays], Limits(*map(np.float64, (LARGEST_LOGIT, OPAQUE_DEPTH)))
     shapes = [(40, N_PROPOSED + 1), (40, N_PROPOSED), (40, N_PROPOSED, 3), (40, N_PROPOSED)]
@@ -152,7 +152,7 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
         if isinstance(guide, DeviceProposalGuide):
             field = field.to(place)
             field.grid.backend = "torch"
-        guide.prepare(step, field)
+        guide.prepare(step, 0.0, field)
         rays = (a.to(place) for a in (rays_o, rays_d, jitter))
         samples = guide.sample(field, *rays, pilot=False, share=1.0)
         weights = noise[: len(samples.t_mid)].to(place)
@@ -182,7 +182,7 @@ def test_no_ray_at_all(device: torch.device) -> None:
     field = make()[0].to(device)
     field.grid.backend = "torch"
     _, guide = guides(device)
-    guide.prepare(0, field)
+    guide.prepare(0, 0.0, field)
     none = torch.zeros(0, 3, device=device)
     samples = guide.sample(field, none, none, none, pilot=False, share=1.0)
     assert len(samples.t_mid) == len(samples.counts) == 0
