@@ -189,6 +189,10 @@ EFFORT_MINUTES = {"draft": (2.0, 2.0), "good": (10.0, 12.0), "best": (60.0, 60.0
 """Minutes of training on a CPU at most, of an object and of an unbounded scene, by the effort."""
 
 
+GRID_MINUTES = 3.0
+"""Training time up to which a scene on a CPU is sampled by a grid of its density."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Settings of `vfr-train`. What is None follows from the device: the defaults of a CPU are made for two
@@ -240,7 +244,8 @@ class TrainConfig:
     """Objects: cells per axis of the occupancy grid."""
     sampling: Sampling = "auto"
     """Scenes: what finds the samples of a ray: a grid that keeps the density of contracted space, on a CPU
-    alone, or the paper's two rounds of proposals. Auto: the grid on a CPU, proposals on a GPU."""
+    alone, which is ahead in the first minutes, or the paper's two rounds of proposals, which end up sharper.
+    Auto: the grid on a CPU for at most 3 minutes, else proposals."""
     distortion: float = 0.01
     """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
     near_gradients: float = 2.0
@@ -286,6 +291,21 @@ class TrainConfig:
         if device == "cuda" and self.effort != "draft":
             return math.inf
         return EFFORT_MINUTES[self.effort][unbounded]
+
+    def sampling_for(self, device: str) -> Sampling:
+        """What finds the samples of an unbounded scene on `device` ("cpu" or "cuda"): "grid" or "proposals".
+
+        Raises ConfigError: the grid is asked for on a GPU.
+
+        >>> TrainConfig(effort="draft").sampling_for("cpu"), TrainConfig().sampling_for("cpu")
+        ('grid', 'proposals')
+        """
+        if self.sampling == "grid" and device == "cuda":
+            raise ConfigError("sampling: on a GPU: expected auto or proposals, got grid")
+        if self.sampling != "auto":
+            return self.sampling
+        short = device == "cpu" and self.minutes_for(device, True) <= GRID_MINUTES
+        return "grid" if short else "proposals"
 
     def for_device(self, device: str, unbounded: bool) -> DeviceSettings:
         """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.

@@ -136,6 +136,7 @@ class Trainer:
         """How long the training takes."""
         # Steps that are asked for are taken, and a GPU is done with its own in minutes.
         self._looks = self._backend == "numba" and config.steps is None and len(self.witnesses.pixels) > 0
+        self._sampling = config.sampling_for("cuda" if self._backend == "torch" else "cpu")
         self._guide: Guide
         self._grid_adam: TableAdam
         if self._backend == "torch":
@@ -149,10 +150,10 @@ class Trainer:
 
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
-        if scene.unbounded and self.config.sampling == "proposals":
-            self._guide = ProposalGuide(self.config, self.pace, scene.near)
-        elif scene.unbounded:
+        if scene.unbounded and self._sampling == "grid":
             self._guide = SpaceGridGuide(self.config, self.pace, scene.near, self.processes)
+        elif scene.unbounded:
+            self._guide = ProposalGuide(self.config, self.pace, scene.near)
         else:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
         grid = self._field.grid
@@ -161,8 +162,6 @@ class Trainer:
 
     def _use_torch(self, scene: Scene) -> None:
         self._composite = composite_on_device
-        if scene.unbounded and self.config.sampling == "grid":
-            raise ConfigError("sampling: on a GPU: expected auto or proposals, got grid")
         if scene.unbounded:
             self._guide = DeviceProposalGuide(self.config, self.pace, scene.near, self.device)
         else:
@@ -196,7 +195,8 @@ class Trainer:
     @property
     def settings(self) -> dict[str, Any]:
         """The settings of this training, with what followed from the device filled in; plain values."""
-        return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
+        chosen = {"device": self.device.type, "sampling": self._sampling}
+        return asdict(self.config) | asdict(self.pace) | chosen
 
     @property
     def sampler(self) -> Sampler:

@@ -37,7 +37,7 @@ def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None
     scene = small_scene(kind)
     # Room for the samples of all rays: of those that do not fit, the two backends leave out different ones.
     settings: dict[str, Any] = {"pilot_steps": 40, "batch_samples": 16384, "batch_rays": 48}
-    settings |= {"steps": 150} if kind == "object" else {"steps": 120, "sampling": "proposals"}
+    settings |= {"steps": 150} if kind == "object" else {"steps": 120}
     ours = Trainer(scene, config(**settings | {"device": device.type}), backend="torch")
     expected = Trainer(scene, config(**settings))
     before = psnr(ours, scene)

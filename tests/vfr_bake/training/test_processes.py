@@ -20,7 +20,8 @@ from vfr_bake.data.scene import build_scene
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.trainer import Trainer
 
-kind, out, n_threads = sys.argv[1], sys.argv[2], int(sys.argv[3])
+kind, sampling = {"object": ("object", "auto")}.get(sys.argv[1], ("unbounded", sys.argv[1]))
+out, n_threads = sys.argv[2], int(sys.argv[3])
 torch.set_num_threads(n_threads)
 numba.set_num_threads(n_threads)
 processes = Processes.from_environment()
@@ -28,7 +29,7 @@ processes = Processes.from_environment()
 scene = replace(build_scene(demo_capture(size=32, n_train=12, n_test=2), kind), has_alpha=True, masked=False)
 field = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
 config = TrainConfig(device="cpu", steps=40, pilot_steps=10, batch_samples=2048, batch_rays=64,
-                     field=field, occupancy_resolution=32)
+                     field=field, occupancy_resolution=32, sampling=sampling)
 trainer = Trainer(scene, config, processes)
 losses = [report.loss for report in trainer.run()]
 if processes.first:
@@ -38,7 +39,7 @@ processes.leave()
 """
 
 
-@pytest.mark.parametrize("kind", ["object", "unbounded"])
+@pytest.mark.parametrize("kind", ["object", "proposals", "grid"])
 def test_two_processes_have_the_loss_curve_of_one(kind: str, tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
