@@ -22,15 +22,16 @@ PER_LOG = np.float32(1.4426950408889634)
 HIGH, LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 """log(2) = HIGH + LOW, HIGH with so few digits that whole multiples of it are exact."""
 HALF, ONE = np.float32(0.5), np.float32(1)
-E1, E2, E3, E4, E5, E6 = np.float32(
-    (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1)
+E1, E2, E3, E4, E5, E6 = map(
+    np.float32,
+    (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1),
 )
 """exp(r) = 1 + r + r^2 (E6 + r (E5 + ...)) for |r| <= log(2) / 2: the polynomial of Cephes."""
 MOST = np.float32(32.0)
 """Beyond 8 standard deviations, where x^2 / 2 is this, p is taken as 0. It is 5e-15 there, and what follows
 from numbers too small for a float32's exponent takes a hundred times as long."""
 SLOPE = np.float32(0.2316419)
-B1, B2, B3, B4, B5 = np.float32((0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429))
+B1, B2, B3, B4, B5 = map(np.float32, (0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429))
 PEAK = np.float32(0.3989422804014327)
 """1 / sqrt(2 pi), the density at 0."""
 
