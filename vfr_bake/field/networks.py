@@ -151,7 +151,8 @@ class Head(nn.Module):
 
     def forward(self, features: Tensor, dirs: Tensor) -> Tensor:
         """Colours [n, 3] in [0, 1], sRGB, from `features` [n, n_channels] and unit `dirs` [n, 3]."""
-        if self._is_fused and features.device.type == "cpu" and features.dtype == torch.float32:
+        fits = features.device.type == "cpu" and features.dtype == torch.float32
+        if self._is_fused and fits and not torch.compiler.is_compiling():
             basis = self.harmonics(dirs).repeat_interleave(self.n_sh_features, dim=-1)
             return fused_head(features, basis, self.width, [*self.spatial, *self.directional, self.out])
         h = self.spatial[1](self.activation(self.spatial[0](features)))

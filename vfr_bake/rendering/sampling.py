@@ -111,6 +111,7 @@ def march_on_device(
         rays=torch.arange(n_served, device=rays_o.device),
         starts=ends[:n_served] - counts,
         counts=counts,
+        sigmas=sigmas[:n],
     )
     return samples, sigmas[:n]
 
