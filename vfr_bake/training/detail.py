@@ -24,7 +24,7 @@ from vfr_bake.kernels.detail import neighbour_squares, window_powers
 MIX = 0.1
 """Share of the draws that falls on all pixels alike that are not transparent."""
 POWER = 0.3
-"""Of the contrast's square, about the power with which errors grow with it."""
+"""Exponent of the contrast's square: about the power with which errors grow with it."""
 WINDOW = 3
 """Side of the square of pixels over which contrast is averaged."""
 MEAN_LOTS = 24

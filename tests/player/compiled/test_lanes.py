@@ -115,7 +115,7 @@ def test_exp_of_no_number_is_none() -> None:
 
 
 def test_sin_and_cos_are_those_of_float64() -> None:
-    """Of all angles that a ray through contracted space has, and beyond; the tolerance is two roundings of
+    """All angles that a ray through contracted space has, and more; the tolerance is two roundings of
     float32. Quarters of a turn are those at which the two change places."""
     random = np.random.default_rng(0)
     quarters = (np.arange(-40, 41) * (np.pi / 4)).astype(np.float32)
