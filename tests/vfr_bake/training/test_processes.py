@@ -28,7 +28,7 @@ processes = Processes.from_environment()
 # What is transparent is learned from in contracted space, too: a few steps show it.
 scene = replace(build_scene(demo_capture(size=32, n_train=12, n_test=2), kind), has_alpha=True, masked=False)
 field = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
-config = TrainConfig(device="cpu", steps=40, pilot_steps=10, batch_samples=2048, batch_rays=64,
+config = TrainConfig(device="cpu", steps=120, pilot_steps=10, batch_samples=2048, batch_rays=64,
                      field=field, occupancy_resolution=32, sampling=sampling)
 trainer = Trainer(scene, config, processes)
 losses = [report.loss for report in trainer.run()]
@@ -49,8 +49,10 @@ def test_two_processes_have_the_loss_curve_of_one(kind: str, tmp_path: Path) -> 
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     subprocess.run([*torchrun, program, kind, two, "1"], check=True, timeout=300)
     losses = [np.array(json.loads(path.read_text())) for path in (one, two)]
-    assert len(losses[0]) == len(losses[1]) == 40
+    assert len(losses[0]) == len(losses[1]) == 120
     # Sums of gradients in another order: float32 rounding, which training amplifies step by step.
     np.testing.assert_allclose(losses[1][:10], losses[0][:10], rtol=1e-4)
-    np.testing.assert_allclose(losses[1], losses[0], rtol=0.05)
-    assert np.mean(losses[0][-5:]) < np.mean(losses[0][:5])
+    np.testing.assert_allclose(losses[1][:40], losses[0][:40], rtol=0.05)
+    # Backgrounds are random, so that a step's loss says little; over 40 steps it hides what is learned.
+    for curve in losses:
+        assert np.mean(curve[60:]) < np.mean(curve[:20])
