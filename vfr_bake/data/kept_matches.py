@@ -23,7 +23,7 @@ import numpy as np
 
 from vfr_bake.data.features import MAX_FEATURES, Features
 
-VERSION = b"1"
+VERSION = b"2"
 """Changes whenever the same picture would give other features or matches."""
 SIDE = 32
 """Pixels along a side of a thumbnail."""

@@ -23,14 +23,11 @@ from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE, is_video
+from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import Progress
 
-BLURRED = 0.3
-"""A picture is blurred if its sharpness is less than this share of its neighbours' median."""
-NEIGHBOURS = 4
-"""Pictures on either side that a picture's sharpness is held against."""
 PLAIN_FEATURES = 30
 """With fewer features at the size of the check there is nothing to recognise."""
 SOFT_SHARPNESS = 15.0
@@ -58,8 +55,6 @@ class CheckedPicture:
     """Width and height at the working size."""
     look: Look | None
     """None where there was no time for it, or it cannot be read."""
-    relative: float | None
-    """Sharpness, divided by the neighbours' median."""
     partners: int | None
     """Pictures that share features with it, of those that it was compared with; None if with none."""
     found: bool | None
@@ -153,11 +148,11 @@ def check_data(
     looks = look_at(pictures.paths, 0.8 * seconds, progress, most)
     seen = [look if isinstance(look, Look) else None for look in looks]
     shared = compare(seen, 0.2 * seconds)
-    relative = _relative_sharpness(seen)
+    blurry = _blurred(seen)
     partners = _partners(len(seen), shared)
     checked = []
     for number, (name, look) in enumerate(zip(pictures.names, looks, strict=True)):
-        why = look if isinstance(look, str) else _fault(seen[number], relative[number], partners[number])
+        why = look if isinstance(look, str) else _fault(seen[number], number in blurry, partners[number])
         if pictures.found[number] is False and why is None:
             why = "the estimation of cameras found no place for it"
         picture_look = seen[number]
@@ -168,7 +163,6 @@ def check_data(
                 full,
                 size.size(*full) if full else None,
                 picture_look,
-                relative[number],
                 partners[number],
                 pictures.found[number],
                 why,
@@ -222,16 +216,10 @@ def _size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _relative_sharpness(looks: Sequence[Look | None]) -> list[float | None]:
-    """Each picture's sharpness by the median of up to NEIGHBOURS seen pictures on either side."""
+def _blurred(looks: Sequence[Look | None]) -> set[int]:
+    """The numbers of the pictures that training would leave out, as far as they were looked at."""
     there = [i for i, look in enumerate(looks) if look is not None]
-    values = np.array([look.sharpness for look in looks if look is not None])
-    relative: list[float | None] = [None] * len(looks)
-    for n, i in enumerate(there):
-        around = np.delete(values, n)[max(0, n - NEIGHBOURS) : n + NEIGHBOURS]
-        if len(around) and (usual := float(np.median(around))) > 0:
-            relative[i] = float(values[n] / usual)
-    return relative
+    return {there[n] for n in blurred([look.blur for look in looks if look is not None])}
 
 
 def _partners(n: int, shared: dict[tuple[int, int], Shared]) -> list[int | None]:
@@ -242,10 +230,10 @@ def _partners(n: int, shared: dict[tuple[int, int], Shared]) -> list[int | None]
     return [int(p) if c else None for p, c in zip(partners, compared, strict=True)]
 
 
-def _fault(look: Look | None, relative: float | None, partners: int | None) -> str | None:
+def _fault(look: Look | None, blurry: bool, partners: int | None) -> str | None:
     if look is None:
         return None
-    if relative is not None and relative < BLURRED:
+    if blurry:
         return "blurred"
     if len(look.descriptors) < PLAIN_FEATURES:
         return "nothing to recognise: plain, dark or out of focus"
@@ -397,7 +385,7 @@ def _image(picture: CheckedPicture) -> dict[str, Any]:
         "height": height,
         "full_size": list(picture.size) if picture.size else None,
         "sharpness": None if look is None else _rounded(look.sharpness),
-        "relative_sharpness": None if picture.relative is None else _rounded(picture.relative),
+        "blur": None if look is None else _rounded(look.blur),
         "exposure": None if look is None else _rounded(look.exposure),
         "n_features": None if look is None else len(look.descriptors),
         "n_partners": picture.partners,

@@ -14,12 +14,18 @@ from PIL import Image
 
 from player.errors import VfrError
 from vfr_bake.data.features import match
-from vfr_bake.data.files.pictures import opencv, picture_size, read_picture, shrunk
+from vfr_bake.data.files.pictures import (
+    SHARPNESS_SIDE,
+    enough_for,
+    opencv,
+    picture_size,
+    read_picture,
+    sharpness,
+    shrunk,
+)
+from vfr_bake.data.quality.sharpness import blur
 from vfr_bake.data.threads import Progress, n_threads, one_by_one
 
-SHARPNESS_SIDE = 800
-"""Pixels of the longest side at which sharpness is measured: blur that it does not show is below two pixels
-at the working size."""
 FEATURE_SIDE, N_FEATURES = 480, 400
 """Pixels of the longest side in which features are looked for, and how many are kept."""
 THUMBNAIL_SIDE = 144
@@ -38,7 +44,9 @@ class Look:
     size: tuple[int, int]
     """Width and height in pixels, upright."""
     sharpness: float
-    """Variance of the Laplacian of the grey levels (0 to 255) at SHARPNESS_SIDE."""
+    """Mean square of the Laplacian of the grey levels (0 to 255) at SHARPNESS_SIDE."""
+    blur: float
+    """From 0 (sharp) to 1: what training leaves pictures out by."""
     exposure: float
     """Mean of log2 of the luminance: one more is twice the light."""
     descriptors: np.ndarray
@@ -61,11 +69,10 @@ def look(path: Path) -> Look:
     """Look at one picture. Raises DataError, MissingExtraError."""
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it", "train")
     size = picture_size(path, upright=True)
-    rgba = read_picture(path, True, _least(size))
+    rgba = read_picture(path, True, enough_for(size, SHARPNESS_SIDE))
     small = shrunk(cv2, rgba, SHARPNESS_SIDE)
     grey = cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY)
     seen = small[..., 3] > 127
-    laplacian = cv2.Laplacian(grey, cv2.CV_32F)[seen]
     light = _light(grey)
     descriptors, levels = _features(cv2, small, cv2.GaussianBlur(light, (0, 0), 2))
     thumbnail = io.BytesIO()
@@ -75,17 +82,13 @@ def look(path: Path) -> Look:
     over_grey.convert("RGB").save(thumbnail, "JPEG", quality=70)
     return Look(
         size=size,
-        sharpness=float(laplacian.var()) if len(laplacian) else 0.0,
+        sharpness=sharpness(cv2, small),
+        blur=blur(small),
         exposure=float(light[seen].mean()) if seen.any() else 0.0,
         descriptors=descriptors,
         levels=levels,
         thumbnail=thumbnail.getvalue(),
     )
-
-
-def _least(size: tuple[int, int]) -> tuple[int, int]:
-    scale = min(1.0, SHARPNESS_SIDE / max(size))
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def _light(grey: np.ndarray) -> np.ndarray:

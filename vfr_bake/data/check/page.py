@@ -61,8 +61,7 @@ def _figure(picture: CheckedPicture) -> str:
     if picture.used is not None:
         facts.append(f"{picture.used[0]}x{picture.used[1]}")
     if picture.look is not None:
-        relative = "" if picture.relative is None else f" ({picture.relative:.1f} of its neighbours')"
-        facts.append(f"sharpness {picture.look.sharpness:.0f}{relative}")
+        facts.append(f"sharpness {picture.look.sharpness:.0f}, blur {picture.look.blur:.2f}")
     if picture.found is not None:
         facts.append("camera known" if picture.found else "no camera")
     why = f'<br><span class="why">{escape(picture.why)}</span>' if picture.why else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,10 @@ from PIL import Image
 
 from player.errors import FormatError
 from vfr_bake.data import threads
-from vfr_bake.data.features import Features, find_features
+from vfr_bake.data.features import MAX_SIDE, Features, find_features
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.opening import open_photograph
-from vfr_bake.data.files.pictures import opencv, read_picture, sharpness
+from vfr_bake.data.files.pictures import enough_for, opencv, picture_size, read_picture, sharpness
 from vfr_bake.data.kept_matches import SIDE, Found, KeptMatches, stamp
 from vfr_bake.data.mapping import Sensor
 
@@ -51,18 +51,18 @@ def look_at(
 
 
 def _found_in(path: Path, mask: Path | None) -> Found:
-    rgba = read_picture(path, upright=True)
+    width, height = picture_size(path, upright=True)
+    # A mask belongs to all pixels.
+    rgba = read_picture(path, True, None if mask is not None else enough_for((width, height), MAX_SIDE))
     if mask is not None:
         rgba = apply_mask(rgba, path, mask, upright=True)
     grey = Image.fromarray(rgba).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it")
-    return Found(
-        rgba.shape[1],
-        rgba.shape[0],
-        find_features(rgba),
-        np.asarray(grey).reshape(-1),
-        sharpness(cv2, rgba[..., :3]),
-    )
+    found = find_features(rgba)
+    # What a JPEG decoder leaves out is a whole number of times, rounded up at the edge.
+    points = found.points * max(1, round(width / rgba.shape[1]))
+    found = replace(found, points=points.clip(0, (width, height)))
+    return Found(width, height, found, np.asarray(grey).reshape(-1), sharpness(cv2, rgba))
 
 
 def sensor_of(path: Path, width: int, height: int) -> Sensor:

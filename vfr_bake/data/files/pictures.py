@@ -17,8 +17,9 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import as_stored, layout_of, read_layout, turned_upright
 
-SHARPNESS_SIDE = 960
-"""Pixels of the longer side that sharpness is measured at: what is blurred by less teaches nothing more."""
+SHARPNESS_SIDE = 800
+"""Pixels of the longest side at which sharpness is measured: blur that it does not show is below two pixels
+at the working size."""
 
 
 class DescribedView(NamedTuple):
@@ -91,6 +92,16 @@ def straight(weighted: np.ndarray) -> np.ndarray:
     """[height, width, 4] uint8 with straight alpha; the inverse of `premultiplied`, in place."""
     weighted[..., :3] /= np.maximum(weighted[..., 3:], 1e-6) / 255
     return (weighted + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def enough_for(size: tuple[int, int], side: int) -> tuple[int, int]:
+    """Width and height of a picture of this `size` that is reduced until no side is longer than `side`.
+
+    >>> enough_for((4000, 3000), 1600), enough_for((40, 30), 1600)
+    ((1600, 1200), (40, 30))
+    """
+    scale = min(1.0, side / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def read_picture(path: Path, upright: bool = False, least: tuple[int, int] | None = None) -> np.ndarray:
@@ -166,12 +177,17 @@ def opencv(wanted: str, extra: str = "poses") -> Any:
 
 
 def sharpness(cv2: Any, image: np.ndarray) -> float:
-    """Mean square of the second derivative of a picture [height, width, 3] uint8.
+    """Mean square of the second derivative of the grey levels of a picture [height, width, 3 or 4] uint8,
+    where it is not transparent.
 
-    Blur of any direction lowers it. It compares pictures of one scene: a plain wall has none.
+    Blur of any direction lowers it. It compares pictures that show the same, of which it finds the sharpest:
+    a plain wall has none. Which pictures of a capture are blurred is told by `vfr_bake.data.quality`.
     """
-    grey = shrunk(cv2, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), SHARPNESS_SIDE)
-    return float(np.square(cv2.Laplacian(grey, cv2.CV_32F)).mean())
+    small = shrunk(cv2, image, SHARPNESS_SIDE)
+    squares = np.square(cv2.Laplacian(cv2.cvtColor(small[..., :3], cv2.COLOR_RGB2GRAY), cv2.CV_32F))
+    if small.shape[2] == 4:
+        squares = squares[small[..., 3] > 127]
+    return float(squares.mean()) if squares.size else 0.0
 
 
 def shrunk(cv2: Any, image: np.ndarray, side: int, interpolation: int | None = None) -> np.ndarray:

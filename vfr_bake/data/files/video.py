@@ -102,7 +102,7 @@ class _Stretches:
         if self._moved >= self._step and self._best is not None:
             self._end_stretch()
             self._moved = 0.0
-        sharp = sharpness(cv2, frame[..., ::-1])
+        sharp = sharpness(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
         if self._best is None or sharp > self._best[0]:
             self._best = sharp, frame
 
