@@ -154,7 +154,8 @@ def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
     pictures, and refuses them in one line if they are.
     """
     from vfr_bake.data import working_size
-    from vfr_bake.data.check.check import BAD, check_data
+    from vfr_bake.data.check.check import check_data
+    from vfr_bake.data.check.verdict import BAD
 
     if data == "demo":
         return None

@@ -12,17 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from player.cameras.camera import Camera, focus_point, world_up
+from player.cameras.camera import Camera
 from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
+from vfr_bake.data.check.turning import share_turned
+from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
 from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE, is_video
+from vfr_bake.data.poses import is_video
 from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
@@ -30,18 +32,6 @@ from vfr_bake.data.threads import Progress
 
 PLAIN_FEATURES = 30
 """With fewer features at the size of the check there is nothing to recognise."""
-SOFT_SHARPNESS = 15.0
-"""Where the median sharpness is less, all are out of focus, blurred, or enlarged."""
-GOOD_SHARED = 40
-"""Neighbours that share as many features, at the size of the check, overlap well."""
-UNEVEN = 0.7
-"""Where pictures show the same by more brighter or darker than each other (powers of two; 95 in 100 pairs
-less), it becomes fog."""
-FEW, GOOD_NUMBER = 20, 40
-"""Pictures: fewer leave holes; about as many show a subject from all sides."""
-GAP_DEGREES = 90.0
-"""A wider gap in the walk around the subject is a side that nobody has seen."""
-GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
 @dataclass(frozen=True)
@@ -169,7 +159,7 @@ def check_data(
             )
         )
     figures = _figures(checked, shared)
-    verdict, likely, advice = _judged(figures, pictures.cameras)
+    verdict, likely, advice = judged(figures, pictures.cameras)
     return Check(
         *(data, pictures.kind, checked, pictures.cameras, figures, verdict, likely, advice),
         time.monotonic() - begin,
@@ -245,6 +235,7 @@ def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], S
     next_ones = [both.n_features for (i, j), both in shared.items() if j == i + 1]
     changes = [abs(both.change) for both in shared.values() if both.n_features >= GOOD_SHARED]
     group = _largest_group(shared)
+    turned = share_turned([both.points for both in shared.values() if both.points is not None])
     faults = Counter(picture.why for picture in pictures if picture.why)
     return {
         "n_pictures": len(pictures),
@@ -259,6 +250,7 @@ def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], S
         "exposure_spread": _rounded(np.quantile(changes, 0.95) if changes else 0.0),
         "shared_features": _rounded(np.median(next_ones) if next_ones else 0.0),
         "share_in_one_group": _rounded(group),
+        "share_turned_on_the_spot": None if turned is None else _rounded(turned),
     }
 
 
@@ -277,89 +269,6 @@ def _largest_group(shared: dict[tuple[int, int], Shared]) -> float:
             leader[a] = b
     groups = Counter(lead(i) for i in list(leader))
     return max(groups.values()) / len(leader) if leader else 0.0
-
-
-def _judged(figures: dict[str, Any], cameras: Sequence[Camera]) -> tuple[str, list[str], list[str]]:
-    """Verdict, what is likely to come out, and what to photograph."""
-    n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
-    likely, advice, bad, doubts = [], [], False, False
-    if cameras:
-        likely.append(f"the cameras of {figures['n_found']} pictures are known.")
-        bad = figures["n_found"] < 2
-    else:
-        share = figures["share_in_one_group"]
-        bad = n < MIN_PICTURES or share < MIN_SHARE / 2
-        doubts |= share < 0.9
-        likely.append(
-            f"about {min(n, round(share * n))} of {n} pictures hang together and are likely to find their "
-            "cameras."
-        )
-        if share < 0.9:
-            advice.append(
-                "photograph with steps of some 10 degrees, so that each picture shows most of what the one "
-                "before it does, and add pictures between those that share nothing."
-            )
-        elif figures["shared_features"] < GOOD_SHARED:
-            advice.append(
-                "take smaller steps, or keep more of textured surroundings in the picture: neighbours "
-                "share few features."
-            )
-    if n < FEW:
-        doubts = True
-        advice.append(f"take more pictures: {n} leave holes, {GOOD_NUMBER} to 100 show a subject well.")
-    if figures["sharpness"] < SOFT_SHARPNESS:
-        doubts = True
-        advice.append(
-            "all pictures are soft: focus on the subject, use more light, hold still while the shutter is "
-            "open; the model will be no sharper than they are."
-        )
-    if figures["n_blurred"]:
-        doubts |= figures["n_blurred"] > 0.2 * seen
-        advice.append(f"take the {figures['n_blurred']} blurred pictures again, or leave them out.")
-    if figures["n_plain"] and not cameras:
-        bad |= figures["n_plain"] > 0.5 * seen
-        advice.append(
-            "put something with a pattern under or behind the subject: there is nothing to recognise in "
-            f"{figures['n_plain']} pictures."
-        )
-    if figures["exposure_spread"] > UNEVEN:
-        advice.append(
-            "lock the exposure: pictures show the same things up to "
-            f"{2 ** figures['exposure_spread']:.1f} times as bright as each other, which becomes fog."
-        )
-    gap = widest_gap(cameras)
-    if gap is not None and gap > GAP_DEGREES:
-        advice.append(
-            f"photograph the other side as well: the cameras leave {gap:.0f} degrees around the subject open."
-        )
-    likely.append(
-        "Training is not worth its minutes yet." if bad
-        else "A model comes out, with weak places." if doubts
-        else "A good model is likely."
-    )  # fmt: skip
-    return BAD if bad else DOUBTFUL if doubts else GOOD, likely, advice
-
-
-def widest_gap(cameras: Sequence[Camera]) -> float | None:
-    """Degrees of the widest gap between cameras, seen from above from where they look at; None for too few,
-    or where they look outwards."""
-    if len(cameras) < 3:
-        return None
-    focus, up = focus_point(cameras), world_up(cameras)
-    arms = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
-    looks = -np.stack([camera.c2w[:3, 2] for camera in cameras])
-    if np.median((arms * looks).sum(axis=1) / np.maximum(np.linalg.norm(arms, axis=1), 1e-9)) > -0.5:
-        return None
-    right, back = level_axes(up)
-    angles = np.sort(np.degrees(np.arctan2(arms @ back, arms @ right)))
-    return float(np.diff([*angles, angles[0] + 360]).max())
-
-
-def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions [3] of unit length at right angles to `up` [3] and to each other."""
-    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    right /= np.linalg.norm(right)
-    return right, np.cross(right, up)
 
 
 def _summary(figures: dict[str, Any]) -> list[str]:

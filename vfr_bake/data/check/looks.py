@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from player.errors import VfrError
+from vfr_bake.data.check.turning import MIN_MATCHES, OFF
 from vfr_bake.data.features import match
 from vfr_bake.data.files.pictures import (
     SHARPNESS_SIDE,
@@ -51,6 +52,9 @@ class Look:
     """Mean of log2 of the luminance: one more is twice the light."""
     descriptors: np.ndarray
     """[n_features, 128] float32 of unit length."""
+    points: np.ndarray
+    """[n_features, 2] float32: where they are, in units of the longer side from the picture's centre, y
+    down."""
     levels: np.ndarray
     """[n_features] float32: log2 of the luminance around each feature."""
     thumbnail: bytes
@@ -63,6 +67,8 @@ class Shared(NamedTuple):
     n_features: int
     change: float
     """How much brighter the second shows it, in powers of two."""
+    points: tuple[np.ndarray, np.ndarray] | None = None
+    """[n, 2] in either, of the features that agree with one geometry; of neighbours alone."""
 
 
 def look(path: Path) -> Look:
@@ -74,7 +80,7 @@ def look(path: Path) -> Look:
     grey = cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY)
     seen = small[..., 3] > 127
     light = _light(grey)
-    descriptors, levels = _features(cv2, small, cv2.GaussianBlur(light, (0, 0), 2))
+    descriptors, points, levels = _features(cv2, small, cv2.GaussianBlur(light, (0, 0), 2))
     thumbnail = io.BytesIO()
     over_grey = Image.new("RGBA", (small.shape[1], small.shape[0]), (210, 210, 210, 255))
     over_grey.alpha_composite(Image.fromarray(small))
@@ -86,6 +92,7 @@ def look(path: Path) -> Look:
         blur=blur(small),
         exposure=float(light[seen].mean()) if seen.any() else 0.0,
         descriptors=descriptors,
+        points=points,
         levels=levels,
         thumbnail=thumbnail.getvalue(),
     )
@@ -96,18 +103,21 @@ def _light(grey: np.ndarray) -> np.ndarray:
     return (2.2 * np.log2((grey.astype(np.float32) + 1) / 256)).astype(np.float32)
 
 
-def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Descriptors [n, 128] of a picture, and its `light` [height, width] around each [n]."""
+def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Descriptors [n, 128] of a picture, their points [n, 2], and its `light` [height, width] around each
+    [n]."""
     small = shrunk(cv2, rgba, FEATURE_SIDE)
     sift = cv2.SIFT.create(nfeatures=N_FEATURES, contrastThreshold=0.02)
     mask = np.where(small[..., 3] > 127, np.uint8(255), np.uint8(0))
     points, found = sift.detectAndCompute(cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY), mask)
     if found is None:
-        return np.zeros((0, 128), np.float32), np.zeros(0, np.float32)
-    scale = len(light) / len(small)
-    columns, rows = np.array([point.pt for point in points]).T * scale
+        return np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    places = np.array([point.pt for point in points], np.float32)
+    columns, rows = places.T * (len(light) / len(small))
     levels = light[rows.astype(int).clip(0, len(light) - 1), columns.astype(int).clip(0, light.shape[1] - 1)]
-    return np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6)), levels
+    middle = (np.array([small.shape[1], small.shape[0]], np.float32) - 1) / 2
+    descriptors = np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6))
+    return descriptors, (places - middle) / max(small.shape[:2]), levels
 
 
 def look_at(
@@ -158,5 +168,16 @@ def compare(looks: Sequence[Look | None], seconds: float) -> dict[tuple[int, int
         matches = match(a.descriptors, b.descriptors)
         n_shared = len(matches)
         change = float(np.median(b.levels[matches[:, 1]] - a.levels[matches[:, 0]])) if n_shared else 0.0
-        shared[i, j] = Shared(n_shared, change)
+        points = _agreeing(a.points[matches[:, 0]], b.points[matches[:, 1]]) if n < len(pairs) else None
+        shared[i, j] = Shared(n_shared, change, points)
     return shared
+
+
+def _agreeing(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the matched points [n, 2] and [n, 2] that agree with one geometry of two pictures."""
+    if len(a) < MIN_MATCHES:
+        return a[:0], b[:0]
+    cv2 = opencv("pictures: expected OpenCV to compare them", "train")
+    _, kept = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, OFF, 0.99, 500)
+    inside = np.zeros(len(a), bool) if kept is None else kept.reshape(-1) > 0
+    return a[inside], b[inside]

@@ -1,4 +1,4 @@
-"""A check as one HTML file: thumbnails, what is wrong with which picture, and the cameras from two sides.
+"""A check as one HTML file: thumbnails, what is wrong with which picture, and the cameras in 3D.
 
 Everything is inside it, nothing is loaded from elsewhere.
 """
@@ -6,13 +6,16 @@ Everything is inside it, nothing is loaded from elsewhere.
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Sequence
 from html import escape
+from string import Template
 
 import numpy as np
 
 from player.cameras.camera import Camera, focus_point, world_up
-from vfr_bake.data.check.check import Check, CheckedPicture, level_axes
+from vfr_bake.data.check.check import Check, CheckedPicture
+from vfr_bake.data.check.verdict import level_axes
 
 MARK = "<!-- vfr-train --check -->"
 """The second line of every such page: one that is there may be replaced."""
@@ -25,8 +28,44 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto
 figure { margin: 0; width: 150px; font-size: 12px; line-height: 1.3; overflow-wrap: anywhere }
 figure img { display: block; max-width: 144px; border: 3px solid #ddd }
 figure.fault img { border-color: #c33 } .why { color: #b00 }
-svg { background: #f6f6f6; margin-right: 16px } svg text { font: 13px system-ui, sans-serif }
+svg, canvas { background: #f6f6f6; margin-right: 16px } canvas { cursor: grab; touch-action: none }
+svg text { font: 13px system-ui, sans-serif }
 """
+
+
+TURNABLE = Template("""<canvas id="turn" width="$side" height="$side"
+ aria-label="$n cameras, to be turned"></canvas><script>
+"use strict";
+const cameras = $cameras;
+const canvas = document.getElementById("turn"), draw = canvas.getContext("2d"), half = $side / 2;
+let azimuth = 0.6, height = 0.5;
+function placed([x, y, z]) {
+  const c = Math.cos(azimuth), s = Math.sin(azimuth), near = x * s + y * c;
+  return [half + (half - $margin) * (x * c - y * s),
+    half - (half - $margin) * (z * Math.cos(height) - near * Math.sin(height))];
+}
+function line(from, to, colour) {
+  draw.strokeStyle = colour; draw.beginPath(); draw.moveTo(...placed(from)); draw.lineTo(...placed(to));
+  draw.stroke();
+}
+function paint() {
+  draw.clearRect(0, 0, 2 * half, 2 * half);
+  draw.fillStyle = "#222"; draw.font = "13px system-ui, sans-serif";
+  draw.fillText("$n cameras: drag to turn", 8, 18);
+  line([0, 0, 0], [0, 0, 0.3], "#c33");
+  for (const [x, y, z, a, b, c] of cameras) {
+    line([x, y, z], [x + a, y + b, z + c], "#58c");
+    draw.fillStyle = "#124"; draw.beginPath(); draw.arc(...placed([x, y, z]), 2.5, 0, 7); draw.fill();
+  }
+}
+canvas.addEventListener("pointermove", (event) => {
+  if (!event.buttons) return;
+  azimuth += 0.01 * event.movementX;
+  height = Math.min(1.57, Math.max(-1.57, height + 0.01 * event.movementY));
+  paint();
+});
+paint();
+</script>""")
 
 
 def check_page(check: Check) -> bytes:
@@ -69,8 +108,8 @@ def _figure(picture: CheckedPicture) -> str:
 
 
 def cameras_drawing(cameras: Sequence[Camera]) -> str:
-    """Two SVG drawings of the cameras, from above and from the side: a dot where each is, a line where it
-    looks."""
+    """The cameras in 3D, turned by dragging, and two SVG drawings, from above and from the side: a dot where
+    each is, a line where it looks; up is a red line from where they look at."""
     up = world_up(cameras)
     right, back = level_axes(up)
     focus = focus_point(cameras)
@@ -88,7 +127,12 @@ def cameras_drawing(cameras: Sequence[Camera]) -> str:
             f'<text x="8" y="18">{len(cameras)} cameras {title}</text>'
             f'<circle cx="{SIDE / 2}" cy="{SIDE / 2}" r="5" fill="none" stroke="#c33"/>{marks}</svg>'
         )
-    return f"<h2>Cameras</h2><p>{''.join(drawings)}</p>"
+    axes = np.stack([right, back, up], axis=-1)
+    rows = np.concatenate([places @ axes / reach, 0.12 * looks @ axes], axis=1).round(4)
+    turnable = TURNABLE.substitute(
+        side=SIDE, margin=MARGIN, n=len(cameras), cameras=json.dumps(rows.tolist(), allow_nan=False)
+    )
+    return f"<h2>Cameras</h2><p>{turnable}{''.join(drawings)}</p>"
 
 
 def _camera_mark(point: np.ndarray, way: np.ndarray) -> str:

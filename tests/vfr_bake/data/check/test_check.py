@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from player.cameras.camera import Camera
+from player.cameras.camera import Camera, world_up
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
 from vfr_bake.cli import train_main
-from vfr_bake.data.check.check import BAD, Check, check_data, widest_gap
+from vfr_bake.data.check.check import Check, check_data
 from vfr_bake.data.check.page import check_page
+from vfr_bake.data.check.verdict import BAD, widest_gap
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.store.working import WorkingSize
 
@@ -118,6 +119,13 @@ def test_cameras_that_come_with_the_pictures(small_data: Path, tmp_path: Path) -
     assert all(picture.found for picture in check.pictures) and len(check.cameras) == 14
     page = check_page(check).decode()
     assert page.count("<svg") == 2 and page.count("<circle") == 2 * 15
+    (turnable,) = re.findall(r"const cameras = (\[.*?\]);", page)
+    drawn = np.array(json.loads(turnable))
+    assert drawn.shape == (14, 6) and "http" not in page
+    places = np.stack([camera.c2w[:3, 3] for camera in check.cameras])
+    heights = (places - places.mean(axis=0)) @ world_up(check.cameras)
+    ratio = (drawn[:, 2] - drawn[:, 2].mean()) / heights  # one scale, and up is up
+    assert ratio.min() > 0 and np.ptp(ratio) < 0.02 * ratio.mean()
 
 
 def test_the_widest_gap_of_a_walk() -> None:

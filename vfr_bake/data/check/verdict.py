@@ -1,0 +1,118 @@
+"""What the figures of a check mean: what is likely to come out, and what to photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from player.cameras.camera import Camera, focus_point, world_up
+from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE
+
+SOFT_SHARPNESS = 15.0
+"""Where the median sharpness is less, all are out of focus, blurred, or enlarged."""
+GOOD_SHARED = 40
+"""Neighbours that share as many features, at the size of the check, overlap well."""
+UNEVEN = 0.7
+"""Where pictures show the same by more brighter or darker than each other (powers of two; 95 in 100 pairs
+less), it becomes fog."""
+FEW, GOOD_NUMBER = 20, 40
+"""Pictures: fewer leave holes; about as many show a subject from all sides."""
+TURNED, ALL_TURNED = 0.4, 0.8
+"""Where the camera turned on the spot in so many steps, depth is weak, and cameras are hardly found."""
+GAP_DEGREES = 90.0
+"""A wider gap in the walk around the subject is a side that nobody has seen."""
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+
+
+def judged(figures: dict[str, Any], cameras: Sequence[Camera]) -> tuple[str, list[str], list[str]]:
+    """Verdict, what is likely to come out, and what to photograph."""
+    n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
+    likely, advice, bad, doubts = [], [], False, False
+    turned = figures["share_turned_on_the_spot"] or 0.0
+    all_turned = turned > ALL_TURNED and not cameras
+    if cameras:
+        likely.append(f"the cameras of {figures['n_found']} pictures are known.")
+        bad = figures["n_found"] < 2
+    else:
+        share = figures["share_in_one_group"]
+        bad = n < MIN_PICTURES or share < MIN_SHARE / 2
+        doubts |= share < 0.9
+        placed = (
+            "are from one place, which tells no depth" if all_turned else "are likely to find their cameras"
+        )
+        likely.append(f"about {min(n, round(share * n))} of {n} pictures hang together and {placed}.")
+        if share < 0.9:
+            advice.append(
+                "photograph with steps of some 10 degrees, so that each picture shows most of what the one "
+                "before it does, and add pictures between those that share nothing."
+            )
+        elif figures["shared_features"] < GOOD_SHARED:
+            advice.append(
+                "take smaller steps, or keep more of textured surroundings in the picture: neighbours "
+                "share few features."
+            )
+    if turned > TURNED:
+        doubts = True
+        bad |= all_turned
+        advice.append(
+            f"move: from picture to picture the camera turned on the spot ({turned:.0%} of the steps). Walk "
+            "around the subject."
+        )
+    if n < FEW:
+        doubts = True
+        advice.append(f"take more pictures: {n} leave holes, {GOOD_NUMBER} to 100 show a subject well.")
+    if figures["sharpness"] < SOFT_SHARPNESS:
+        doubts = True
+        advice.append(
+            "all pictures are soft: focus on the subject, use more light, hold still while the shutter is "
+            "open; the model will be no sharper than they are."
+        )
+    if figures["n_blurred"]:
+        doubts |= figures["n_blurred"] > 0.2 * seen
+        advice.append(f"take the {figures['n_blurred']} blurred pictures again, or leave them out.")
+    if figures["n_plain"] and not cameras:
+        bad |= figures["n_plain"] > 0.5 * seen
+        advice.append(
+            "put something with a pattern under or behind the subject: there is nothing to recognise in "
+            f"{figures['n_plain']} pictures."
+        )
+    if figures["exposure_spread"] > UNEVEN:
+        advice.append(
+            "lock the exposure: pictures show the same things up to "
+            f"{2 ** figures['exposure_spread']:.1f} times as bright as each other, which becomes fog."
+        )
+    gap = widest_gap(cameras)
+    if gap is not None and gap > GAP_DEGREES:
+        advice.append(
+            f"photograph the other side as well: the cameras leave {gap:.0f} degrees around the subject open."
+        )
+    likely.append(
+        "Training is not worth its minutes yet." if bad
+        else "A model comes out, with weak places." if doubts
+        else "A good model is likely."
+    )  # fmt: skip
+    return BAD if bad else DOUBTFUL if doubts else GOOD, likely, advice
+
+
+def widest_gap(cameras: Sequence[Camera]) -> float | None:
+    """Degrees of the widest gap between cameras, seen from above from where they look at; None for too few,
+    or where they look outwards."""
+    if len(cameras) < 3:
+        return None
+    focus, up = focus_point(cameras), world_up(cameras)
+    arms = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
+    looks = -np.stack([camera.c2w[:3, 2] for camera in cameras])
+    if np.median((arms * looks).sum(axis=1) / np.maximum(np.linalg.norm(arms, axis=1), 1e-9)) > -0.5:
+        return None
+    right, back = level_axes(up)
+    angles = np.sort(np.degrees(np.arctan2(arms @ back, arms @ right)))
+    return float(np.diff([*angles, angles[0] + 360]).max())
+
+
+def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions [3] of unit length at right angles to `up` [3] and to each other."""
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, up)
