@@ -213,7 +213,7 @@ def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[st
 
 
 def _warn_of_folds(scene: Scene) -> None:
-    from vfr_bake.data.folds import torn_views
+    from vfr_bake.data.models.folds import torn_views
 
     try:
         torn = torn_views(scene.train)

@@ -377,7 +377,9 @@ def test_cameras_that_are_folded_are_told_of(
     small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Which are is tested where they are found."""
-    monkeypatch.setattr("vfr_bake.data.folds.torn_views", lambda _: [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")])
+    monkeypatch.setattr(
+        "vfr_bake.data.models.folds.torn_views", lambda _: [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")]
+    )
     steps = ["--steps", "1", "--eval-views", "0"]
     assert train_main([str(small_data), str(tmp_path / "model.pt"), *steps]) == 0
     said = capsys.readouterr().err

@@ -4,9 +4,9 @@
     python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS
 
 A request has `view`, `size` [width, height], for an asset `samples` and `quality`, and `rgb`, a file for the
-picture or null. The answer has the milliseconds of the frame and, of them, of march with lookups and of the
-head (time in their tasks over the number of threads), the fetches of all rays that hit, and peak memory. A
-model's frame is not taken apart.
+picture [height, width, 4], its colours over the background and its opacity, or null. The answer has the
+milliseconds of the frame and, of them, of march with lookups and of the head (time in their tasks over the
+number of threads), the fetches of all rays that hit, and peak memory. A model's frame is not taken apart.
 
 The player's process imports the player alone, as `vfr-play` does; so what either needs is imported where it
 is opened.
@@ -44,7 +44,7 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
         march.seconds = head.seconds = 0.0
         frame, ms = _timed(lambda: renderer.render(camera, request["samples"], quality=request["quality"]))
         taken = frame.n_density_samples[(frame.opacity > MIN_OPACITY) & (frame.n_density_samples > 0)]
-        return _kept(request, frame.rgb) | {
+        return _kept(request, frame.rgb, frame.opacity) | {
             "ms": ms,
             "march_ms": 1000 * march.seconds / renderer.n_threads,
             "head_ms": 1000 * head.seconds / renderer.n_threads,
@@ -62,7 +62,7 @@ def open_model(path: str, cameras: str, threads: str) -> Answer:
     import numba
     import torch
 
-    from vfr_bake.rendering.render import render_image
+    from vfr_bake.rendering.render import render_rays
     from vfr_bake.training.model_file import load_model
 
     if int(threads):
@@ -73,8 +73,15 @@ def open_model(path: str, cameras: str, threads: str) -> Answer:
 
     def answer(request: dict[str, Any]) -> dict[str, Any]:
         camera = views[request["view"]].resized(*request["size"])
-        rgb, ms = _timed(lambda: render_image(model.field, model.sampler, camera, model.background))
-        return _kept(request, rgb) | {"ms": ms, "march_ms": 0.0, "head_ms": 0.0, "fetches": 0}
+        (colours, opacity), ms = _timed(lambda: render_rays(model.field, model.sampler, *camera.rays()))
+        rgb = colours + (1 - opacity[:, None]) * model.background
+        size = camera.height, camera.width
+        return _kept(request, rgb.reshape(*size, 3), opacity.reshape(size)) | {
+            "ms": ms,
+            "march_ms": 0.0,
+            "head_ms": 0.0,
+            "fetches": 0,
+        }
 
     return answer
 
@@ -86,10 +93,10 @@ def _timed(render: Callable[[], Any]) -> tuple[Any, float]:
     return rendered, 1000 * (time.perf_counter() - start)
 
 
-def _kept(request: dict[str, Any], rgb: np.ndarray) -> dict[str, Any]:
+def _kept(request: dict[str, Any], rgb: np.ndarray, opacity: np.ndarray) -> dict[str, Any]:
     """Write the picture if that is asked for; returns the peak memory."""
     if request["rgb"] is not None:
-        np.save(request["rgb"], rgb)
+        np.save(request["rgb"], np.concatenate([rgb, opacity[..., None]], axis=-1))
     return {"peak_mb": peak_rss_mb()}
 
 

@@ -20,13 +20,16 @@ def trade_page(trade: Trade) -> bytes:
     width, height = trade.sizes[0]
     wanted = "full model" if trade.conditions["model"] else "photograph"
     front = [setting for setting in trade.settings if setting.on_front]
+    fitted = ""
+    if trade.conditions["exposure_fitted"]:
+        fitted = "Exposure is fitted on the left half of each view, and the right half is scored. "
     return page(
         "Speed and accuracy",
         f"<p>{escape(trade.recommendation)}</p>",
         f"<p>{len(trade.conditions['views'])} test views of {escape(str(trade.conditions['data']))}, "
         f"{width}x{height}; {trade.conditions['frames_a_setting_and_size']} frames a setting and size, in "
-        f"turns; {trade.conditions['threads']} threads, {escape(trade.conditions['march'])}. Filled marks "
-        "and bold rows are on the front: no other setting is better, faster and smaller.</p>",
+        f"turns; {trade.conditions['threads']} threads, {escape(trade.conditions['march'])}. {fitted}"
+        "Filled marks and bold rows are on the front: no other setting is better, faster and smaller.</p>",
         "<h2>Quality against time</h2><p>Size of a mark: megabytes.</p>",
         plot(_marks(trade, "time"), f"ms a frame at {width}x{height}", "PSNR, dB"),
         "<h2>Quality against size</h2><p>Size of a mark: ms a frame.</p>",

@@ -32,7 +32,8 @@ from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene, reader_as
-from vfr_bake.training.scores.metrics import Distance, mean_scores, over_background, psnr, score_view, ssim
+from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
+from vfr_bake.training.scores.metrics import Distance, mean_scores, psnr, ssim
 
 N_FIRST_PICTURES = 3
 """Number of times that an asset is opened for its first picture; the median counts."""
@@ -51,7 +52,22 @@ class Views:
     background: np.ndarray
     """[3] float32 in [0, 1], the colour behind the assets."""
     photographs: list[np.ndarray]
-    """[h, w, 3] float32 in [0, 1] each, over the background."""
+    """[h, w, 4] uint8 each."""
+    masked: bool
+    """Whether pixels that are not opaque are masked."""
+    exposure: bool
+    """Whether the model was trained with an exposure of each picture: that of a view is then fitted on its
+    left half, and the right half is scored, as `vfr-eval` does."""
+
+    def beside(self, pictures: list[np.ndarray]) -> list[RenderedView]:
+        """The pictures [h, w, 4], colours over the background and opacity, one a view, as they are compared
+        with the photographs."""
+        views = []
+        for camera, picture, rgba in zip(self.cameras, pictures, self.photographs, strict=True):
+            rendered = picture[..., :3], picture[..., 3].reshape(-1)
+            settings = self.background, self.exposure, self.masked
+            views.append(beside_photograph(camera.name, *rendered, rgba, *settings))
+        return views
 
 
 def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:
@@ -114,6 +130,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
         "front_at": list(own),
         "background": views.background.tolist(),
         "bits": 8,
+        "exposure_fitted": views.exposure,
     }
     pictures = [quality.worst_view for quality in qualities]
     worst = {quality.worst_view.name: quality.worst for quality in qualities}
@@ -172,7 +189,7 @@ class _Run:
             n_fetches=None,
             quality=None,
             what={"preset": "full model"},
-            scores=self.scores(pictures, None),
+            scores=self.scores(self._views.beside(pictures), pictures, None),
             times={size: frame_times(some, None, [1.0] * len(some)) for size, some in answers.items()},
             n_bytes=path.stat().st_size,
             peak_mb=answers[sizes[0]][-1]["peak_mb"],
@@ -200,9 +217,9 @@ class _Run:
         self, name: str, asset: Asset, player: Process, dials: list[Dials], full: list[np.ndarray] | None
     ) -> _Quality:
         """Every view with all dials, against the photographs and the model's pictures if there are some."""
-        wanted = self._views.photographs if full is None else full
         scores: dict[Dials, dict[str, float | None]] = {}
-        worst_view, worst, peak = Pictures(name, wanted[0], wanted[0]), [], None
+        first = self._views.photographs[0][..., :3] / np.float32(255)
+        worst_view, worst, peak = Pictures(name, first, first), [], None
         for done, some in enumerate(dials):
             pictures = []
             for view, photograph in enumerate(self._views.photographs):
@@ -211,22 +228,30 @@ class _Run:
                 answer = player.ask(**request, **some.request())
                 pictures.append(np.load(self._picture))
                 peak = answer["peak_mb"]
-            scores[some] = self.scores(pictures, full)
+            beside = self._views.beside(pictures)
+            scores[some] = self.scores(beside, pictures, full)
             if some == Dials(asset.manifest.n_fetches):
-                lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, pictures, strict=True)]))
-                worst_view = Pictures(name, wanted[lowest], pictures[lowest])
-                worst = worst_pixels(asset, self._views.cameras, wanted, pictures)
+                wanted = [view.photograph for view in beside] if full is None else _colours(full)
+                shown = [view.rgb for view in beside] if full is None else _colours(pictures)
+                lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, shown, strict=True)]))
+                worst_view = Pictures(name, wanted[lowest], shown[lowest])
+                worst = worst_pixels(asset, self._views.cameras, wanted, shown)
             self._progress(f"quality of {name}", done + 1, len(dials))
         return _Quality(scores, peak, worst_view, worst)
 
-    def scores(self, pictures: list[np.ndarray], full: list[np.ndarray] | None) -> dict[str, float | None]:
+    def scores(
+        self, beside: list[RenderedView], pictures: list[np.ndarray], full: list[np.ndarray] | None
+    ) -> dict[str, float | None]:
         """Means over the views."""
-        views = zip(self._views.cameras, pictures, self._views.photographs, strict=True)
-        means = mean_scores([score_view(view.name, a, b, self._lpips) for view, a, b in views])
+        means = mean_scores([view.score(self._lpips) for view in beside])
         for name, score in (("psnr_to_model", psnr), ("ssim_to_model", ssim)):
-            off = None if full is None else [score(a, b) for a, b in zip(pictures, full, strict=True)]
-            means[name] = None if off is None else float(np.mean(off))
+            pairs = None if full is None else zip(_colours(pictures), _colours(full), strict=True)
+            means[name] = None if pairs is None else float(np.mean([score(a, b) for a, b in pairs]))
         return means
+
+
+def _colours(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    return [picture[..., :3] for picture in pictures]
 
 
 def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
@@ -275,4 +300,14 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) ->
     if len(backgrounds) > 1:
         raise ConfigError(f"assets: expected one background, got {sorted(backgrounds)}")
     background = np.array(backgrounds.pop(), np.float32)
-    return Views(cameras, background, [over_background(scene.test.images[i], background) for i in chosen])
+    photographs = [scene.test.images[i] for i in chosen]
+    exposure = any(_exposure_learned(asset.manifest.provenance) for asset in assets)
+    return Views(cameras, background, photographs, scene.masked, exposure)
+
+
+def _exposure_learned(provenance: dict[str, Any]) -> bool:
+    """Whether training found that the exposure changes from picture to picture; what an asset remembers is
+    free in its form."""
+    trained = provenance.get("trained")
+    effects = trained.get("effects") if isinstance(trained, dict) else None
+    return isinstance(effects, dict) and effects.get("exposure") is True

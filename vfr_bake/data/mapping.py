@@ -198,25 +198,28 @@ def map_pictures(
         except BaseException:
             token.cancel()
             raise
-    found = sorted(models.values(), key=lambda model: -model.num_reg_images())
-    if found:
-        _refine_principal_points(found[0])
     progress(n_pictures, n_pictures)
-    return found
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def _refine_principal_points(model: Any) -> None:
+def refine_principal_points(model: Any) -> None:
     """Let the principal points go, once, at the end, where every camera has taken enough pictures.
 
     A phone's is off by a hundredth of the picture, which turns every pose by half a degree and leaves a pixel
     of error at the border; from few pictures it cannot be told from a turn.
     """
-    pycolmap = pycolmap_module()
     n_taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     if min(n_taken.values()) < MIN_FOR_PRINCIPAL_POINT:
         return
+    adjust(model, principal_points=True)
+
+
+def adjust(model: Any, principal_points: bool = False) -> None:
+    """Adjust the cameras and points of a `pycolmap.Reconstruction` together, also its `principal_points` if
+    that is asked for."""
+    pycolmap = pycolmap_module()
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
+    options.refine_principal_point = principal_points
     options.print_summary = False
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.images.values():

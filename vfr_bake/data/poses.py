@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from vfr_bake.data.files.looks import Look, look_at
 from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.repeats import repeats
-from vfr_bake.data.folds import agreeing_pairs, near_pairs, torn_neighbours
 from vfr_bake.data.kept_matches import KeptMatches, stamp
 from vfr_bake.data.mapping import (
     Pair,
@@ -32,8 +31,11 @@ from vfr_bake.data.mapping import (
     map_pictures,
     match_pictures,
     pycolmap_module,
+    refine_principal_points,
     write_database,
 )
+from vfr_bake.data.models.folds import agreeing_pairs, near_pairs, torn_neighbours
+from vfr_bake.data.models.joining import joined
 from vfr_bake.data.world import find_up, turn_to_z
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -71,9 +73,11 @@ class PoseReport:
     mean_track_length: float
     """Pictures a point is seen in, on average."""
     unplaced: Mapping[str, str] = field(default_factory=dict)
-    """Why a picture found no place, by its name; empty where the cameras were there already."""
+    """Why a picture found no place, by its name."""
     repeated: dict[str, str] = field(default_factory=dict)
     """Pictures that were left out because another shows the same, and which."""
+    apart: tuple[int, ...] = ()
+    """Numbers of pictures of the groups that have places of their own, which fit nothing of the rest."""
 
     def summary(self) -> str:
         """One sentence for whoever took the pictures.
@@ -91,7 +95,16 @@ class PoseReport:
         return (
             f"{self.folder}: cameras of {self.n_registered} of {self.n_pictures} pictures, "
             f"off by {self.mean_error:.2f} pixels, a point is seen in {self.mean_track_length:.1f} pictures"
-            f"{left_out}"
+            f"{left_out}{self._largest_taken()}"
+        )
+
+    def _largest_taken(self) -> str:
+        if not self.apart:
+            return ""
+        groups = " and ".join(map(str, self.apart))
+        return (
+            f"; of {len(self.apart) + 1} groups of pictures that show too little in common the largest is "
+            f"taken, the {'other has' if len(self.apart) == 1 else 'others have'} {groups}"
         )
 
 
@@ -123,8 +136,9 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     tells, share one camera (model RADIAL), which begins with EXIF's focal length. In the model the z axis is
     up (`vfr_bake.data.world`); its unit is arbitrary: pictures alone do not tell it. A subject that looks the
     same from two sides is folded into one, as if walked around half, where nothing but it is matched.
-    Pictures of one walk, named in its order, are unfolded (`vfr_bake.data.folds`); pictures in no order are
-    not, unless their surroundings prevent it.
+    Pictures of one walk, named in its order, are unfolded (`vfr_bake.data.models.folds`); pictures in no
+    order are not, unless their surroundings prevent it. Parts that share pictures are joined
+    (`vfr_bake.data.models.joining`); of others the largest is taken.
 
     Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
     `sparse/0`), OutputError, MissingExtraError.
@@ -150,7 +164,7 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     looks = look_at(masked, known, lambda done, of: progress("features", done, of))
     repeated = _repeated(photos, looks)
     kept = [number for number in range(len(names)) if number not in repeated]
-    record = EstimateRecord(True, {names[number]: names[other] for number, other in repeated.items()})
+    left_out = {names[number]: names[other] for number, other in repeated.items()}
     stamps = [stamp(*masked[number]) for number in kept]
     names, looks = [names[number] for number in kept], [looks[number] for number in kept]
     sensors, features = [look.sensor for look in looks], [look.features for look in looks]
@@ -170,12 +184,14 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
             f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}{ADVICE}"
         )
     _turn_upright(models[0])
+    placed = _names_in(models[0])
+    apart = tuple(n for other in models[1:] if (n := len(_names_in(other) - placed)) >= MIN_PICTURES)
+    reasons = why_unplaced(names, features, pairs, models)
     with new_folder(model) as new:
         models[0].write_binary(str(new))
-        write_record(new, record)
+        write_record(new, EstimateRecord(True, left_out, reasons, apart))
     known.remove()
-    reasons = why_unplaced(names, features, pairs, models)
-    return replace(_read_report(model, photos, len(pictures)), unplaced=reasons)
+    return _read_report(model, photos, len(pictures))
 
 
 def cache_root() -> Path:
@@ -231,14 +247,18 @@ def _placed(
     pairs: Sequence[Pair],
     progress: Progress,
 ) -> list[Any]:
-    """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first; if that is
-    folded, others that are not."""
+    """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, with those
+    joined into it that fit; if that is folded, others that are not."""
 
     def built(some: Sequence[Pair], stage: str) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
-            return map_pictures(database, place, Path(name), len(names), lambda *n: progress(stage, *n))
+            found = map_pictures(database, place, Path(name), len(names), lambda *n: progress(stage, *n))
+            found = joined(found, database, place)
+        if found:
+            refine_principal_points(found[0])
+        return found
 
     def n_torn(models: list[Any]) -> int:
         return len(torn_neighbours(models[0], names, pairs))
@@ -331,12 +351,14 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
         at = -1
     if at != len(points):
         raise FormatError(f"{model}: cut short: remove {model} to estimate the cameras anew")
-    repeated = read_record(model).repeated
+    record = read_record(model)
     return PoseReport(
         folder,
-        n_pictures - len(repeated),
+        n_pictures - len(record.repeated),
         n_registered,
         error_sum / max(n_points, 1),
         n_seen / max(n_points, 1),
-        repeated=repeated,
+        record.unplaced,
+        record.repeated,
+        record.apart,
     )

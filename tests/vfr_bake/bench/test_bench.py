@@ -26,9 +26,10 @@ from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import MAX_PSNR
 from vfr_bake.bench.timing import Dials, Times, lookup_slope, measure_times
+from vfr_bake.bench.trade import Views, _read_views
 from vfr_bake.bench.worst import APART, worst_pixels
 from vfr_bake.cli import bench_main
-from vfr_bake.config import BakeConfig, FieldConfig
+from vfr_bake.config import BakeConfig, BenchConfig, FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import Model, save_model
@@ -332,3 +333,51 @@ def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> 
     # A cell is 1/12 in contracted space, there 1/r^2 of a unit of the way: 64/12 model units at 8.
     assert heaviest == pytest.approx(2 * 8, abs=2 * 64 / 12)
     assert min(t for t, _ in worst.weights) <= frame.depth[5, 7] <= max(t for t, _ in worst.weights)
+
+
+@pytest.mark.parametrize("exposure", [True, False])
+def test_exposure_is_fitted_on_left_halves_where_training_learned_it(
+    exposure: bool, shells_folder: Path, data: Path
+) -> None:
+    """Photographs that are the played pictures through a gain and an offset."""
+    asset = Asset.open(shells_folder)
+    trained = {"trained": {"effects": {"exposure": exposure}}}
+    asset = replace(asset, manifest=replace(asset.manifest, provenance=trained))
+    views = _read_views(BenchConfig(assets=(shells_folder,), data=str(data)), [asset], lambda *_: None)
+    assert views.exposure is exposure and not views.masked
+    pictures, photographs = [], []
+    for camera in views.cameras:
+        frame = render(asset, camera, n_fetches=0, march="numba")
+        pictures.append(np.concatenate([frame.rgb, frame.opacity[..., None]], axis=-1))
+        covered = frame.opacity[..., None]
+        shown = 0.7 * (frame.rgb - (1 - covered) * views.background) + 0.05 * covered
+        rgba = np.concatenate([shown / np.maximum(covered, 1e-6), covered], axis=-1)
+        photographs.append((255 * rgba).round().clip(0, 255).astype(np.uint8))
+    beside = replace(views, photographs=photographs).beside(pictures)
+    assert [view.first_column for view in beside] == [24 if exposure else 0] * len(pictures)
+    scores = [view.score().psnr for view in beside]
+    assert min(scores) > 45 if exposure else max(scores) < 30
+
+
+def test_masked_pixels_are_not_scored(shells_folder: Path) -> None:
+    picture = np.full((20, 24, 4), 0.5, np.float32)
+    picture[..., 3] = 1
+    rgba = np.full((20, 24, 4), 128, np.uint8)
+    rgba[:, :, 3] = 255
+    rgba[5:, :, :] = 0
+    cameras = read_cameras(Asset.open(shells_folder).path("cameras.json"))[:1]
+    (masked,) = Views(cameras, np.ones(3, np.float32), [rgba], True, False).beside([picture])
+    (shown,) = Views(cameras, np.ones(3, np.float32), [rgba], False, False).beside([picture])
+    assert masked.score().psnr_float > 50 > 10 > shown.score().psnr_float
+    assert masked.seen == 0.25
+
+
+@pytest.mark.parametrize("remembered", [None, [], {"effects": []}, {"effects": {"exposure": "yes"}}])
+def test_what_training_never_wrote_is_no_exposure(
+    remembered: object, shells_folder: Path, data: Path
+) -> None:
+    asset = Asset.open(shells_folder)
+    asset = replace(asset, manifest=replace(asset.manifest, provenance={"trained": remembered}))
+    assert not _read_views(
+        BenchConfig(assets=(shells_folder,), data=str(data)), [asset], lambda *_: None
+    ).exposure

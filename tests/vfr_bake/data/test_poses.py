@@ -69,7 +69,7 @@ def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixtur
     (camera,) = model.cameras.values()
     truth = camera.principal_point_x
     camera.principal_point_x = truth + 6
-    mapping._refine_principal_points(model)
+    mapping.refine_principal_points(model)
     assert model.camera(camera.camera_id).principal_point_x == pytest.approx(truth, abs=0.1)
     assert capfd.readouterr() == ("", "")
 

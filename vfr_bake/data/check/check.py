@@ -20,6 +20,7 @@ from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
 from vfr_bake.data.check.turning import share_turned
 from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
+from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.files.video import extract_frames
@@ -98,6 +99,8 @@ class _Set:
     paths: list[Path]
     found: list[bool | None]
     cameras: list[Camera] = field(default_factory=list)
+    why: dict[str, str] = field(default_factory=dict)
+    """Why pictures have no camera, as far as their estimation told."""
 
 
 class _Describing(PictureReader):
@@ -144,7 +147,7 @@ def check_data(
     for number, (name, look) in enumerate(zip(pictures.names, looks, strict=True)):
         why = look if isinstance(look, str) else _fault(seen[number], number in blurry, partners[number])
         if pictures.found[number] is False and why is None:
-            why = "the estimation of cameras found no place for it"
+            why = pictures.why.get(name, "the estimation of cameras found no place for it")
         picture_look = seen[number]
         full = picture_look.size if picture_look else _size(pictures.paths[number])
         checked.append(
@@ -174,7 +177,8 @@ def _listed(data: str) -> _Set:
         folder = unpack(folder, lambda done, of: None)
     if is_video(folder):
         folder = extract_frames(folder, lambda done, of: None)
-    if folder.is_dir() and (has_transforms(folder) or colmap_folder(folder) is not None):
+    model = colmap_folder(folder) if folder.is_dir() else None
+    if folder.is_dir() and (has_transforms(folder) or model is not None):
         reader = _Describing()
         load_folder(folder, None, reader)
         paths = [view.path for view in reader.described]
@@ -182,13 +186,19 @@ def _listed(data: str) -> _Set:
         names = [camera.name for camera in cameras]
         kind = "transforms.json" if has_transforms(folder) else "COLMAP"
         found: list[bool | None] = [True] * len(paths)
+        why: dict[str, str] = {}
         if kind == "COLMAP":
+            assert model is not None
             place, there = find_pictures(folder)
             others = [path for path in there if path not in set(paths)]
             names += [path.relative_to(place).as_posix() for path in others]
             paths = paths + others
             found += [False] * len(others)
-        return _Set(kind, names, paths, found, cameras)
+            record = read_record(model)
+            why = record.unplaced | {
+                name: f"shows what {kept} does" for name, kept in record.repeated.items()
+            }
+        return _Set(kind, names, paths, found, cameras, why)
     place, paths = find_pictures(folder)
     if not paths:
         raise DataError(f"{folder}: expected a folder of pictures or a video, got none")

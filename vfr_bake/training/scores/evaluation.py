@@ -56,20 +56,49 @@ def render_views(
     for index in chosen:
         camera, rgba = views.cameras[index], views.images[int(index)]
         colours, opacity = render_rays(model.field, model.sampler, *camera.rays())
-        first_column = 0
-        if model.exposure is not None:
-            first_column = camera.width // 2
-            learned = np.arange(len(opacity)) % camera.width < first_column
-            left = np.flatnonzero(learned & (rgba[..., 3].reshape(-1) == 255) if masked else learned)
-            gains, offsets = fitted(colours[left], opacity[left], rgba.reshape(-1, 4)[left])
-            colours = (colours * gains + opacity[:, None] * offsets).clip(0, opacity[:, None])
-        rgb = (colours + (1 - opacity[:, None]) * model.background).reshape(camera.height, camera.width, 3)
-        photograph, seen = over_background(rgba, model.background), 1.0
-        if masked:
-            opaque = rgba[..., 3] == 255
-            photograph = np.where(opaque[..., None], photograph, rgb)
-            seen = float(opaque[:, first_column:].mean())
-        yield RenderedView(camera.name, rgb, photograph, seen, first_column)
+        rgb = colours + (1 - opacity[:, None]) * model.background
+        rendered = rgb.reshape(camera.height, camera.width, 3), opacity
+        exposure = model.exposure is not None
+        yield beside_photograph(camera.name, *rendered, rgba, model.background, exposure, masked)
+
+
+def beside_photograph(
+    name: str,
+    rgb: np.ndarray,
+    opacity: np.ndarray,
+    rgba: np.ndarray,
+    background: np.ndarray,
+    exposure: bool,
+    masked: bool,
+) -> RenderedView:
+    """A picture as it is compared with its photograph.
+
+    Args:
+        name: the camera's.
+        rgb: [height, width, 3] in [0, 1], over the background.
+        opacity: [n_pixels].
+        rgba: [height, width, 4] uint8, the photograph.
+        background: [3] in [0, 1].
+        exposure: whether the exposure is fitted, on the left half.
+        masked: whether pixels that are not opaque are masked.
+    """
+    first_column = 0
+    if exposure:
+        width = rgba.shape[1]
+        first_column = width // 2
+        behind = (1 - opacity[:, None]) * background
+        colours = rgb.reshape(-1, 3) - behind
+        learned = np.arange(len(opacity)) % width < first_column
+        left = np.flatnonzero(learned & (rgba[..., 3].reshape(-1) == 255) if masked else learned)
+        gains, offsets = fitted(colours[left], opacity[left], rgba.reshape(-1, 4)[left])
+        colours = (colours * gains + opacity[:, None] * offsets).clip(0, opacity[:, None])
+        rgb = (colours + behind).reshape(rgb.shape)
+    photograph, seen = over_background(rgba, background), 1.0
+    if masked:
+        opaque = rgba[..., 3] == 255
+        photograph = np.where(opaque[..., None], photograph, rgb)
+        seen = float(opaque[:, first_column:].mean())
+    return RenderedView(name, rgb, photograph, seen, first_column)
 
 
 def evaluate(

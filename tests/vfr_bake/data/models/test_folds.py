@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from tests.vfr_bake.data.test_poses import centres, real_pictures
-from vfr_bake.data import folds, load_scene, poses
+from vfr_bake.data import load_scene, poses
+from vfr_bake.data.models import folds
 from vfr_bake.data.poses import estimate_cameras
 
 
