@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,11 +16,13 @@ from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import mapping, poses
+from vfr_bake.data.check.check import check_data
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.looks import sensor_of
 from vfr_bake.data.folders import load_folder
 from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
+from vfr_bake.data.store.working import WorkingSize
 
 N_CAN = 10
 
@@ -173,6 +176,7 @@ def test_a_model_that_cannot_be_finished_leaves_none(can, tmp_path: Path, monkey
             raise KeyboardInterrupt
 
     monkeypatch.setattr(poses, "map_pictures", lambda *_: [HalfWritten()])
+    monkeypatch.setattr(poses, "refine_principal_points", lambda _: None)
     monkeypatch.setattr(poses, "_turn_upright", lambda _: None)
     with pytest.raises(KeyboardInterrupt):
         estimate_cameras(tmp_path, quiet)
@@ -262,6 +266,19 @@ def test_nothing_there_and_a_file_of_another_kind(tmp_path: Path):
 def test_blank_pictures(tmp_path: Path):
     text = message(save(tmp_path, [np.full((60, 80, 3), 200, np.uint8)] * 5))
     assert "expected at least 5 of 5, got 0" in text and "blank" in text
+
+
+def test_all_blurred(tmp_path: Path):
+    pictures = [cv2.GaussianBlur(textured(seed, 320, 240), (0, 0), 25) for seed in range(5)]
+    text = message(save(tmp_path, pictures))
+    assert "expected at least 5 of 5, got 0" in text and "blurred" in text
+
+
+def test_three_pictures_must_all_find_their_place(can, tmp_path: Path):
+    photos = first_pictures(can, tmp_path, 3)
+    assert estimate_cameras(photos, quiet).n_registered == 3
+    text = message(save(tmp_path / "walls", [textured(seed) for seed in range(3)]))
+    assert "of at least 3 of 3 pictures, got 0" in text
 
 
 def test_the_same_picture_again_and_again(tmp_path: Path):
@@ -484,3 +501,30 @@ def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[st
     path.write_bytes(b"no video" * 100)
     assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
     assert not video.frames_folder(path).exists()
+
+
+def test_a_video_without_frames(tmp_path: Path):
+    path = tmp_path / "a.avi"
+    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48)).release()
+    assert path.is_file()
+    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
+
+
+def test_of_groups_that_have_nothing_in_common_the_largest_is_taken_and_said(can, tmp_path: Path):
+    """Eight of the can, and four of a wall that stands in two planes."""
+    photos = first_pictures(can, tmp_path, 8)
+    wall = textured(9, 1600, 300)
+    for index in range(4):
+        near = Image.fromarray(wall[:150, 80 * index : 80 * index + 700])
+        far = Image.fromarray(wall[150:, 40 * index : 40 * index + 700])
+        both = Image.new("RGB", (700, 300))
+        both.paste(near, (0, 150))
+        both.paste(far, (0, 0))
+        both.save(photos / f"b_{index}.jpg", quality=95)
+    report = estimate_cameras(photos, quiet)
+    assert report.n_registered == 8 and set(report.unplaced) == {f"b_{index}.jpg" for index in range(4)}
+    assert estimate_cameras(photos, quiet) == report
+    checked = check_data(str(photos), WorkingSize(), 60.0)
+    assert {p.name: p.why for p in checked.pictures if p.found is False} == report.unplaced
+    apart = replace(report, apart=(4,))
+    assert apart.summary().endswith("the largest is taken, the other has 4")
