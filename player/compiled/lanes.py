@@ -85,6 +85,9 @@ class Lanes:
     def __or__(self, other: Any) -> Lanes:
         return self._binary("or_", "or_", other)
 
+    def __xor__(self, other: Any) -> Lanes:
+        return self._binary("xor", "xor", other)
+
     def __rshift__(self, other: Any) -> Lanes:
         return self._binary("ashr", "ashr", other)
 

@@ -196,9 +196,9 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
         levels = hash_grid.Levels(SCALES, offsets, HASHED, MASK)
         grid = hash_grid.GridArrays(table, *levels)
         if n_channels == 1:
-            proposals.scatter_logits(points, gradient[:, 0].copy(), levels, 2, grad)
-            edges = np.linspace(0.1, 0.9, 9, dtype=F32)[None].repeat(60, 0)
-            arrays = [np.zeros((60, 8, *more), F32) for more in [(), (3,), ()] * 2]
+            proposals.scatter_logits(points[:, :, None], gradient[:, :1].copy(), levels, 2, grad)
+            edges = np.linspace(0.1, 0.9, 17, dtype=F32)[None].repeat(60, 0)
+            arrays = [np.zeros((60, *more, 16), F32) for more in [(), (3,), ()] * 2]
             rounds = [proposals.Round(edges.copy(), *arrays[3 * i : 3 * i + 3]) for i in range(2)]
             proposals.propose(
                 points, points, np.full((60, 3), 0.5, F32), (F32(0.1), F32(0.9)), F32(1), grid, grid,

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
+from player.compiled.lanes import LANES
 from vfr_bake.kernels import njit
-from vfr_bake.kernels.contraction import contracted_at
-from vfr_bake.kernels.density import look_up
-from vfr_bake.kernels.hash_grid import FLAGS, corners, prefetch_point
+from vfr_bake.kernels.density import density_logit
+from vfr_bake.kernels.hash_grid import FLAGS, GridArrays, corners
+from vfr_bake.kernels.ray_lanes import look_up_lanes, propose_lanes
 
 PADDING = 1e-3
 """Weight that every interval gets before it is drawn from, so that no place is out of reach."""
@@ -31,7 +32,7 @@ class Round(NamedTuple):
     depths: np.ndarray
     """[n_rays, n] optical depth of each interval; 0 behind an opaque one."""
     points: np.ndarray
-    """[n_rays, n, 3] middles of the intervals, in the unit cube; undefined behind an opaque one."""
+    """[n_rays, 3, n] middles of the intervals, in the unit cube; undefined behind an opaque one."""
     weights: np.ndarray
     """[n_rays, n], 0 behind an opaque interval."""
 
@@ -57,87 +58,57 @@ def distance(s):
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
-def proposal_logit(x, y, z, grid):
-    """Log-density of a proposal at a point of the unit cube; the grid's table is [n_entries, 1]."""
-    prefetch_point(x, y, z, grid)
-    table, scales, offsets, hashed, mask = grid
-    total = table.dtype.type(0)
-    for level in range(scales.shape[0]):
-        r, w = corners(x, y, z, scales[level], offsets[level], mask, hashed[level])
-        total += (
-            w[0] * table[r[0], 0]
-            + w[1] * table[r[1], 0]
-            + w[2] * table[r[2], 0]
-            + w[3] * table[r[3], 0]
-            + w[4] * table[r[4], 0]
-            + w[5] * table[r[5], 0]
-            + w[6] * table[r[6], 0]
-            + w[7] * table[r[7], 0]
-        )
-    return total
-
-
-@njit(fastmath=FLAGS, error_model="numpy")
-def resample(edges, weights, exponent, jitter, centres, out):
+def resample(edges, weights, exponent, jitter, mass, middles, out):
     """Borders `out` [m + 1] of m intervals drawn from a histogram: `edges` [n + 1], `weights` [n] >= 0.
 
     The middles are the inverse of the distribution function at (j + jitter) / m; borders lie half way between
-    middles and are reflected at both ends (mip-NeRF 360, section 3). `centres` [m] is scratch. Weights are
-    raised to `exponent` in [0, 1], which flattens them while they are not to be trusted yet.
+    middles and are reflected at both ends (mip-NeRF 360, section 3). Weights are raised to `exponent` in [0,
+    1], which flattens them while they are not to be trusted yet. `mass` [n + 1] at least and `middles` [m + n]
+    at least are scratch.
     """
     kind = edges.dtype.type
     n, m = weights.shape[0], out.shape[0] - 1
     padding = kind(PADDING)
     total = kind(0)
+    mass[0] = total
     for j in range(n):
         total += (weights[j] if exponent == kind(1) else weights[j] ** exponent) + padding
+        mass[j + 1] = total
     low, high = edges[0], edges[n]
-    j = -1
-    before, inside = kind(0), kind(0)
-    for i in range(m):
-        wanted = (kind(i) + jitter) / kind(m) * total
-        while j < n - 1 and (j < 0 or before + inside < wanted):
-            before += inside
-            j += 1
-            inside = (weights[j] if exponent == kind(1) else weights[j] ** exponent) + padding
-        share = min(max((wanted - before) / inside, kind(0)), kind(1))
-        centres[i] = edges[j] + share * (edges[j + 1] - edges[j])
+    part = total / kind(m)
+    # Each turn goes on to the next middle or to the next interval, without a branch that could be guessed
+    # wrong: a middle that is written in the wrong interval is written again.
+    i, j = 0, 0
+    for _ in range(m + n - 1):
+        wanted = (kind(i) + jitter) * part
+        share = (wanted - mass[j]) / (mass[j + 1] - mass[j])
+        middles[i] = edges[j] + min(max(share, kind(0)), kind(1)) * (edges[j + 1] - edges[j])
+        onward = np.int64((mass[j + 1] < wanted) & (j < n - 1))
+        j += onward
+        i += 1 - onward
     half = kind(0.5)
     for i in range(1, m):
-        out[i] = (centres[i - 1] + centres[i]) * half
+        out[i] = (middles[i - 1] + middles[i]) * half
     if m == 1:
         out[0], out[1] = low, high
         return
-    out[0] = max(low, centres[0] - (out[1] - centres[0]))
-    out[m] = min(high, centres[m - 1] + (centres[m - 1] - out[m - 1]))
+    out[0] = max(low, middles[0] - (out[1] - middles[0]))
+    out[m] = min(high, middles[m - 1] + (middles[m - 1] - out[m - 1]))
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def _proposal_weights(rays_o, rays_d, ray, grid, limits, found):
-    """Fill in what the round `found` has of one ray, whose edges are there; nothing is looked up behind an
-    opaque interval."""
-    edges, depths, points, weights = (
-        found.edges[ray], found.depths[ray], found.points[ray], found.weights[ray]
-    )  # fmt: skip
-    kind = edges.dtype.type
-    half = kind(0.5)
-    tau = kind(0)
-    t0 = distance(edges[0])
-    for j in range(weights.shape[0]):
+    """Fill in what the round `found` has of one ray, whose edges are there; nothing is looked up far behind
+    an opaque interval."""
+    origin, direction, edges = rays_o[ray], rays_d[ray], found.edges[ray]
+    points, depths, weights = found.points[ray], found.depths[ray], found.weights[ray]
+    tau = np.float32(0)
+    for first in range(0, weights.shape[0], LANES):
         if tau > limits.opaque_depth:
-            weights[j] = 0
-            depths[j] = 0
-            continue
-        t1 = distance(edges[j + 1])
-        t = (t0 + t1) * half
-        x, y, z = contracted_at(rays_o, rays_d, ray, t)
-        logit = min(proposal_logit(x, y, z, grid), limits.largest_logit)
-        depth = np.exp(logit) * (t1 - t0)
-        weights[j] = -np.exp(-tau) * np.expm1(-depth)
-        tau += depth
-        depths[j] = depth
-        points[j, 0], points[j, 1], points[j, 2] = x, y, z
-        t0 = t1
+            weights[first:] = 0
+            depths[first:] = 0
+            return
+        tau = propose_lanes(origin, direction, edges, first, grid, limits, tau, points, depths, weights)
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
@@ -153,50 +124,54 @@ def propose(rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, fir
     block = 16
     n_rays = rays_o.shape[0]
     for start in prange((n_rays + block - 1) // block):
-        centres = np.empty(max(edges.shape[1], second.edges.shape[1]), edges.dtype)
+        most = max(edges.shape[1], first.edges.shape[1], second.edges.shape[1])
+        mass, middles = np.empty(most, edges.dtype), np.empty(2 * most, edges.dtype)
         whole = np.array([near, far], edges.dtype)
         unit = np.ones(1, edges.dtype)
         for ray in range(start * block, min((start + 1) * block, n_rays)):
             shift = jitter[ray]
-            resample(whole, unit, kind(1), shift[0], centres, first.edges[ray])
+            resample(whole, unit, kind(1), shift[0], mass, middles, first.edges[ray])
             _proposal_weights(rays_o, rays_d, ray, grid0, limits, first)
-            resample(first.edges[ray], first.weights[ray], exponent, shift[1], centres, second.edges[ray])
+            resample(first.edges[ray], first.weights[ray], exponent, shift[1], mass, middles, second.edges[ray])
             _proposal_weights(rays_o, rays_d, ray, grid1, limits, second)
-            resample(second.edges[ray], second.weights[ray], exponent, shift[2], centres, edges[ray])
+            resample(second.edges[ray], second.weights[ray], exponent, shift[2], mass, middles, edges[ray])
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, points, features):
-    """Look the field up in the final intervals, up to where a ray is opaque.
+def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, points, features, sigmas):
+    """Look the field up in the final intervals, up to where a ray is opaque; their number n is a multiple of
+    LANES.
 
-    Ray r writes its `counts[r]` samples to the rows from r * n on of `t_mid`, `deltas`, `points` and
-    `features`; the rows behind them are left as they are.
+    Ray r writes its `counts[r]` samples to the rows from r * n on of `t_mid`, `deltas`, `points`, `features`
+    and `sigmas`; what is written to the rows behind them has no meaning.
     """
-    kind = edges.dtype.type
-    half = kind(0.5)
     n = edges.shape[1] - 1
     block = 16
     n_rays = rays_o.shape[0]
+    grid = GridArrays(field.table, field.scales, field.offsets, field.hashed, field.mask)
     for start in prange((n_rays + block - 1) // block):
         hidden = np.zeros(field.b1.shape[0], edges.dtype)
+        places = np.empty((5, LANES), edges.dtype)
         for ray in range(start * block, min((start + 1) * block, n_rays)):
-            tau = kind(0)
-            t0 = distance(edges[ray, 0])
-            counts[ray] = 0
-            for j in range(n):
+            tau = np.float32(0)
+            counts[ray] = n
+            for first in range(0, n, LANES):
+                k = ray * n + first
+                look_up_lanes(
+                    rays_o[ray], rays_d[ray], edges[ray], first, grid, places, features[k : k + LANES]
+                )
+                for lane in range(LANES):
+                    if tau > limits.opaque_depth:
+                        counts[ray] = min(counts[ray], first + lane)
+                    logit = density_logit(features[k + lane], field, hidden)
+                    sigmas[k + lane] = np.exp(min(logit, limits.largest_logit))
+                    t_mid[k + lane], deltas[k + lane] = places[0, lane], places[1, lane]
+                    for axis in range(3):
+                        points[k + lane, axis] = places[2 + axis, lane]
+                    tau += sigmas[k + lane] * deltas[k + lane]
                 if tau > limits.opaque_depth:
+                    counts[ray] = min(counts[ray], first + LANES)
                     break
-                t1 = distance(edges[ray, j + 1])
-                t = (t0 + t1) * half
-                k = ray * n + j
-                x, y, z = contracted_at(rays_o, rays_d, ray, t)
-                sigma = look_up(x, y, z, field, limits, features[k], hidden)
-                t_mid[k] = t
-                deltas[k] = t1 - t0
-                points[k, 0], points[k, 1], points[k, 2] = x, y, z
-                tau += sigma * (t1 - t0)
-                counts[ray] = j + 1
-                t0 = t1
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
@@ -247,18 +222,20 @@ def interlevel(edges, starts, counts, weights, found, losses, grad_logits):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def scatter_logits(points, grad_logits, levels, n_threads, grad_table):
-    """Add to `grad_table` [n_entries, 1] the gradient of `proposal_logit` at `points` [n_points, 3], given
-    `grad_logits` [n_points]. One thread owns a level, as in the hash grid's own scatter."""
+    """Add to `grad_table` [n_entries, 1] the gradient of a proposal's log-densities at `points` [n_rays, 3,
+    n], given `grad_logits` [n_rays, n]. One thread owns a level, as in the hash grid's own scatter."""
     scales, offsets, hashed, mask = levels
     n_levels = scales.shape[0]
     for thread in prange(n_threads):
         for level in range(thread, n_levels, n_threads):
-            for i in range(points.shape[0]):
-                if grad_logits[i] == 0:
-                    continue
-                r, w = corners(
-                    points[i, 0], points[i, 1], points[i, 2], scales[level], offsets[level], mask,
-                    hashed[level],
-                )  # fmt: skip
-                for corner in range(8):
-                    grad_table[r[corner], 0] += w[corner] * grad_logits[i]
+            for ray in range(points.shape[0]):
+                for j in range(points.shape[2]):
+                    g = grad_logits[ray, j]
+                    if g == 0:
+                        continue
+                    r, w = corners(
+                        points[ray, 0, j], points[ray, 1, j], points[ray, 2, j], scales[level],
+                        offsets[level], mask, hashed[level],
+                    )  # fmt: skip
+                    for corner in range(8):
+                        grad_table[r[corner], 0] += w[corner] * g

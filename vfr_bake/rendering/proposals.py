@@ -7,6 +7,8 @@ distances spaced uniformly up to one model unit and by disparity beyond, positio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numba import get_num_threads
@@ -17,7 +19,7 @@ from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.proposals import Round
-from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
+from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composited_features
 
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
@@ -25,53 +27,44 @@ N_FINAL = 32
 """Intervals in which the field itself is looked up."""
 FAR = 1e3
 """Rays end at this distance, model units; the farthest camera is at 1."""
-RESOLUTIONS = (128, 512)
-"""Finest level of each round's grid, cells per axis over contracted space; both have 10 levels from 16 on."""
-N_LEVELS = 10
+LAYOUTS = ((5, 128), (5, 256))
+"""Levels of each round's grid, and cells per axis of the finest over contracted space; the coarsest has
+BASE_RESOLUTION."""
+FIRST_LAYOUTS = ((10, 128), (10, 512))
+"""Those of the model files that do not say."""
+BASE_RESOLUTION = 16
 LOG2_TABLE_SIZE = 17
-RAY_CHUNK = 4096
-"""Rays whose samples are held at once when pictures are rendered: 35 MB of features at most."""
 
 
 class ProposalGrid(nn.Module):
     """Log-density as the sum over levels of one interpolated channel."""
 
-    def __init__(self, max_resolution: int) -> None:
+    def __init__(self, n_levels: int, max_resolution: int) -> None:
         super().__init__()
-        self.layout = GridLayout(N_LEVELS, 16, max_resolution, LOG2_TABLE_SIZE)
+        self.layout = GridLayout(n_levels, BASE_RESOLUTION, max_resolution, LOG2_TABLE_SIZE)
         self.table = nn.Parameter(zeros(self.layout.n_entries, 1))
 
 
 class ProposalSampler(nn.Module):
     """Says where to look a field up along the rays of an unbounded scene.
 
-    `near`: how near to a camera matter may begin, model units.
+    `near`: how near to a camera matter may begin, model units. `layouts`: levels and finest resolution of
+    each round's grid.
     """
 
-    def __init__(self, near: float) -> None:
+    def __init__(self, near: float, layouts: Sequence[tuple[int, int]] = LAYOUTS) -> None:
         super().__init__()
-        self.near = near
-        self.grids = nn.ModuleList(ProposalGrid(resolution) for resolution in RESOLUTIONS)
+        self.near, self.layouts = near, tuple(layouts)
+        self.grids = nn.ModuleList(ProposalGrid(*layout) for layout in self.layouts)
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The samples of all rays [n_rays, 3], in the middle of their intervals."""
         middle = torch.full((len(rays_o), 3), 0.5)
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
 
-    @torch.no_grad()
     def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
         """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
-        features = np.empty((len(rays_o), field.config.n_channels), np.float32)
-        opacity, depth = np.empty((2, len(rays_o)), np.float32)
-        for start in range(0, len(rays_o), RAY_CHUNK):
-            rows = slice(start, start + RAY_CHUNK)
-            samples = self.sample_all(field, rays_o[rows], rays_d[rows])
-            values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
-            sigmas = field.density(samples.features)
-            out, alpha, _ = composite(sigmas, values, samples.deltas, samples.starts, samples.counts)
-            features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
-            depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
-        return RayFeatures(features, opacity, depth)
+        return composited_features(self.sample_all, field, rays_o, rays_d)
 
     def sample_rounds(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, exponent: float = 1.0
@@ -81,7 +74,9 @@ class ProposalSampler(nn.Module):
         `exponent`: weights are raised to it before they are drawn from; less than 1 early in training.
         """
         n_rays = len(rays_o)
-        rounds = [_empty_round(n_rays) for _ in RESOLUTIONS]
+        # Those of a camera lie axis by axis; the kernels read a ray's three numbers beside each other.
+        rays_o, rays_d = rays_o.contiguous(), rays_d.contiguous()
+        rounds = [_empty_round(n_rays) for _ in self.grids]
         edges = np.empty((n_rays, N_FINAL + 1), np.float32)
         near = np.float32(self.near)
         borders = (kernels.spacing(near), kernels.spacing(np.float32(FAR)))
@@ -100,19 +95,25 @@ class ProposalSampler(nn.Module):
         t_mid, deltas = np.empty(n_samples, np.float32), np.empty(n_samples, np.float32)
         points = np.empty((n_samples, 3), np.float32)
         features = np.empty((n_samples, field.config.n_channels), np.float32)
+        sigmas = np.empty(n_samples, np.float32)
         kernels.field_samples(
             rays_o.numpy(), rays_d.numpy(), edges, field.arrays(), LIMITS, counts, t_mid, deltas, points,
-            features,
+            features, sigmas,
         )  # fmt: skip
-        kept = (np.arange(N_FINAL) < counts[:, None]).reshape(-1)
+        arrays = [t_mid, deltas, points, features, sigmas]
+        kept = np.flatnonzero(np.arange(N_FINAL) < counts[:, None])
+        if len(kept) < n_samples:
+            arrays = [array[kept] for array in arrays]
+        t_mid, deltas, points, features, sigmas = arrays
         return RaySamples(
-            t_mid=torch.from_numpy(t_mid[kept]),
-            deltas=torch.from_numpy(deltas[kept]),
-            points=torch.from_numpy(points[kept]),
-            features=torch.from_numpy(features[kept]),
+            t_mid=torch.from_numpy(t_mid),
+            deltas=torch.from_numpy(deltas),
+            points=torch.from_numpy(points),
+            features=torch.from_numpy(features),
             rays=torch.arange(n_rays),
             starts=torch.from_numpy(np.cumsum(counts) - counts),
             counts=torch.from_numpy(counts),
+            sigmas=torch.from_numpy(sigmas),
         )
 
     def add_gradients(
@@ -128,7 +129,7 @@ class ProposalSampler(nn.Module):
             kernels.interlevel(edges, starts, counts, weights.detach().numpy(), found, losses, grad_logits)
             grad_logits /= n_rays
             kernels.scatter_logits(
-                found.points.reshape(-1, 3), grad_logits.reshape(-1), grid.layout.arrays(np.float32),  # type: ignore[union-attr]
+                found.points, grad_logits, grid.layout.arrays(np.float32),  # type: ignore[union-attr]
                 get_num_threads(), grid.table.grad.numpy(),  # type: ignore[union-attr]
             )  # fmt: skip
             total += float(losses.sum()) / n_rays
@@ -139,6 +140,6 @@ def _empty_round(n_rays: int) -> Round:
     return Round(
         edges=np.empty((n_rays, N_PROPOSED + 1), np.float32),
         depths=np.empty((n_rays, N_PROPOSED), np.float32),
-        points=np.empty((n_rays, N_PROPOSED, 3), np.float32),
+        points=np.empty((n_rays, 3, N_PROPOSED), np.float32),
         weights=np.empty((n_rays, N_PROPOSED), np.float32),
     )

@@ -18,7 +18,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import space as kernels
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.space import Found, Pace
-from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
+from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composited_features
 
 RESOLUTION = 128
 """Cells per axis."""
@@ -40,8 +40,6 @@ FALL = 0.5
 """Share by which a cell follows what was gathered there if that is less than it has."""
 SHARE = 64
 """An update looks at one cell in so many, at random; the others are left to the rays that pass."""
-RAY_CHUNK = 4096
-"""Rays whose samples are held at once when pictures are rendered."""
 
 
 class Intervals(NamedTuple):
@@ -106,30 +104,13 @@ class SpaceGrid:
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """The samples of all rays [n_rays, 3], FINER times as many as in training, without jitter."""
-        return self._march_middles(field, rays_o, rays_d)[0]
-
-    def _march_middles(
-        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
-    ) -> tuple[RaySamples, np.ndarray]:
         middle = torch.full((len(rays_o),), 0.5)
         rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-        return self.march(field, *rays, middle, FINER)[:2]
+        return self.march(field, *rays, middle, FINER)[0]
 
-    @torch.no_grad()
     def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
         """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
-        features = np.empty((len(rays_o), field.config.n_channels), np.float32)
-        opacity, depth = np.empty((2, len(rays_o)), np.float32)
-        for start in range(0, len(rays_o), RAY_CHUNK):
-            rows = slice(start, start + RAY_CHUNK)
-            samples, sigmas = self._march_middles(field, rays_o[rows], rays_d[rows])
-            values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
-            out, alpha, _ = composite(
-                torch.from_numpy(sigmas), values, samples.deltas, samples.starts, samples.counts
-            )
-            features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
-            depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
-        return RayFeatures(features, opacity, depth)
+        return composited_features(self.sample_all, field, rays_o, rays_d)
 
     def update(self, field: VfrField) -> None:
         """Look at the field at one random point of each of a share of the cells; the first time, of all."""

@@ -34,8 +34,9 @@ STEPS_PER_UPDATE = (16, 64)
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
 steps and b the slope (mip-NeRF 360, section C)."""
-STEPS_PER_PROPOSAL_UPDATE = 5
-"""Later proposals change slowly and learn in one step of so many (nerfacc's default)."""
+STEPS_PER_PROPOSAL_UPDATE, STEADY_STEPS = 5, 200
+"""Proposals change ever more slowly, and learn in one step of so many at most (nerfacc's default): in each one
+for so many steps, then in every second for as many, and so on."""
 
 
 class Guide(ABC):
@@ -229,7 +230,7 @@ class SpaceGuide(Guide):
     def prepare(self, step: int, progress: float, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
-        self._learns = step < ANNEAL_STEPS or step % STEPS_PER_PROPOSAL_UPDATE == 0
+        self._learns = step % min(STEPS_PER_PROPOSAL_UPDATE, 1 + step // STEADY_STEPS) == 0
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:

@@ -8,7 +8,8 @@ measured), since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), wh
 files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where
 all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
 occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
-tensors), or, since version 2.3, its grid of contracted space: near, threshold (optical depth), densities
+tensors), since version 2.4 layouts (levels and finest resolution of each round's grid; 10 and 128, 10 and 512
+in older files); or, since version 2.3, its grid of contracted space: near, threshold (optical depth), densities
 [128, 128, 128] float32.
 """
 
@@ -32,7 +33,7 @@ from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.proposals import FAR, ProposalSampler
+from vfr_bake.rendering.proposals import BASE_RESOLUTION, FAR, FIRST_LAYOUTS, ProposalSampler
 from vfr_bake.rendering.render import Sampler, mean_colour, render_rays
 from vfr_bake.rendering.space_grid import RESOLUTION, THRESHOLD, SpaceGrid
 from vfr_bake.training.captures.exposure import Correction
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 3)
+VERSION = (2, 4)
 N_MEAN_VIEWS = 16
 """Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
@@ -245,7 +246,8 @@ def _read(path: Path, max_memory: float | None) -> dict[str, Any]:
 
 def _sampler_content(sampler: Sampler) -> dict[str, Any]:
     if isinstance(sampler, ProposalSampler):
-        return {"near": sampler.near, "state": sampler.state_dict()}
+        layouts = torch.tensor(sampler.layouts)
+        return {"near": sampler.near, "layouts": layouts, "state": sampler.state_dict()}
     if isinstance(sampler, SpaceGrid):
         densities = torch.from_numpy(sampler.densities)
         return {"near": sampler.near, "threshold": sampler.threshold, "densities": densities}
@@ -291,9 +293,27 @@ def _restore_space(content: dict[str, Any], where: str) -> SpaceGrid | ProposalS
         return _restore_grid(content, where)
     check_kinds(content, {"near": float, "state": dict}, where)
     _check_near(content["near"], where)
-    sampler = ProposalSampler(content["near"])
+    sampler = ProposalSampler(content["near"], _layouts(content, where))
     _restore(sampler, content["state"], where)
     return sampler
+
+
+def _layouts(content: dict[str, Any], where: str) -> list[tuple[int, int]]:
+    """Levels and finest resolution of the grid of each round of proposals."""
+    if "layouts" not in content:
+        return list(FIRST_LAYOUTS)
+    check_kinds(content, {"layouts": torch.Tensor}, where)
+    layouts = content["layouts"]
+    check_plain(layouts, layouts.dtype == torch.int64, "whole numbers", f"{where}: layouts")
+    if list(layouts.shape) != [2, 2]:
+        raise FormatError(f"{where}: layouts: expected 2 x 2 numbers, got {brief(list(layouts.shape))}")
+    for n_levels, resolution in layouts.tolist():
+        if not (1 <= n_levels <= 32 and BASE_RESOLUTION <= resolution <= 8192):
+            raise FormatError(
+                f"{where}: layouts: expected 1 to 32 levels of {BASE_RESOLUTION} to 8192 cells, got "
+                f"{n_levels} of {resolution}"
+            )
+    return [(n_levels, resolution) for n_levels, resolution in layouts.tolist()]
 
 
 def _restore_grid(content: dict[str, Any], where: str) -> SpaceGrid:

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from player.march.march import OPAQUE_DEPTH
 from tests.reference import composite_ray
 from tests.vfr_bake import twins
 from vfr_bake.config import FieldOptions
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.kernels.contraction import contracted_unit
+from vfr_bake.kernels.density import LARGEST_LOGIT
 from vfr_bake.rendering.proposals import FAR, N_FINAL, N_PROPOSED, ProposalSampler
+from vfr_bake.torch_kernels.hash_grid import encode
 from vfr_bake.training.optimiser import GridAdam
 
 ONE = np.float32(1)
@@ -76,13 +79,14 @@ HISTOGRAMS = {
 def test_resampling_inverts_the_distribution(name: str, jitter: float) -> None:
     weights = HISTOGRAMS[name]
     edges = np.sort(np.random.default_rng(0).random(17))
-    out, centres = np.empty(9), np.empty(8)
-    kernels.resample(edges, weights, np.float64(1), np.float64(jitter), centres, out)
+    out = np.empty(9)
+    kernels.resample(edges, weights, np.float64(1), np.float64(jitter), np.empty(17), np.empty(24), out)
     np.testing.assert_allclose(out, naive_resample(edges, weights, 8, jitter), rtol=0, atol=1e-9)
     assert (np.diff(out) >= 0).all() and out[0] >= edges[0] and out[-1] <= edges[-1]
     single, zero = (a.astype(np.float32) for a in (edges, weights))
     ours = np.empty(9, np.float32)
-    kernels.resample(single, zero, ONE, np.float32(jitter), np.empty(8, np.float32), ours)
+    scratch = np.empty(17, np.float32), np.empty(24, np.float32)
+    kernels.resample(single, zero, ONE, np.float32(jitter), *scratch, ours)
     np.testing.assert_allclose(ours, out, rtol=0, atol=2e-5)
 
 
@@ -114,7 +118,7 @@ def test_interlevel_loss_and_its_gradient() -> None:
     logits = random.normal(size=n)
     depths, p_weights = proposal(logits)
     losses, gradient = np.empty(1), np.empty((1, n))
-    found = kernels.Round(p_edges, depths[None], np.empty((1, n, 3)), p_weights[None])
+    found = kernels.Round(p_edges, depths[None], np.empty((1, 3, n)), p_weights[None])
     kernels.interlevel(edges, starts, counts, weights, found, losses, gradient)
     assert losses[0] == pytest.approx(naive_interlevel(edges[0], weights, p_edges[0], p_weights), rel=1e-12)
     assert losses[0] > 0
@@ -146,11 +150,83 @@ def test_samples_lie_where_they_say() -> None:
     expected = np.stack([(contract(point) + 2) / 4 for point in points])
     np.testing.assert_allclose(samples.points.numpy(), expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(samples.features, twins.encode(field.grid, samples.points), rtol=0, atol=1e-5)
-    for found in rounds:
-        before = np.cumsum(found.depths.astype(np.float64), axis=1) - found.depths
-        weights = np.exp(-before) * -np.expm1(-found.depths.astype(np.float64))
-        seen = found.depths > 0
-        np.testing.assert_allclose(found.weights[seen], weights[seen], rtol=1e-3, atol=1e-6)
+    with torch.no_grad():
+        torch.testing.assert_close(samples.sigmas, field.density(samples.features), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("scale", [0.0, 2.0, 30.0])
+def test_rounds_are_the_equations_in_float64(scale: float) -> None:
+    """Of the edges that each round has; with a scale of 30 densities reach the largest and are opaque."""
+    field, sampler, rays_o, rays_d = make()
+    for grid in sampler.grids:
+        torch.nn.init.uniform_(grid.table, -scale, scale)
+    _, _, rounds = sampler.sample_rounds(field, rays_o, rays_d, torch.rand(40, 3))
+    o, d = rays_o[:, None].double().numpy(), rays_d[:, None].double().numpy()
+    for grid, found in zip(sampler.grids, rounds, strict=True):
+        t = np.vectorize(kernels.distance)(found.edges.astype(np.float64))
+        lengths = np.diff(t, axis=1)
+        points = o + (t[:, 1:] + t[:, :-1])[..., None] / 2 * d
+        points = (np.apply_along_axis(contract, 2, points) + 2) / 4
+        rows = torch.from_numpy(points.reshape(-1, 3))
+        layout = grid.layout
+        logits = encode(rows, grid.table.detach().double(), layout.levels(grid.table.double())).sum(dim=1)
+        depths = np.exp(np.minimum(logits.numpy().reshape(lengths.shape), LARGEST_LOGIT)) * lengths
+        before = np.cumsum(depths, axis=1) - depths
+        seen = before < OPAQUE_DEPTH * 0.99
+        assert seen.any(axis=1).all() and (scale < 30 or not seen.all())
+        np.testing.assert_allclose(found.points.transpose(0, 2, 1)[seen], points[seen], rtol=0, atol=1e-6)
+        # Logits are sums of up to ten numbers of `scale`, in places known to 1e-6 of up to 512 cells.
+        close = {"rtol": 1e-4 + 1e-3 * scale, "atol": 1e-7}
+        np.testing.assert_allclose(found.depths[seen], depths[seen], **close)
+        ours = np.cumsum(found.depths.astype(np.float64), axis=1) - found.depths
+        weights = np.exp(-ours) * -np.expm1(-found.depths.astype(np.float64))
+        np.testing.assert_allclose(found.weights[seen], weights[seen], rtol=1e-5, atol=1e-7)
+        behind = before > OPAQUE_DEPTH * 1.01
+        assert not found.weights[behind].any() and not found.depths[behind].any()
+
+
+def test_thin_and_opaque_depths_keep_their_digits() -> None:
+    """Where a proposal gives every interval the same density, from next to nothing to the largest."""
+    field, sampler, rays_o, rays_d = make()
+    for logit in (-1e4, -80.0, -60.0, -20.0, -5.0, -1.0, 0.0, 3.0, LARGEST_LOGIT, 1e4):
+        with torch.no_grad():
+            for grid in sampler.grids:
+                grid.table.zero_()
+                grid.table[: 17**3] = logit  # of the coarsest level alone
+        _, _, rounds = sampler.sample_rounds(field, rays_o, rays_d, torch.rand(40, 3))
+        for found in rounds:
+            lengths = np.diff(np.vectorize(kernels.distance)(found.edges.astype(np.float64)), axis=1)
+            depths = np.exp(min(logit, LARGEST_LOGIT)) * lengths
+            before = np.cumsum(depths, axis=1) - depths
+            seen = before < OPAQUE_DEPTH * 0.99
+            weights = np.where(seen, np.exp(-before) * -np.expm1(-depths), 0)
+            np.testing.assert_allclose(found.weights[seen], weights[seen], rtol=2e-3, atol=1e-37)
+
+
+def test_rays_may_lie_axis_by_axis() -> None:
+    """As those of a camera do."""
+    field, sampler, rays_o, rays_d = make()
+    expected = sampler.sample_all(field, rays_o.numpy(), rays_d.numpy())
+    samples = sampler.sample_all(field, *(np.asfortranarray(rays.numpy()) for rays in (rays_o, rays_d)))
+    for name in ("t_mid", "points", "features", "sigmas"):
+        torch.testing.assert_close(getattr(samples, name), getattr(expected, name), rtol=0, atol=0)
+
+
+def test_no_ray_at_all() -> None:
+    field, sampler, rays_o, rays_d = make()
+    samples, edges, rounds = sampler.sample_rounds(field, rays_o[:0], rays_d[:0], torch.zeros(0, 3))
+    assert len(samples.t_mid) == len(samples.counts) == len(edges) == 0
+    adams = [GridAdam(grid.table) for grid in sampler.grids]
+    assert sampler.add_gradients(rounds, edges, samples, torch.zeros(0), 1) == 0
+    assert not any(adam.gradient.any() for adam in adams)
+
+
+def test_a_density_that_is_no_number_is_seen() -> None:
+    field, sampler, rays_o, rays_d = make()
+    with torch.no_grad():
+        sampler.grids[1].table.fill_(float("nan"))
+    _, _, rounds = sampler.sample_rounds(field, rays_o, rays_d, torch.rand(40, 3))
+    assert np.isfinite(rounds[0].weights).all() and np.isnan(rounds[1].weights).all()
 
 
 def test_nothing_is_looked_up_behind_an_opaque_sample() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from player.march.march import OPAQUE_DEPTH
 from tests.vfr_bake.rendering.test_proposals import (
     HISTOGRAMS,
     contract,
@@ -16,12 +15,11 @@ from tests.vfr_bake.rendering.test_proposals import (
 )
 from vfr_bake.config import TrainConfig
 from vfr_bake.kernels import proposals as compiled
-from vfr_bake.kernels.density import LARGEST_LOGIT, Limits
 from vfr_bake.kernels.proposals import Round, spacing
 from vfr_bake.rendering.compositing import RaySamples
-from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED
+from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid
 from vfr_bake.torch_kernels import proposals as kernels
-from vfr_bake.training.device_guides import DeviceProposalGuide
+from vfr_bake.training.device_guides import DeviceProposalGuide, field_samples, proposal_weights
 from vfr_bake.training.guides import ProposalGuide
 
 
@@ -81,7 +79,7 @@ def test_interlevel_loss_and_its_gradient(device: torch.device) -> None:
     losses = kernels.interlevel(*tensors, p_weights)
     proposed = p_weights.detach().cpu().numpy()
     expected, depths, starts = np.empty(n_rays), np.zeros((n_rays, n)), np.arange(n_rays) * m
-    found = Round(p_edges, depths, np.empty((n_rays, n, 3)), proposed)
+    found = Round(p_edges, depths, np.empty((n_rays, 3, n)), proposed)
     compiled.interlevel(
         edges, starts, np.full(n_rays, m), weights.reshape(-1), found, expected, np.empty((n_rays, n))
     )
@@ -105,37 +103,47 @@ def guides(device: torch.device) -> tuple[ProposalGuide, DeviceProposalGuide]:
 
 
 @pytest.mark.parametrize("step", [0, 10, 1000])
-def test_rounds_and_samples_are_the_kernels_in_float64(step: int, device: torch.device) -> None:
-    """In float32 flat parts of a distribution magnify rounding a thousandfold in each round."""
+def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) -> None:
+    """Each stage from what the kernels' own one before it has found: flat parts of a distribution magnify
+    rounding a thousandfold in each round."""
     field, _, *rays = make()
     torch.manual_seed(3)
-    rays = [a.double() for a in (*rays, torch.rand(40, 3))]
+    jitter = torch.rand(40, 3)
     expected, guide = guides(device)
-    for module in (field, expected.sampler, guide._sampler):
-        module.double()
-    guide.prepare(step, 0.0, field)
-    grids = [grid.layout.grid(grid.table) for grid in expected.sampler.grids]
-    arrays, limits = [a.numpy() for a in rays], Limits(*map(np.float64, (LARGEST_LOGIT, OPAQUE_DEPTH)))
-    shapes = [(40, N_PROPOSED + 1), (40, N_PROPOSED), (40, N_PROPOSED, 3), (40, N_PROPOSED)]
-    rounds = [Round(*(np.zeros(shape) for shape in shapes)) for _ in range(2)]
-    edges, counts, n = np.empty((40, N_FINAL + 1)), np.empty(40, np.int64), 40 * N_FINAL
-    compiled.propose(*arrays, guide._borders, np.float64(guide._exponent), *grids, limits, *rounds, edges)
-    t_mid, deltas, points = np.empty(n), np.empty(n), np.empty((n, 3))
-    features = np.empty((n, field.config.n_channels))
-    compiled.field_samples(
-        *arrays[:2], edges, field.arrays(), limits, counts, t_mid, deltas, points, features
-    )
-    field.to(device).grid.backend = "torch"
-    samples = guide.sample(field, *(a.to(device) for a in rays), pilot=False, share=1.0)
-    for (ours, weights), found in zip(guide._rounds, rounds, strict=True):
-        np.testing.assert_allclose(ours.cpu().numpy(), found[0], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(weights.detach().cpu().numpy(), found[3], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(guide._edges.cpu().numpy(), edges, rtol=0, atol=1e-8)
-    assert samples.counts.tolist() == counts.tolist()
-    kept = (np.arange(N_FINAL) < counts[:, None]).reshape(-1)
-    for name, values in {"t_mid": t_mid, "deltas": deltas, "points": points, "features": features}.items():
-        ours = getattr(samples, name).cpu().numpy()
-        np.testing.assert_allclose(ours, values[kept], rtol=1e-4, atol=1e-5, err_msg=name)
+    for each in (expected, guide):
+        each.prepare(step, 0.0, field)
+    found = expected.sample(field, *rays, jitter, pilot=False, share=1.0)
+    rounds, edges = expected._rounds, expected._edges
+    guide._sampler.double()
+    field.double().to(device).grid.backend = "torch"
+    o, d, shifts = (a.double().to(device) for a in (*rays, jitter))
+    before = torch.tensor([guide._borders] * 40), torch.ones(40, 1)
+    for number, (grid, now) in enumerate(zip(guide._sampler.grids, rounds, strict=True)):
+        assert isinstance(grid, ProposalGrid)
+        exponent = guide._exponent if number else 1.0
+        drawn = kernels.resample(*doubles(device, *before), exponent, shifts[:, number], N_PROPOSED)
+        same_borders(now.edges, drawn)
+        weights = proposal_weights(grid, o, d, *doubles(device, torch.from_numpy(now.edges)))
+        np.testing.assert_allclose(now.weights, weights.detach().cpu().numpy(), rtol=1e-3, atol=3e-5)
+        before = torch.from_numpy(now.edges), torch.from_numpy(now.weights)
+    drawn = kernels.resample(*doubles(device, *before), guide._exponent, shifts[:, 2], N_FINAL)
+    same_borders(edges.numpy(), drawn)
+    samples = field_samples(field, o, d, *doubles(device, edges))
+    assert samples.counts.tolist() == found.counts.tolist()
+    for name in ("t_mid", "deltas", "points", "features"):
+        ours, theirs = getattr(samples, name).cpu().numpy(), getattr(found, name).numpy()
+        np.testing.assert_allclose(theirs, ours, rtol=1e-4, atol=3e-5, err_msg=name)
+
+
+def same_borders(ours: np.ndarray, expected: torch.Tensor) -> None:
+    """In float32 a sum of 64 masses of up to 1 is known to 4e-6, which is 4e-3 of an interval that has no more
+    than the padding of 1e-3: few borders lie in such."""
+    off = np.abs(ours - expected.cpu().numpy())
+    assert off.max() < 1e-3 and np.quantile(off, 0.99) < 3e-5
+
+
+def doubles(device: torch.device, *tensors: torch.Tensor) -> list[torch.Tensor]:
+    return [tensor.to(device, torch.float64) for tensor in tensors]
 
 
 @pytest.mark.parametrize("step", [0, 5])
@@ -164,8 +172,10 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
     torch.testing.assert_close(losses[1].cpu(), losses[0], rtol=1e-4, atol=1e-7)
     assert len(gradients[0]) == len(gradients[1]) == 2
     for ours, expected in zip(*reversed(gradients), strict=True):
-        assert expected.abs().max() > 0
-        torch.testing.assert_close(ours, expected, rtol=1e-3, atol=2e-4 * float(expected.abs().max()))
+        # Whether an interval counts as overlapping one that it just touches is for rounding to say.
+        close = (ours - expected).abs() <= 1e-3 * expected.abs() + 2e-4 * expected.abs().max()
+        assert expected.abs().max() > 0 and int((~close).sum()) <= 1e-4 * len(close)
+        assert (ours - expected).norm() < 0.02 * expected.norm()
 
 
 def same_samples(ours: RaySamples, expected: RaySamples) -> None:
