@@ -18,7 +18,6 @@ from player.compiled.lanes import (
     Variable,
     address,
     choose,
-    gather,
     load,
     splat,
     store,
@@ -59,6 +58,28 @@ def opacity(depth: Lanes) -> Lanes:
     return choose(depth < THIN, depth * thin, 1.0 - (-depth).exp())
 
 
+def gathered(base: Any, index: Lanes, kind: Any) -> Lanes:
+    """Integers of a `kind` at `index` behind the address `base`.
+
+    By the processor's own instruction where LLVM knows it to be fast: a level of a table takes longer to come
+    than to be read, and with an instruction a number more are under way at a time. Field samples take 0.7 to
+    0.8 of the time that they take one by one.
+    """
+    b, bits = index.b, kind.width
+    nothing = ir.Constant(vector(LONG), ir.Undefined)
+    one = b.insert_element(nothing, b.ptrtoint(base, LONG), INT(0))
+    start = b.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES))
+    behind = b.mul(index.wide().value, ir.Constant(vector(LONG), [bits // 8] * LANES))
+    places = b.inttoptr(b.add(behind, start), ir.VectorType(ir.PointerType(kind), LANES))
+    all_of_them = ir.Constant(ir.VectorType(ir.IntType(1), LANES), [1] * LANES)
+    words = vector(kind)
+    arguments = [places.type, INT, all_of_them.type, words]
+    function = cgutils.get_or_insert_function(
+        b.module, ir.FunctionType(words, arguments), f"llvm.masked.gather.v{LANES}i{bits}.v{LANES}p0"
+    )
+    return Lanes(b, b.call(function, [places, INT(4), all_of_them, ir.Constant(words, ir.Undefined)]))
+
+
 def sums_before(values: Lanes) -> tuple[Lanes, Any]:
     """The sum of the lanes before each, and that of all as one number."""
     b, zero = values.b, values.like(0.0)
@@ -97,8 +118,8 @@ class _Level:
         """(Row from the level's first on, trilinear weight) of the eight corners, x fastest."""
         x, y, z = self._cell
         b, side = x.b, self._side
-        hashes = [_pair(x, 1), _pair(y * _signed(PRIME_Y), _signed(PRIME_Y)),
-                  _pair(z * _signed(PRIME_Z), _signed(PRIME_Z))]  # fmt: skip
+        by_y, by_z = y * _signed(PRIME_Y), z * _signed(PRIME_Z)
+        hashes = [(x, x + 1), (by_y, by_y + _signed(PRIME_Y)), (by_z, by_z + _signed(PRIME_Z))]
         row = (z * side + y) * side + x
         shares = [(1.0 - inside, inside) for inside in self._inside]
         found = []
@@ -113,10 +134,6 @@ class _Level:
             at = Lanes(b, b.select(self._hashed, shared.value, own.value))
             found.append((at, shares[0][i] * (shares[1][j] * shares[2][k])))
         return found
-
-
-def _pair(value: Lanes, step: int) -> tuple[Lanes, Lanes]:
-    return value, value + step
 
 
 def _signed(prime: Any) -> int:
@@ -155,7 +172,6 @@ def _propose_lanes(
         for axis, values in enumerate(point):
             store(at, b.add(j, b.mul(pitch, LONG(axis))), values)
         total = Variable(lengths.like(0.0))
-        every = lengths.like(0.0) < 1
         scales = b.extract_value(arguments[4], 1)
         n_levels = context.make_array(signature.args[4].types[1])(context, b, scales).nitems
         with cgutils.for_range(b, n_levels) as loop:
@@ -163,7 +179,7 @@ def _propose_lanes(
             table = b.gep(held.table, [level.first])
             logit = total.get()
             for row, share in level.corners():
-                logit = share.call("fma", gather(table, row, 4, every).as_float(), logit)
+                logit = share.call("fma", gathered(table, row, INT).as_float(), logit)
             total.set(logit)
         logit = total.get()
         depth = choose(logit > largest, largest, logit).exp() * lengths
@@ -201,7 +217,6 @@ def _look_up_lanes(
         t, lengths, point = _points_at(b, origin, direction, borders, j)
         for row, values in enumerate((t, lengths, *point)):
             store(place_at, LONG(row * LANES), values)
-        every = lengths.like(0.0) < 1
         scales = b.extract_value(arguments[4], 1)
         n_levels = context.make_array(signature.args[4].types[1])(context, b, scales).nitems
         with cgutils.for_range(b, n_levels) as loop:
@@ -209,7 +224,7 @@ def _look_up_lanes(
             table = b.gep(held.table, [b.mul(level.first, LONG(2))])
             sums = [lengths.like(0.0), lengths.like(0.0)]
             for row, share in level.corners():
-                words = gather(table, row, 8, every, LONG).halves()
+                words = gathered(table, row, LONG).halves()
                 sums = [share.call("fma", w.as_float(), s) for w, s in zip(words, sums, strict=True)]
             start = b.gep(feature_at, [b.mul(loop.index, LONG(2))])
             pitch = b.mul(n_levels, LONG(2))

@@ -24,7 +24,7 @@ from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composited_f
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
 N_FINAL = 32
-"""Intervals in which the field itself is looked up."""
+"""Intervals in which the field itself is looked up; in the first half of a training half of them."""
 FAR = 1e3
 """Rays end at this distance, model units; the farthest camera is at 1."""
 LAYOUTS = ((5, 128), (5, 256))
@@ -67,17 +67,24 @@ class ProposalSampler(nn.Module):
         return composited_features(self.sample_all, field, rays_o, rays_d)
 
     def sample_rounds(
-        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, exponent: float = 1.0
+        self,
+        field: VfrField,
+        rays_o: Tensor,
+        rays_d: Tensor,
+        jitter: Tensor,
+        exponent: float = 1.0,
+        n_final: int = N_FINAL,
     ) -> tuple[RaySamples, np.ndarray, list[Round]]:
-        """Samples, the borders [n_rays, N_FINAL + 1] of their intervals in s, and what the rounds found.
+        """Samples, the borders [n_rays, n_final + 1] of their intervals in s, and what the rounds found.
 
         `exponent`: weights are raised to it before they are drawn from; less than 1 early in training.
+        `n_final`: a multiple of 16.
         """
         n_rays = len(rays_o)
         # Those of a camera lie axis by axis; the kernels read a ray's three numbers beside each other.
         rays_o, rays_d = rays_o.contiguous(), rays_d.contiguous()
         rounds = [_empty_round(n_rays) for _ in self.grids]
-        edges = np.empty((n_rays, N_FINAL + 1), np.float32)
+        edges = np.empty((n_rays, n_final + 1), np.float32)
         near = np.float32(self.near)
         borders = (kernels.spacing(near), kernels.spacing(np.float32(FAR)))
         grids = [grid.layout.grid(grid.table) for grid in self.grids]  # type: ignore[union-attr, arg-type]
@@ -90,7 +97,8 @@ class ProposalSampler(nn.Module):
     def _field_samples(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: np.ndarray
     ) -> RaySamples:
-        n_rays, n_samples = len(rays_o), len(rays_o) * N_FINAL
+        n_final = edges.shape[1] - 1
+        n_rays, n_samples = len(rays_o), len(rays_o) * n_final
         counts = np.empty(n_rays, np.int64)
         t_mid, deltas = np.empty(n_samples, np.float32), np.empty(n_samples, np.float32)
         points = np.empty((n_samples, 3), np.float32)
@@ -101,7 +109,7 @@ class ProposalSampler(nn.Module):
             features, sigmas,
         )  # fmt: skip
         arrays = [t_mid, deltas, points, features, sigmas]
-        kept = np.flatnonzero(np.arange(N_FINAL) < counts[:, None])
+        kept = np.flatnonzero(np.arange(n_final) < counts[:, None])
         if len(kept) < n_samples:
             arrays = [array[kept] for array in arrays]
         t_mid, deltas, points, features, sigmas = arrays

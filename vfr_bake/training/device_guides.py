@@ -10,7 +10,7 @@ from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.compositing import RaySamples
 from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
-from vfr_bake.rendering.proposals import N_FINAL, N_PROPOSED, ProposalGrid, ProposalSampler
+from vfr_bake.rendering.proposals import N_PROPOSED, ProposalGrid, ProposalSampler
 from vfr_bake.rendering.sampling import march_on_device
 from vfr_bake.torch_kernels import fast
 from vfr_bake.torch_kernels import proposals as kernels
@@ -77,7 +77,7 @@ class DeviceProposalGuide(SpaceGuide):
             with torch.set_grad_enabled(self._learns):
                 weights = proposal_weights(grid, rays_o, rays_d, edges)
             self._rounds.append((edges, weights))
-        self._edges = self._resample(edges, weights, self._exponent, jitter[:, 2], N_FINAL)
+        self._edges = self._resample(edges, weights, self._exponent, jitter[:, 2], self._n_final)
         return field_samples(field, rays_o, rays_d, self._edges)
 
     @staticmethod
@@ -87,7 +87,7 @@ class DeviceProposalGuide(SpaceGuide):
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         if not self._learns or not n_rays:
             return
-        final = weights.new_zeros(len(samples.counts), N_FINAL)
+        final = weights.new_zeros(len(samples.counts), self._edges.shape[1] - 1)
         rows = Padding(samples.starts, samples.counts, len(weights)).rows(weights.detach())
         final[:, : rows.shape[1]] = rows
         losses = [kernels.interlevel(self._edges, final, edges, proposed) for edges, proposed in self._rounds]

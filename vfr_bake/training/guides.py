@@ -206,7 +206,7 @@ class SpaceGuide(Guide):
     all devices."""
 
     _edges: Tensor
-    """[n_rays, N_FINAL + 1] borders of the last samples' intervals, in s."""
+    """[n_rays, n_final + 1] borders of the last samples' intervals, in s."""
 
     def __init__(
         self,
@@ -220,6 +220,7 @@ class SpaceGuide(Guide):
         self._adams = [adam(grid.table) for grid in sampler.grids]  # type: ignore[arg-type]
         self._distortion = distortion
         self._learns = True
+        self._n_final = N_FINAL
         self._exponent = 1.0
         self._borders = (float(spacing(sampler.near)), float(spacing(FAR)))
         self._span = self._borders[1] - self._borders[0]
@@ -231,12 +232,16 @@ class SpaceGuide(Guide):
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step % min(STEPS_PER_PROPOSAL_UPDATE, 1 + step // STEADY_STEPS) == 0
+        # While the learning rate is high, few samples on many rays teach more; later their noise is what is
+        # left of the error.
+        self._n_final = N_FINAL if progress >= MILESTONES[0] else N_FINAL // 2
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
-        kept = torch.arange(N_FINAL, device=weights.device) < samples.counts[:, None]
+        n_final = self._edges.shape[1] - 1
+        kept = torch.arange(n_final, device=weights.device) < samples.counts[:, None]
         low, high = self._edges[:, :-1][kept], self._edges[:, 1:][kept]
         mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
         losses = self._distortion(weights, mids, widths, samples.starts, samples.counts)
@@ -268,7 +273,7 @@ class ProposalGuide(SpaceGuide):
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
         samples, edges, self._rounds = self._sampler.sample_rounds(
-            field, rays_o, rays_d, jitter, self._exponent
+            field, rays_o, rays_d, jitter, self._exponent, self._n_final
         )
         self._edges = torch.from_numpy(edges)
         return samples

@@ -111,7 +111,7 @@ def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) 
     jitter = torch.rand(40, 3)
     expected, guide = guides(device)
     for each in (expected, guide):
-        each.prepare(step, 0.0, field)
+        each.prepare(step, 0.5, field)
     found = expected.sample(field, *rays, jitter, pilot=False, share=1.0)
     rounds, edges = expected._rounds, expected._edges
     guide._sampler.double()
@@ -144,6 +144,24 @@ def same_borders(ours: np.ndarray, expected: torch.Tensor) -> None:
 
 def doubles(device: torch.device, *tensors: torch.Tensor) -> list[torch.Tensor]:
     return [tensor.to(device, torch.float64) for tensor in tensors]
+
+
+def test_proposals_learn_ever_more_rarely_and_samples_get_twice_as_many(device: torch.device) -> None:
+    field, _, *rays = make()
+    jitter = torch.rand(40, 3)
+    for guide in guides(device):
+        learnt = []
+        for step in range(2000):
+            guide.prepare(step, 0.0, field)
+            learnt.append(len(guide.tables()) == 2)
+        assert all(learnt[:200]) and learnt[200:400] == [True, False] * 100
+        assert [sum(learnt[n : n + 60]) for n in (400, 600, 840, 1500)] == [20, 15, 12, 12]
+        for progress, n in ((0.0, N_FINAL // 2), (0.49, N_FINAL // 2), (0.5, N_FINAL), (1.0, N_FINAL)):
+            guide.prepare(1500, progress, field)
+            if isinstance(guide, ProposalGuide):
+                guide.sample(field, *rays, jitter, pilot=False, share=1.0)
+                assert guide._edges.shape == (40, n + 1)
+            assert guide._n_final == n
 
 
 @pytest.mark.parametrize("step", [0, 5])

@@ -16,7 +16,7 @@ from vfr_bake.config import FieldConfig
 from vfr_bake.data.witnesses import N_WITNESSES, Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.rendering.proposals import FIRST_LAYOUTS, ProposalSampler
 from vfr_bake.rendering.render import render_image
 from vfr_bake.rendering.space_grid import RESOLUTION, SpaceGrid
 from vfr_bake.training.model_file import Model, load_model, save_model
@@ -242,20 +242,50 @@ def test_a_broken_grid_of_a_scene_is_named(
 
 
 def test_samplers_of_scenes_come_back(saved: Path, model: Model) -> None:
-    """The grid, and the proposals of a GPU and of the models of version 2.2."""
+    """The grid, and proposals with the levels of today and of before version 2.4."""
     field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
     torch.nn.init.uniform_(field.grid.table, -1, 1)
     grid = SpaceGrid(0.1, seed=0)
     grid.densities[:] = np.random.default_rng(0).random((RESOLUTION,) * 3)
     grid.threshold = 0.005
     rays_o, rays_d = np.zeros((3, 3), np.float32), np.eye(3, dtype=np.float32)
-    for sampler in (grid, ProposalSampler(0.1)):
+    first = ProposalSampler(0.1, FIRST_LAYOUTS)
+    for table in first.parameters():
+        torch.nn.init.uniform_(table, -1, 1)
+    for sampler in (grid, ProposalSampler(0.1), first):
         save_model(saved, replace(model, field=field, sampler=sampler))
+        if sampler is first:
+            content = torch.load(saved, weights_only=True)["sampler"]
+            assert content.pop("layouts").tolist() == [[10, 128], [10, 512]]
+            change(saved, sampler=content)
         found = load_model(saved).sampler
         assert type(found) is type(sampler) and found.near == 0.1  # type: ignore[union-attr]
         expected = sampler.composited_features(field, rays_o, rays_d)
         for ours, theirs in zip(found.composited_features(field, rays_o, rays_d), expected, strict=True):
             np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("layouts", "message"),
+    [
+        ([[5, 128], [5, 256]], "layouts: expected Tensor"),
+        (torch.ones(2, 2), "layouts: expected a plain tensor of whole numbers"),
+        (torch.ones(3, 2, dtype=torch.int64), r"layouts: expected 2 x 2 numbers, got \[3, 2\]"),
+        (torch.tensor([[5, 128], [0, 256]]), "expected 1 to 32 levels of 16 to 8192 cells, got 0 of 256"),
+        (torch.tensor([[33, 128], [5, 256]]), "expected 1 to 32 levels of 16 to 8192 cells, got 33 of 128"),
+        (torch.tensor([[5, 15], [5, 256]]), "expected 1 to 32 levels of 16 to 8192 cells, got 5 of 15"),
+        (torch.tensor([[5, 128], [5, 9000]]), "expected 1 to 32 levels of 16 to 8192 cells, got 5 of 9000"),
+        (torch.tensor([[5, 128], [6, 256]]), "the tensors do not fit the settings"),
+    ],
+)
+def test_broken_levels_of_proposals_are_named(
+    saved: Path, model: Model, layouts: object, message: str
+) -> None:
+    field, sampler = VfrField(replace(CONFIG, unbounded=True, density_width=0)), ProposalSampler(0.1)
+    save_model(saved, replace(model, field=field, sampler=sampler))
+    change(saved, sampler={"near": 0.1, "state": sampler.state_dict(), "layouts": layouts})
+    with pytest.raises(FormatError, match=message):
+        load_model(saved)
 
 
 def test_nan_in_the_weights_is_named(saved: Path) -> None:
