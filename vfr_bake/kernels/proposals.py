@@ -63,8 +63,8 @@ def resample(edges, weights, exponent, jitter, mass, middles, out):
 
     The middles are the inverse of the distribution function at (j + jitter) / m; borders lie half way between
     middles and are reflected at both ends (mip-NeRF 360, section 3). Weights are raised to `exponent` in [0,
-    1], which flattens them while they are not to be trusted yet. `mass` [n + 1] at least and `middles` [m + n]
-    at least are scratch.
+    1], which flattens them while they are not to be trusted yet. `mass` [n + 1] and `middles` [m + n], both
+    at least, are scratch.
     """
     kind = edges.dtype.type
     n, m = weights.shape[0], out.shape[0] - 1
@@ -132,7 +132,9 @@ def propose(rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, fir
             shift = jitter[ray]
             resample(whole, unit, kind(1), shift[0], mass, middles, first.edges[ray])
             _proposal_weights(rays_o, rays_d, ray, grid0, limits, first)
-            resample(first.edges[ray], first.weights[ray], exponent, shift[1], mass, middles, second.edges[ray])
+            resample(
+                first.edges[ray], first.weights[ray], exponent, shift[1], mass, middles, second.edges[ray]
+            )
             _proposal_weights(rays_o, rays_d, ray, grid1, limits, second)
             resample(second.edges[ray], second.weights[ray], exponent, shift[2], mass, middles, edges[ray])
 

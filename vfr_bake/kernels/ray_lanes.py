@@ -105,9 +105,7 @@ class _Level:
         last = scale.to_int() - 1
         places = [value * scale for value in point]
         self._cell = [place.to_int().most(0).least(last) for place in places]
-        self._inside = [
-            place - cell.to_float() for place, cell in zip(places, self._cell, strict=True)
-        ]
+        self._inside = [place - cell.to_float() for place, cell in zip(places, self._cell, strict=True)]
         self._side = last + 2
         self._hashed = b.trunc(entry(grid.hashed), ir.IntType(1))
         self._mask = splat(b, b.trunc(grid.mask, INT))
@@ -139,8 +137,6 @@ class _Level:
 def _signed(prime: Any) -> int:
     """The int32 with the bits of a uint32."""
     return int(prime) - (1 << 32 if int(prime) >> 31 else 0)
-
-
 
 
 def _points_at(b: Any, origin: Any, direction: Any, edges: Any, first: Any) -> tuple[Lanes, Lanes, Three]:

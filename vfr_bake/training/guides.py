@@ -35,8 +35,8 @@ ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
 steps and b the slope (mip-NeRF 360, section C)."""
 STEPS_PER_PROPOSAL_UPDATE, STEADY_STEPS = 5, 200
-"""Proposals change ever more slowly, and learn in one step of so many at most (nerfacc's default): in each one
-for so many steps, then in every second for as many, and so on."""
+"""Proposals change ever more slowly, and learn in one step of so many at most (nerfacc's default): in each
+one for so many steps, then in every second for as many, and so on."""
 
 
 class Guide(ABC):

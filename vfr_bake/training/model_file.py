@@ -8,9 +8,9 @@ measured), since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), wh
 files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where
 all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
 occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
-tensors), since version 2.4 layouts (levels and finest resolution of each round's grid; 10 and 128, 10 and 512
-in older files); or, since version 2.3, its grid of contracted space: near, threshold (optical depth), densities
-[128, 128, 128] float32.
+tensors) and, since version 2.4, layouts (levels and finest resolution of each round's grid; 10 and 128, 10
+and 512 in older files), or, since version 2.3, its grid of contracted space: near, threshold (optical depth),
+densities [128, 128, 128] float32.
 """
 
 from __future__ import annotations

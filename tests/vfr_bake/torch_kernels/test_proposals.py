@@ -136,8 +136,8 @@ def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) 
 
 
 def same_borders(ours: np.ndarray, expected: torch.Tensor) -> None:
-    """In float32 a sum of 64 masses of up to 1 is known to 4e-6, which is 4e-3 of an interval that has no more
-    than the padding of 1e-3: few borders lie in such."""
+    """In float32 a sum of 64 masses of up to 1 is known to 4e-6, which is 4e-3 of an interval that has no
+    more than the padding of 1e-3: few borders lie in such."""
     off = np.abs(ours - expected.cpu().numpy())
     assert off.max() < 1e-3 and np.quantile(off, 0.99) < 3e-5
 
