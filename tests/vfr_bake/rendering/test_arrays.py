@@ -17,7 +17,9 @@ import numpy as np
 import torch
 from numba import config
 from vfr_bake.config import FieldOptions
-from vfr_bake.kernels import adam, hash_grid
+from player.compiled.lanes import LANES
+from vfr_bake.kernels import adam, hash_grid, proposals
+from vfr_bake.kernels.contraction import contracted_unit
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.space import settle
 from vfr_bake.kernels.visibility import mark_visible_cells
@@ -28,8 +30,39 @@ from vfr_bake.kernels.density import LIMITS
 from vfr_bake.rendering.sampling import march
 from vfr_bake.training.optimiser import FusedGridAdam, GridAdam
 
-if config.DISABLE_JIT:  # it asks for memory ahead, and has no Python
+
+def along(origin, direction, edges, first):
+    t = [proposals.distance(s) for s in edges[first : first + LANES + 1]]
+    for near, far in zip(t[:LANES], t[1:], strict=True):
+        middle = (near + far) / np.float32(2)
+        yield middle, far - near, contracted_unit(*(origin + middle * direction), np.float32(1))
+
+
+def propose_lanes(origin, direction, edges, first, grid, limits, tau, points, depths, weights):
+    for lane, (_, length, place) in enumerate(along(origin, direction, edges, first)):
+        logit = 0
+        for level in range(len(grid.scales)):
+            where = grid.scales[level], grid.offsets[level], grid.mask, grid.hashed[level]
+            rows, shares = hash_grid.corners(*place, *where)
+            logit += sum(share * grid.table[row, 0] for row, share in zip(rows, shares, strict=True))
+        depth = np.exp(min(logit, limits.largest_logit)) * length
+        seen = tau <= limits.opaque_depth
+        points[:, first + lane] = place
+        depths[first + lane] = seen * depth
+        weights[first + lane] = seen * np.exp(-tau) * -np.expm1(-depth)
+        tau += depth
+    return tau
+
+
+def look_up_lanes(origin, direction, edges, first, grid, places, features):
+    for lane, (middle, length, place) in enumerate(along(origin, direction, edges, first)):
+        places[:, lane] = middle, length, *place
+        hash_grid.encode_point(*place, grid, features[lane])
+
+
+if config.DISABLE_JIT:  # these have no Python: instructions that ask for memory ahead, and registers
     adam.prefetch = hash_grid.prefetch = lambda table, row: None
+    proposals.propose_lanes, proposals.look_up_lanes = propose_lanes, look_up_lanes
 torch.manual_seed(0)
 torch.set_num_threads(1)
 found = {}
