@@ -24,7 +24,7 @@ from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composited_f
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
 N_FINAL = 32
-"""Intervals in which the field itself is looked up; in the first half of a training half of them."""
+"""Intervals in which the field itself is looked up; in training, half of them once there is more than fog."""
 FAR = 1e3
 """Rays end at this distance, model units; the farthest camera is at 1."""
 LAYOUTS = ((5, 128), (5, 256))

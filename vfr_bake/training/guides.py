@@ -28,7 +28,8 @@ from vfr_bake.training.optimiser import MILESTONES, GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
-"""First steps, in which empty space has to be found and the occupancy grid is updated often."""
+"""First steps, in which empty space has to be found: the occupancy grid is updated often, and rays through
+proposals have all their samples."""
 STEPS_PER_UPDATE = (16, 64)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
@@ -232,9 +233,8 @@ class SpaceGuide(Guide):
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step % min(STEPS_PER_PROPOSAL_UPDATE, 1 + step // STEADY_STEPS) == 0
-        # While the learning rate is high, few samples on many rays teach more; later their noise is what is
-        # left of the error.
-        self._n_final = N_FINAL if progress >= MILESTONES[0] else N_FINAL // 2
+        # Once there is more than fog, half of the samples teach as much, as they lie where matter is.
+        self._n_final = N_FINAL if step < FOG_STEPS else N_FINAL // 2
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
