@@ -58,13 +58,10 @@ class Writer {
     const rows = 4 * fours(nIn), stride = rows + (scale ? 2 : 1);
     this.code.push(`for (int o = 0; o < ${fours(nOut)}; o++) {`, `int k = ${base} + o * ${stride};`, `vec4 b = weight(k + ${rows});`);
     this.lines((p) => `vec4 s${p} = ${add ? `${y}${p}[o]` : "b"};`);
-    for (let i = 0; i < fours(nIn); i++) {
-      const w = [0, 1, 2, 3].map((c) => `w${c} = weight(k + ${4 * i + c})`);
-      this.code.push("{", `vec4 ${w.join(", ")};`);
-      this.lines((p) => `{ vec4 x = ${x}${p}[${i}]; s${p} += w0 * x.x + w1 * x.y + w2 * x.z + w3 * x.w; }`);
-      this.code.push("}");
-    }
-    if (scale) this.code.push(`b = weight(k + ${rows + 1});`);
+    this.code.push(`for (int i = 0; i < ${fours(nIn)}; i++) {`, "vec4 w0 = weight(k), w1 = weight(k + 1), w2 = weight(k + 2), w3 = weight(k + 3);");
+    this.lines((p) => `{ vec4 x = ${x}${p}[i]; s${p} += w0 * x.x + w1 * x.y + w2 * x.z + w3 * x.w; }`);
+    this.code.push("k += 4;", "}");
+    if (scale) this.code.push("b = weight(k + 1);");
     this.lines((p) => `${y}${p}[o] = ${after(scale ? `s${p} * b` : `s${p}`)};`);
     this.code.push("}");
   }
