@@ -262,9 +262,11 @@ def corner_number(bricks: Lanes, cells: Sequence[Lanes]) -> Lanes:
     return bricks.wide() * 729 + (x * 81 + y * 9 + z).wide()
 
 
-def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any, out: Any) -> Any:
-    """March a packet: s into `samples`, weights `pitch` numbers behind; SUMS of each ray into `out`. Returns
-    how many rows were written."""
+def _collect(
+    b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any, out: Any, ways: bool
+) -> Any:
+    """March a packet: s into `samples`, weights `pitch` numbers behind and, with `ways`, behind these what
+    each sample stands for; SUMS of each ray into `out`. Returns how many rows were written."""
     resolution, n_per_axis = (splat(b, b.trunc(n, INT)) for n in (grid.resolution, grid.n_per_axis))
     low, slope = splat(b, grid.density_low), splat(b, grid.density_slope)
     last, zero, first = (resolution - 1).to_float(), low.like(0.0), path.first()
@@ -320,7 +322,8 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
             with b.if_then(live.any()):
                 f = [x - c.to_float() for x, c in zip(g, cell, strict=True)]
                 code = _trilinear(grid.density, corner_number(slot, cell), f, live)
-                optical = (low + slope * code).exp() * path.way()
+                way = path.way()
+                optical = (low + slope * code).exp() * way
                 optical = choose(live, optical, zero)
                 before = trans.get()
                 depth = tau.get() + optical
@@ -343,6 +346,8 @@ def _collect(b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any
                 place = b.mul(row, LONG(LANES))
                 store(samples, place, s)
                 store(samples, b.add(place, pitch), weight)
+                if ways:
+                    store(samples, b.add(place, b.add(pitch, pitch)), way)
                 b.store(b.add(row, LONG(1)), n_rows)
     depth = path.distance(moment.get() / total.get())
     for row, values in (
@@ -413,26 +418,35 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
     return c0 + (c1 - c0) * f[0]
 
 
-def _march_packet(_: Any, lookup: Any, steps: Any, packets: Any, number: Any, samples: Any, out: Any) -> Any:
+def _marching(ways: bool) -> Any:
+    """The intrinsic of `march_packet`, or of `march_packet_ways`."""
 
-    def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
-        kinds = signature.args
-        grid = unpacked(context, b, kinds[0], arguments[0])
-        path = _path(context, b, kinds[1:3], *arguments[1:4])
-        places, found = (address(context, b, kinds[n], arguments[n]) for n in (4, 5))
-        pitch = b.udiv(context.make_array(samples)(context, b, arguments[4]).nitems, LONG(2))
-        return _collect(b, grid, path, places, pitch, found)
+    def typed(_: Any, lookup: Any, steps: Any, packets: Any, number: Any, samples: Any, out: Any) -> Any:
 
-    return types.int64(lookup, steps, packets, types.intp, samples, out), generate
+        def generate(context: Any, b: Any, signature: Any, arguments: Any) -> Any:
+            kinds = signature.args
+            grid = unpacked(context, b, kinds[0], arguments[0])
+            path = _path(context, b, kinds[1:3], *arguments[1:4])
+            places, found = (address(context, b, kinds[n], arguments[n]) for n in (4, 5))
+            n_rows = 3 if ways else 2
+            pitch = b.udiv(context.make_array(samples)(context, b, arguments[4]).nitems, LONG(n_rows))
+            return _collect(b, grid, path, places, pitch, found, ways)
+
+        return types.int64(lookup, steps, packets, types.intp, samples, out), generate
+
+    return intrinsic(typed)
 
 
-march_packet: Any = intrinsic(_march_packet)
+march_packet: Any = _marching(ways=False)
 """march_packet(lookup: Lookup, steps: BoxSteps or SpaceSteps, packets [n_packets, BOX_ROWS or SPACE_ROWS,
 LANES] float32, number, samples [2, n, LANES] float32, out [SUMS, LANES] float32): march the packet `number`;
 rows written.
 
 Into `samples` go s and weights; it has room for the most samples that a ray can have.
 """
+march_packet_ways: Any = _marching(ways=True)
+"""`march_packet` with `samples` [3, n, LANES]: behind the weights go the model units that each sample stands
+for."""
 
 
 def _place_fetches(

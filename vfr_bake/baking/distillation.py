@@ -18,9 +18,10 @@ import numpy as np
 
 from player.asset.grid import SparseGrid, VertexRows
 from player.cameras.camera import Camera
+from player.compiled.samples import sample_rays
 from player.errors import TrainingError
 from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
-from player.march.march import MIN_OPACITY, MarchResult, sample_rays
+from player.march.march import MIN_OPACITY, MarchResult
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.kernels.stored_features import compose, corner_rows

@@ -22,8 +22,8 @@ import numpy as np
 
 from player.asset.grid import SPARE, SparseGrid, brick_number, build_grid, vertex_rows
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.compiled.samples import sample_rays
 from player.march.fetches import MIN_TOTAL
-from player.march.march import sample_rays
 from vfr_bake.baking.distillation import TeacherRays, corners
 from vfr_bake.kernels.sample_weights import add_corner_weights
 from vfr_bake.kernels.stored_features import compose

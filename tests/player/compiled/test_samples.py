@@ -1,0 +1,66 @@
+"""Samples one by one, compiled, against the march in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from player.asset.grid import SparseGrid
+from player.compiled import samples as compiled
+from player.march import march
+from tests.player.march.contracted_scene import contracted_grid
+from tests.player.march.pyramid_scene import random_scene, sparse_scene
+from tests.player.march.test_contracted_march import bumps, shells
+from tests.player.march.test_levels import rays
+
+GRIDS = {
+    "box": lambda: random_scene(60, 50, (1, 2, 4), seed=9).grid,
+    "space": lambda: random_scene(60, 50, (1, 2, 4), seed=9, contracted=True).grid,
+    "long steps": lambda: sparse_scene((1, 1, 1, 1, 2, 4, 4, 16), 8, contracted=True).grid,
+    "haze": lambda: contracted_grid(bumps, lambda x: x[:, 0] < 4),
+    "shells": lambda: contracted_grid(bumps, shells),
+}
+
+
+def compare(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> int:
+    """Both on the same rays; returns the number of samples."""
+    a, b = (module.sample_rays(grid, rays_o, rays_d) for module in (march, compiled))
+    same = a.n_density_samples == b.n_density_samples
+    assert (~same).sum() <= 5, "cells are the same but where cosines are rounded differently"
+    assert [a.samples.ray.dtype, a.n_density_samples.dtype] == [
+        b.samples.ray.dtype,
+        b.n_density_samples.dtype,
+    ]
+    kept_a, kept_b = (same[x.samples.ray] for x in (a, b))
+    np.testing.assert_array_equal(a.samples.ray[kept_a], b.samples.ray[kept_b])
+    np.testing.assert_array_equal(a.samples.s[kept_a], b.samples.s[kept_b])
+    np.testing.assert_allclose(a.samples.weights[kept_a], b.samples.weights[kept_b], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(a.ways[kept_a], b.ways[kept_b], rtol=1e-4)
+    np.testing.assert_allclose(a.tau[same], b.tau[same], rtol=1e-4, atol=1e-6)
+    at = b.path.at(b.samples.ray, b.samples.s)
+    assert at.shape == (3, len(b.samples.s))
+    return len(b.samples.s)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_samples_are_those_of_the_march(name: str) -> None:
+    assert compare(GRIDS[name](), *rays(3000, seed=1)) > 1000
+
+
+@pytest.mark.parametrize("n", [0, 1, 17])
+def test_any_number_of_rays(n: int) -> None:
+    rays_o, rays_d = rays(40, seed=1)
+    compare(GRIDS["box"](), rays_o[:n], rays_d[:n])
+
+
+def test_rays_that_meet_nothing() -> None:
+    rays_o, rays_d = (np.float32([[5, 5, 5]] * 20), np.float32([[1, 0, 0]] * 20))
+    assert compare(GRIDS["box"](), rays_o, rays_d) == 0
+
+
+def test_more_samples_than_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, some = GRIDS["haze"](), rays(1000, seed=2)
+    whole = compiled.sample_rays(grid, *some)
+    monkeypatch.setattr(compiled, "MOST_AT_ONCE", 1)
+    for a, b in zip(compiled.sample_rays(grid, *some).samples, whole.samples, strict=True):
+        np.testing.assert_array_equal(a, b)
