@@ -36,7 +36,7 @@ demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures
 	$(BIN)/python -m vfr_bake.demo --output demo --force
 
 test: $(VENV)/.dev system-libraries other-programs check  ## style, types and tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.dev  ## style and types alone
 	$(BIN)/ruff check .

@@ -23,6 +23,17 @@ LACKING = {
 }
 """What this platform does not have: the programs that `make` installs from Debian's or Ubuntu's packages,
 Open3D where pyproject.toml does not ask for it, and Ctrl-C that is sent to a process."""
+LONGEST = (
+    "tests/vfr_bake/baking/test_bake.py",
+    "tests/test_real_data.py",
+    "tests/test_real_scene.py",
+    "tests/vfr_bake/test_cli.py",
+    "tests/vfr_bake/training/test_trainer.py",
+    "tests/player/compiled/test_processor.py",
+    "tests/player/viewer/test_viewer.py",
+    "tests/vfr_bake/bench/test_bench.py",
+)
+"""Files that take longest, begun first: no worker is then left alone with one of them at the end."""
 N_TESTS = {"programs": 13, "open3d": 35, "signals": 1}
 """Tests marked `needs(...)`: so many are skipped where that is lacking, and no other test anywhere."""
 
@@ -35,6 +46,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    paths = [item.path.relative_to(config.rootpath).as_posix() for item in items]
+    place = {path: LONGEST.index(path) if path in LONGEST else len(LONGEST) for path in paths}
+    order = sorted(range(len(items)), key=lambda i: place[paths[i]])
+    items[:] = [items[i] for i in order]
     counts: Counter[str] = Counter()
     for item in items:
         for what in {mark.args[0] for mark in item.iter_markers("needs")}:
