@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 
 from player.compiled.lanes import BYTE, FLOAT, INT, Lanes, address, choose, load, splat, store, vector
 
-LINEAR, GELU, SIGMOID = range(3)
+LINEAR, GELU = range(2)
 
 # erf(z) = z P(z^2) / Q(z^2) for |z| <= 4, highest power first; Q > 0
 _ERF_P = (

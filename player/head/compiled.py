@@ -13,7 +13,6 @@ import numpy as np
 from player.compiling import compiled
 from player.head.activations import (
     GELU,
-    SIGMOID,
     gelu_lanes,
     quantize_lanes,
     round_lanes,
@@ -54,12 +53,12 @@ class CompiledHead:
         p = self._program
         n_channels = p.features.width
         assert features.shape == (len(dirs), n_channels) and dirs.shape[1:] == (3,)
-        rgb = np.empty((len(features), 3), np.float32)
+        rgb = np.empty(-(-3 * len(features) // LANES) * LANES, np.float32)
         memory, codes = scratch(p.n_floats, np.float32, 0), scratch(p.n_bytes, np.uint8, 0)
         inputs = (np.ascontiguousarray(a, np.float32) for a in (features, dirs))
         _run(p.steps, p.weights, (p.packed, p.starts), p.pairs, memory, codes, *inputs, rgb, self._places)
         check_scratch(memory, codes)
-        return rgb
+        return rgb[: 3 * len(features)].reshape(-1, 3)
 
 
 @compiled
@@ -85,7 +84,10 @@ def _run(steps, weights, integers, pairs, memory, codes, features, dirs, rgb, pl
                 _monomials(memory, pairs, step, n)
         for row in range(n):
             for c in range(3):
-                rgb[begin + row, c] = memory[at[2] + row * pitch[2] + c]
+                rgb[3 * (begin + row) + c] = memory[at[2] + row * pitch[2] + c]
+    rgb[3 * len(features) :] = np.float32(0.0)
+    for i in range(0, len(rgb), LANES):
+        sigmoid_lanes(rgb, i)
 
 
 @compiled
@@ -129,9 +131,6 @@ def _activate(memory, at, n, kind):
     if kind == GELU:
         for i in range(at, at + n, LANES):
             gelu_lanes(memory, i)
-    elif kind == SIGMOID:
-        for i in range(at, at + n, LANES):
-            sigmoid_lanes(memory, i)
 
 
 @compiled

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from player.head.activations import GELU, LINEAR, SIGMOID
+from player.head.activations import GELU, LINEAR
 from player.head.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED, WIDTH
 from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
@@ -87,6 +87,7 @@ class Program:
     features: Value
     dirs: Value
     rgb: Value
+    """Whose sigmoid is the colour."""
 
 
 def program_of(head: HeadArrays, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
@@ -119,7 +120,7 @@ class _Compiler:
         z = self._dense(encoded, Layer(head.from_sh, np.zeros(0)), GELU, start=z)
         for layer, rounding in zip(head.directional, roundings, strict=True):
             z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, GELU)
-        rgb = self._dense(z, head.output, SIGMOID)
+        rgb = self._dense(z, head.output)
         pairs = [pair for order in range(1, head.form.sh_degree) for pair in _pairs(order)]
         return Program(
             np.array(self._steps, STEP), self._weights.joined(), self._packed.joined(),
