@@ -199,13 +199,14 @@ class Renderer:
     ) -> _Picture:
         """A picture that shows what is behind."""
         n_pixels = camera.width * camera.height
-        rgb = np.empty((n_pixels, 3), np.float32)
-        rgb[:] = (0.0, 0.0, 0.0) if background == "transparent" else background
+        behind = None if background == "transparent" else background
+        rgb = np.empty((camera.height, 3 * camera.width), np.float32)
+        rgb[:] = np.tile(np.asarray(behind or (0, 0, 0), np.float32), camera.width)
         zeros = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.float32)
         return _Picture(
             view=View.of(self._grid, camera.transformed(self._model_from_world), self._block_bounds),
-            planes=Planes(rgb, *zeros, np.zeros(n_pixels, np.int32)),
-            behind=None if background == "transparent" else background,
+            planes=Planes(rgb.reshape(-1, 3), *zeros, np.zeros(n_pixels, np.int32)),
+            behind=behind,
             n_fetches=n_fetches,
             opaque_depth=opaque_depth,
             features=np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None,

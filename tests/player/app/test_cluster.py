@@ -100,6 +100,33 @@ def test_every_frame_arrives_once_though_a_worker_dies(
 
 
 @pytest.mark.extra
+@pytest.mark.parametrize("quality", ["high", "fast"])
+def test_a_cluster_makes_the_frames_of_a_quality_as_one_machine_does(
+    quality: str, cluster: Cluster, shells_folder: Path, tmp_path: Path
+) -> None:
+    """Whether made in one go, alone, after others or by a worker."""
+    cluster.add_worker()
+    film = [
+        str(shells_folder), "--orbit", "4", "--size", "61x47", "--threads", "1", "--quality", quality,
+        "--format", "webp",
+    ]  # fmt: skip
+    assert cli.main([*film, "--output", str(tmp_path / "film")]) == 0
+    assert cli.main([*film, "--output", str(tmp_path / "one"), "--frames", "2:3"]) == 0
+    process = play(*film, "--output", str(tmp_path / "there"), "--dask", cluster.address)
+    _, errors = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0, errors
+    frames = sorted((tmp_path / "film").iterdir())
+    assert [path.name for path in sorted((tmp_path / "there").iterdir())] == [path.name for path in frames]
+    for path in frames:
+        assert (tmp_path / "there" / path.name).read_bytes() == path.read_bytes()
+    assert (tmp_path / "one" / frames[2].name).read_bytes() == frames[2].read_bytes()
+    frames[1].unlink()
+    assert cli.main([*film, "--output", str(tmp_path / "film"), "--resume"]) == 0
+    for path in frames:
+        assert (tmp_path / "there" / path.name).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.extra
 def test_what_is_said_when_it_cannot_be(
     cluster: Cluster,
     shells_folder: Path,
