@@ -47,8 +47,9 @@ TASK_BLOCKS = {"numba": 256, "numpy": 128}
 numpy arrays of more blocks do not stay in cache."""
 MOST_THREADS = 16
 """Threads a core, at most: more finish nothing sooner, and each has scratch arrays of its own."""
-TASKS_A_THREAD = 8
-"""Tasks at least, where there are blocks enough: shared out evenly."""
+TASKS_A_THREAD = {"numba": 8, "numpy": 1}
+"""Tasks at least, where there are blocks enough: shared out evenly. A call of numpy takes as long for ten
+rays as for a hundred, and threads wait for one another between calls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +228,7 @@ class Renderer:
         """Blocks shared out to tasks, where `n_pixels` of each are found at a time."""
         size = min(
             TASK_BLOCKS[self.march] * len(EVERY) // n_pixels,
-            max(len(blocks) // (TASKS_A_THREAD * self.n_threads), 16),
+            max(len(blocks) // (TASKS_A_THREAD[self.march] * self.n_threads), 16),
         )
         return [blocks[i : i + size] for i in range(0, len(blocks), size)]
 

@@ -2,7 +2,8 @@
 
     python tests/benchmarks/bench_play.py out/ --cameras transforms_test.json --size 800x800
     python tests/benchmarks/bench_play.py fidelity/ balanced/ fast/ --curves
-    python tests/benchmarks/bench_play.py out/ --against CHECKOUT ITS_ASSET --frames 60
+    python tests/benchmarks/bench_play.py lego/ fox/ --against CHECKOUT --march numba numpy --frames 60
+    python tests/benchmarks/bench_play.py out/ --against CHECKOUT ITS_ASSET
 
 Parts are processor time of all threads, divided by their number: what they take of a frame when all are busy.
 What is left of the wall's clock is waiting, for another program or for the last task. Lookups cannot be
@@ -10,9 +11,9 @@ timed apart: they are k / (k - 1) of what k fetches a ray take longer than one. 
 two marches must give the same picture within one level of eight bits; a head in 8 bits takes a last bit for
 another level now and then, which moves one pixel in ten thousand by two levels or more.
 
-With `--against`, every quality beside another version of the player that plays an asset of its own baking
-(`tests/benchmarks/against.py`). With `--curves`, tables of time against pixels, threads and assets, numba
-alone.
+With `--against`, every quality beside another version of the player, which plays the same asset or one of its
+own baking (`tests/benchmarks/against.py`). With `--curves`, tables of time against pixels, threads and
+assets, numba alone.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: the threads are ours, as in the player
 
 import argparse
+import itertools
 import statistics
 import sys
 import tempfile
@@ -151,6 +153,13 @@ def line(parts: Parts) -> str:
     )
 
 
+def picture_size(asset: Asset, arguments: argparse.Namespace) -> tuple[int, int]:
+    """What was asked for; else 800x800 of an object, and the size of the training pictures of a capture."""
+    if arguments.size is None:
+        return asset.manifest.view_size if asset.manifest.contracted else (800, 800)
+    return arguments.size
+
+
 def views(asset: Asset, path: Path | None, size: tuple[int, int], n_frames: int) -> list[Camera]:
     own = asset.manifest.view_size[0], asset.manifest.view_size[1]
     if path is None:
@@ -185,13 +194,13 @@ def curves(assets: list[Asset], arguments: argparse.Namespace, n_threads: int) -
         print(f"| {edge}x{edge} | {parts.wall:.0f} | {1e6 * parts.wall / edge**2:.0f} |")
     print("\n| threads | ms a frame | times threads |\n|---|---|---|")
     for n in range(1, n_threads + 1):
-        cameras = views(first, arguments.cameras, arguments.size, arguments.frames)
+        cameras = views(first, arguments.cameras, picture_size(first, arguments), arguments.frames)
         parts, _ = measure(first, cameras, "numba", n, arguments.samples)
         print(f"| {n} | {parts.wall:.0f} | {parts.wall * n:.0f} |")
     print("\n| asset, MB | vertices | ms a frame | march | lookups | head | rest |")
     print("|---|---|---|---|---|---|---|")
     for asset in assets:
-        cameras = views(asset, arguments.cameras, arguments.size, arguments.frames)
+        cameras = views(asset, arguments.cameras, picture_size(asset, arguments), arguments.frames)
         parts, _ = measure(asset, cameras, "numba", n_threads, arguments.samples)
         size = sum(entry.bytes for entry in asset.manifest.files.values()) / 1e6
         n_vertices = asset.arrays.densities.first_rows[-1]
@@ -202,18 +211,21 @@ def curves(assets: list[Asset], arguments: argparse.Namespace, n_threads: int) -
 
 
 def against_another(arguments: argparse.Namespace) -> int:
-    """Every asset of this version against the one of the other."""
-    for folder in arguments.assets:
+    """Every asset of this version against the one of the other, or the same one, with each march."""
+    checkout, *own = arguments.against
+    for folder, march in itertools.product(arguments.assets, arguments.march):
+        size = picture_size(Asset.open(folder), arguments)
         with tempfile.TemporaryDirectory(prefix="vfr-bench-play-") as scratch:
             rows = against.compare(
-                folder, tuple(arguments.against), arguments.size, arguments.frames, arguments.threads,
-                arguments.march, Path(scratch),
+                folder, (checkout, own[0] if own else folder), size, arguments.frames, arguments.threads,
+                march, Path(scratch),
             )  # fmt: skip
         load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
         print(
-            f"\n{folder}, {arguments.march}, {arguments.threads} threads, {arguments.frames} frames{load}\n"
+            f"\n{folder}, {size[0]}x{size[1]}, {march}, {arguments.threads} threads, "
+            f"{arguments.frames} frames{load}\n"
         )
-        print("\n".join(against.lines(rows)))
+        print("\n".join(against.lines(rows)), flush=True)
     return 0
 
 
@@ -221,17 +233,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("assets", type=Path, nargs="+")
     parser.add_argument("--cameras", type=Path, help="transforms.json; else an orbit")
-    parser.add_argument("--size", type=size, default=(800, 800))
+    parser.add_argument("--size", type=size, help="else 800x800, or that of a capture's training pictures")
     parser.add_argument("--frames", type=positive, default=8)
     parser.add_argument("--threads", type=positive, default=default_threads())
     parser.add_argument("--samples", type=int)
     parser.add_argument("--curves", action="store_true", help="time against pixels, threads and assets")
     parser.add_argument(
-        "--against", type=Path, nargs=2, metavar=("CHECKOUT", "ASSET"), help="another version"
+        "--against", type=Path, nargs="+", metavar="PATH",
+        help="a checkout of another version, and its asset if that is not the same one",
+    )  # fmt: skip
+    parser.add_argument(
+        "--march", choices=("numba", "numpy"), nargs="+", default=["numba"], help="with --against"
     )
-    parser.add_argument("--march", choices=("numba", "numpy"), default="numba", help="with --against")
     arguments = parser.parse_args()
     if arguments.against:
+        if len(arguments.against) > 2:
+            parser.error("--against: expected a checkout and at most one asset")
         return against_another(arguments)
     start = time.perf_counter()
     assets = [Asset.open(path) for path in arguments.assets]
@@ -242,7 +259,7 @@ def main() -> int:
         return 0
     worst = 0
     for asset in assets:
-        cameras = views(asset, arguments.cameras, arguments.size, arguments.frames)
+        cameras = views(asset, arguments.cameras, picture_size(asset, arguments), arguments.frames)
         print(f"{asset.folder}: {asset.arrays.densities.first_rows[-1]:,} vertices")
         worst = max(worst, compare(asset, cameras, arguments.threads, arguments.samples))
     print(f"worst difference {worst} of 255; peak memory {peak_rss_mb()} MB")
