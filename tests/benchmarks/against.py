@@ -39,6 +39,12 @@ except ImportError:  # a version whose modules all lie in one folder
     from player.cameras import Camera
 from player.render import Renderer
 folder, threads, march, quality, picture = sys.argv[1:]
+def peak_mb():
+    try:  # a process inherits ru_maxrss from the one that started it
+        with open("/proc/self/status") as status:
+            return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 renderer = Renderer(Asset.open(Path(folder)), int(threads), march)
 settings = {} if quality == "exact" else {"quality": quality}
 for line in sys.stdin:
@@ -48,8 +54,7 @@ for line in sys.stdin:
     frame = renderer.render(camera, **settings)
     wall, used = time.perf_counter() - wall, time.process_time() - used
     np.save(picture, frame.to_uint8())
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps([wall, used, peak]), flush=True)
+    print(json.dumps([wall, used, peak_mb()]), flush=True)
 """
 
 

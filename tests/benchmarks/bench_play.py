@@ -156,8 +156,10 @@ def line(parts: Parts) -> str:
 def picture_size(asset: Asset, arguments: argparse.Namespace) -> tuple[int, int]:
     """What was asked for; else 800x800 of an object, and the size of the training pictures of a capture."""
     if arguments.size is None:
-        return asset.manifest.view_size if asset.manifest.contracted else (800, 800)
-    return arguments.size
+        width, height = asset.manifest.view_size if asset.manifest.contracted else (800, 800)
+        return width, height
+    width, height = arguments.size
+    return width, height
 
 
 def views(asset: Asset, path: Path | None, size: tuple[int, int], n_frames: int) -> list[Camera]:
