@@ -14,24 +14,56 @@ from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS
 
 
+@njit(inline="always")
+def _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
+    kind = sigmas.dtype.type
+    tau = kind(0)
+    for c in range(out.shape[1]):
+        out[ray, c] = 0
+    for i in range(starts[ray], starts[ray] + counts[ray]):
+        depth = sigmas[i] * deltas[i]
+        weight = -np.exp(-tau) * np.expm1(-depth)
+        weights[i] = weight
+        tau += depth
+        taus[i] = tau
+        for c in range(out.shape[1]):
+            out[ray, c] += weight * features[i, c]
+    opacity[ray] = -np.expm1(-tau)
+
+
+@njit(inline="always")
+def _composite_ray_backward(
+    ray, features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights, grad_sigmas,
+    grad_features,
+):  # fmt: skip
+    kind = features.dtype.type
+    first, last = starts[ray], starts[ray] + counts[ray]
+    if first == last:
+        return
+    end = np.exp(-taus[last - 1]) * grad_opacity[ray]
+    behind = kind(0)
+    for i in range(last - 1, first - 1, -1):
+        inner = grad_weights[i]
+        for c in range(features.shape[1]):
+            inner += grad_out[ray, c] * features[i, c]
+            grad_features[i, c] = weights[i] * grad_out[ray, c]
+        grad_sigmas[i] = deltas[i] * (np.exp(-taus[i]) * inner - behind + end)
+        behind += weights[i] * inner
+
+
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def composite(sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
     """Write w_i to `weights`, the optical depth behind sample i to `taus` (both [n_samples]), F to `out`
     [n_rays, n_channels] and A to `opacity` [n_rays]."""
-    kind = sigmas.dtype.type
     for ray in prange(starts.shape[0]):
-        tau = kind(0)
-        for c in range(out.shape[1]):
-            out[ray, c] = 0
-        for i in range(starts[ray], starts[ray] + counts[ray]):
-            depth = sigmas[i] * deltas[i]
-            weight = -np.exp(-tau) * np.expm1(-depth)
-            weights[i] = weight
-            tau += depth
-            taus[i] = tau
-            for c in range(out.shape[1]):
-                out[ray, c] += weight * features[i, c]
-        opacity[ray] = -np.expm1(-tau)
+        _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity)
+
+
+@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def composite_part(sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
+    """`composite` on the thread that calls it, while others do theirs."""
+    for ray in range(starts.shape[0]):
+        _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity)
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
@@ -43,23 +75,27 @@ def composite_backward(
 
     dL/dF_i = w_i g,    dL/d d_i = T_{i+1} v_i - sum_{j>i} w_j v_j + a exp(-tau).
     """
-    kind = features.dtype.type
     for ray in prange(starts.shape[0]):
-        first, last = starts[ray], starts[ray] + counts[ray]
-        if first == last:
-            continue
-        end = np.exp(-taus[last - 1]) * grad_opacity[ray]
-        behind = kind(0)
-        for i in range(last - 1, first - 1, -1):
-            inner = grad_weights[i]
-            for c in range(features.shape[1]):
-                inner += grad_out[ray, c] * features[i, c]
-                grad_features[i, c] = weights[i] * grad_out[ray, c]
-            grad_sigmas[i] = deltas[i] * (np.exp(-taus[i]) * inner - behind + end)
-            behind += weights[i] * inner
+        _composite_ray_backward(
+            ray, features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights,
+            grad_sigmas, grad_features,
+        )  # fmt: skip
 
 
-@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def composite_part_backward(
+    features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights, grad_sigmas,
+    grad_features,
+):  # fmt: skip
+    """`composite_backward` on the thread that calls it, while others do theirs."""
+    for ray in range(starts.shape[0]):
+        _composite_ray_backward(
+            ray, features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights,
+            grad_sigmas, grad_features,
+        )  # fmt: skip
+
+
+@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def silence(gradients, faint):
     """Set those rows of `gradients` [n_samples, n_channels] to 0 whose length is less than `faint` times the
     root of the mean square length; NaN stays."""

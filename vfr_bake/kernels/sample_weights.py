@@ -10,7 +10,7 @@ BLOCKS = 4
 """Blocks of two cells along each edge of a brick."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def add_sample_weights(lookup, steps, packets, samples, sums, places, weights, totals):
     """Add the weights of all samples of the rays in `packets` to `totals` [n_slots * BLOCKS**3] float64, at
     the slot and the block of 2 x 2 x 2 cells of the finest level that each is in.
@@ -37,7 +37,7 @@ def add_sample_weights(lookup, steps, packets, samples, sums, places, weights, t
                     totals[slot * 64 + block] += weights[lane]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def add_corner_weights(rows, shares, weights, totals):
     """Add the `weights` [n] of samples to `totals` [n_vertices] at the eight corners around each, `rows` [n,
     8], by their `shares` [n, 8]."""

@@ -20,7 +20,7 @@ TRIED = 2
 """Symbols that are tried beside 0: the nearest, and the next towards 0."""
 
 
-@njit(nogil=True, cache=True)
+@njit(cache=True)
 def add_squares(starts, rows, shares, slopes, changed, out):
     """Add to `out` [n_vertices] the squares by which a vertex changes each ray.
 
@@ -40,7 +40,7 @@ def add_squares(starts, rows, shares, slopes, changed, out):
                     changed[row] = 0
 
 
-@njit(nogil=True, cache=True)
+@njit(cache=True)
 def add_to_coarser(masks, bricks, rows, values, out):
     """Add to `out` [n_coarse] the values [n] of the finer level's vertices, each dealt to the vertices that
     predict it by their shares in the prediction.
@@ -67,7 +67,7 @@ def add_to_coarser(masks, bricks, rows, values, out):
                 row += 1
 
 
-@njit(nogil=True, cache=True)
+@njit(cache=True)
 def from_coarser(masks, bricks, rows, values, out):
     """Into `out` [n] what the values [n_coarse] of the next coarser level say at the vertices of a level, as
     floats; the rest is as for `add_to_coarser`."""
@@ -91,7 +91,7 @@ def from_coarser(masks, bricks, rows, values, out):
                 row += 1
 
 
-@njit(nogil=True, cache=True)
+@njit(cache=True)
 def choose(
     wanted, predicted, weights, neighbours, classes, bits, context_of_sum, mixed, limits, near, values, seen
 ):

@@ -160,7 +160,7 @@ class _CompositeField(torch.autograd.Function):
         weights, taus = torch.zeros_like(sigmas), torch.empty_like(sigmas)
         out = features.new_empty(len(starts), features.shape[1])
         opacity = features.new_empty(len(starts))
-        kernels.composite(
+        kernels.composite_part(
             _array(sigmas), _array(features), deltas.numpy(), starts.numpy(), counts.numpy(),
             weights.numpy(), taus.numpy(), out.numpy(), opacity.numpy(),
         )  # fmt: skip
@@ -171,7 +171,7 @@ class _CompositeField(torch.autograd.Function):
     def backward(ctx, *grads):
         features, sigmas, deltas, starts, counts, weights, taus, *parameters = ctx.saved_tensors
         grad_logits, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
-        kernels.composite_backward(
+        kernels.composite_part_backward(
             _array(features), deltas.numpy(), starts.numpy(), counts.numpy(), weights.numpy(), taus.numpy(),
             *(_array(grad) for grad in grads), grad_logits.numpy(), grad_features.numpy(),
         )  # fmt: skip

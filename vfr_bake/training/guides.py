@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from numba import get_num_threads
 from torch import Tensor
 
 from vfr_bake.config import DeviceSettings, TrainConfig
@@ -42,6 +43,10 @@ one for so many steps, then in every second for as many, and so on."""
 
 class Guide(ABC):
     """The sampler in training."""
+
+    samples_ahead = False
+    """Whether a step's samples are taken while the step before it is learned from, in the field before that:
+    of no use on a GPU, and where what is kept of a step's samples is kept until its end."""
 
     @property
     @abstractmethod
@@ -122,6 +127,7 @@ class BoxGuide(Guide):
 class OccupancyGuide(BoxGuide):
     """Marches an object's box on a CPU and keeps its occupancy grid."""
 
+    samples_ahead = True
     _grid: OccupancyGrid
 
     def __init__(
@@ -129,6 +135,7 @@ class OccupancyGuide(BoxGuide):
     ) -> None:
         super().__init__(settings, OccupancyGrid(config.occupancy_resolution, step_length, config.seed))
         self._processes = processes
+        self._n_chunks = get_num_threads()
 
     @property
     def sampler(self) -> OccupancyGrid:
@@ -143,9 +150,11 @@ class OccupancyGuide(BoxGuide):
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
-        grid, budget, n_chunks = self._grid, int(self._budget(pilot) * share), torch.get_num_threads()
+        grid, budget = self._grid, int(self._budget(pilot) * share)
         first = jitter[:, 0].contiguous()
-        samples, sigmas = march(field, grid.distance, grid.step, rays_o, rays_d, first, budget, n_chunks)
+        samples, sigmas = march(
+            field, grid.distance, grid.step, rays_o, rays_d, first, budget, self._n_chunks
+        )
         if grid.n_updates > 0:
             grid.observe(samples.points.numpy(), sigmas)
         return samples

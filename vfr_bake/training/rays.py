@@ -38,6 +38,18 @@ class RayBatch:
     """[n_rays, 2] float32 in (0, 1): the pixel's centre as shares of the picture's width and height."""
 
 
+@dataclass(frozen=True)
+class Batch(RayBatch):
+    """The rays of one step, and what chance adds to them."""
+
+    jitter: Tensor
+    """[n_rays, 3] in [0, 1)."""
+    background: Tensor
+    """[n_rays, 3] in [0, 1]."""
+    chances: Tensor
+    """[n_rays] in [0, 1): decides whether a ray with a small error is learned from."""
+
+
 class Pixels(NamedTuple):
     """Pixels of all pictures, which may differ in size: all of them, or one chunk of what lies on a disk
     (`vfr_bake.data.capture.StoredImages`). Arrays, or tensors on one device."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ from vfr_bake.rendering.compositing import RaySamples, composite, composite_fiel
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
+from vfr_bake.training.ahead import Sampled, SecondThread
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.captures.unmasked import unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
@@ -41,7 +43,7 @@ from vfr_bake.training.optimiser import (
     rate_factor,
 )
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.rays import DevicePixelSampler, PixelSampler, RayBatch
+from vfr_bake.training.rays import Batch, DevicePixelSampler, PixelSampler
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 SOLID = 0.9
@@ -66,18 +68,6 @@ class StepReport:
     n_samples: int
     seconds: float
     """Since training began, interruptions left out."""
-
-
-@dataclass(frozen=True)
-class Batch(RayBatch):
-    """This process' rays of one step."""
-
-    jitter: Tensor
-    """[n_rays, 3] in [0, 1)."""
-    background: Tensor
-    """[n_rays, 3] in [0, 1]."""
-    chances: Tensor
-    """[n_rays] in [0, 1): decides whether a ray with a small error is learned from."""
 
 
 class Trainer:
@@ -143,6 +133,9 @@ class Trainer:
             self._use_torch(scene)
         else:
             self._use_numba(scene)
+        self._second = SecondThread()
+        self._next: Sampled | None = None
+        """Of the next step, if they have been taken."""
         self._parameters = [*self._field.network_parameters(), *self.pilot.parameters()]
         self._adam = torch.optim.Adam(
             self._parameters, lr=self.pace.network_rate, eps=EPSILON, betas=BETAS, fused=True
@@ -213,7 +206,6 @@ class Trainer:
             progress = self.processes.agree(self.duration.progress(step, seconds))
             if progress >= 1:
                 return
-            self._guide.prepare(step, progress, self._field)
             loss, n_rays, n_samples = self._step(step, progress)
             bad_in_a_row = bad_in_a_row + 1 if loss != loss else 0
             if bad_in_a_row == MOST_BAD_STEPS:
@@ -245,38 +237,66 @@ class Trainer:
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
-        # Where colours are composited anyway the head needs no pilot.
-        pilot = step < self.config.pilot_steps and self._field.config.compositing == "features"
-        batch = self._draw(self._guide.n_rays(pilot))
-        samples = self._guide.sample(
-            self._field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
-        )
+        pilot = self._is_pilot(step)
+        batch, samples = self._next or self._sampled(step, progress)
         learned = self.effects.learned(batch.pictures, batch.places)
         n_learned = len(samples.rays) if learned is None else int(learned[samples.rays].sum())
         totals = self.processes.total(len(samples.rays), len(samples.t_mid), n_learned)
         n_rays, n_samples, n_learned = (int(total) for total in totals)
         self._guide.observe(n_rays, n_samples)
-        squares, weights, seen = self._error(batch, samples, learned, pilot)
-        regulariser = self._guide.regulariser(samples, weights)
-        value = self.processes.total(float(squares.detach().sum()))[0] / (3 * max(n_learned, 1))
-        if self._skips(pilot):
-            squares = squares * chosen_rays(squares.detach(), batch.chances[samples.rays])
-        loss = squares.sum() / (3 * max(n_learned, 1))
-        if regulariser is not None:
-            loss = loss + regulariser / max(n_rays, 1)
-        # A batch that met nothing (seen by no process) has nothing to teach.
-        self._adam.zero_grad(set_to_none=True)
-        if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
-            return value if n_samples == 0 else float("nan"), n_rays, n_samples
-        factor = rate_factor(step, progress)
-        for group in self._adam.param_groups:
-            group["lr"] = self.pace.network_rate * factor
-        self._adam.step()
-        for table in (self._grid_adam, *self._guide.tables()):
-            table.step(self.pace.grid_rate * factor)
-        if seen is not None:
-            self.effects.observe(seen, n_rays)
-        return value, n_rays, n_samples
+        with self._sampling_next(step, progress, pilot):
+            squares, weights, seen = self._error(batch, samples, learned, pilot)
+            regulariser = self._guide.regulariser(samples, weights)
+            value = self.processes.total(float(squares.detach().sum()))[0] / (3 * max(n_learned, 1))
+            if self._skips(pilot):
+                squares = squares * chosen_rays(squares.detach(), batch.chances[samples.rays])
+            loss = squares.sum() / (3 * max(n_learned, 1))
+            if regulariser is not None:
+                loss = loss + regulariser / max(n_rays, 1)
+            # A batch that met nothing (seen by no process) has nothing to teach.
+            self._adam.zero_grad(set_to_none=True)
+            if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
+                return value if n_samples == 0 else float("nan"), n_rays, n_samples
+            self._second.wait()
+            factor = rate_factor(step, progress)
+            for group in self._adam.param_groups:
+                group["lr"] = self.pace.network_rate * factor
+            self._adam.step()
+            for table in (self._grid_adam, *self._guide.tables()):
+                table.step(self.pace.grid_rate * factor)
+            if seen is not None:
+                self.effects.observe(seen, n_rays)
+            return value, n_rays, n_samples
+
+    def _is_pilot(self, step: int) -> bool:
+        """Whether the pilot gives the colours; where they are composited anyway the head needs none."""
+        return step < self.config.pilot_steps and self._field.config.compositing == "features"
+
+    def _sampled(self, step: int, progress: float) -> Sampled:
+        """A new batch for a step, with its samples in the field as it is."""
+        self._guide.prepare(step, progress, self._field)
+        pilot = self._is_pilot(step)
+        batch = self._draw(self._guide.n_rays(pilot))
+        samples = self._guide.sample(
+            self._field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size
+        )
+        return Sampled(batch, samples)
+
+    @contextmanager
+    def _sampling_next(self, step: int, progress: float, pilot: bool) -> Iterator[None]:
+        """Within it the samples of the next step are taken, on a second thread where there is one, in the
+        field as it is at the beginning; before it changes wait for the second thread."""
+        self._next = None
+        if not (self._guide.samples_ahead and self._skips(pilot)):
+            yield
+        elif self._second.is_there and self.processes.size == 1:
+            with self._second.meanwhile(lambda: self._sampled(step + 1, progress)) as result:
+                yield
+            self._next = result.result()
+        else:  # several processes, too, meet in a fixed order
+            following = self._sampled(step + 1, progress)
+            yield
+            self._next = following
 
     def _draw(self, n_rays: int) -> Batch:
         """This process' share of a joint batch, drawn alike in all of them."""
@@ -400,6 +420,7 @@ class Trainer:
             "pixels": self._pixels.position,
             "effects": self.effects.state(),
             "duration": self.duration.state(),
+            "next": None if self._next is None else self._next.state(),
         }
         return state if self.device.type == "cpu" else _on_cpu(state)
 
@@ -417,6 +438,7 @@ class Trainer:
         self._pixels.restore(state["pixels"])
         self.effects.restore(state["effects"])
         self.duration.restore(state["duration"])
+        self._next = None if state["next"] is None else Sampled.restored(state["next"])
 
 
 def choose_device(name: str) -> torch.device:

@@ -29,7 +29,8 @@ def march(
     samples, sigmas = sampling.march_on_device(
         on(device, logit).lookup, cells, STEP, rays_o, rays_d, jitters()[: len(rays_o)].to(device), budget
     )
-    return RaySamples(**{name: value.cpu() for name, value in vars(samples).items()}), sigmas.cpu()
+    tensors = {name: value.cpu() for name, value in vars(samples).items() if value is not None}
+    return RaySamples(**tensors), sigmas.cpu()
 
 
 def jitters() -> torch.Tensor:

@@ -200,7 +200,8 @@ def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch:
     for _ in trainer.run():
         pass
     found = np.concatenate(drawn)
-    assert len(drawn) == 12 and len(found) > 300
+    # One more batch where the next step's is drawn during the last.
+    assert len(drawn) in (12, 13) and len(found) > 300
     witnesses = trainer.witnesses
     kept = witnesses.views() * side * side + witnesses.pixels
     assert len(kept) > side * side and not np.isin(found, kept).any()

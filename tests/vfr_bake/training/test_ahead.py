@@ -1,0 +1,102 @@
+"""The samples of the next step are taken while a step is learned from, in the field before it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numba
+import pytest
+import torch
+
+from vfr_bake.config import FieldOptions, TrainConfig
+from vfr_bake.data.demo import demo_scene
+from vfr_bake.training.ahead import SecondThread
+from vfr_bake.training.trainer import Trainer
+
+FIELD = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    n_torch, n_numba = torch.get_num_threads(), numba.get_num_threads()
+    if n_numba < 2:
+        pytest.fail("these tests are about two threads: run them with NUMBA_NUM_THREADS=2")
+    torch.set_num_threads(2)
+    numba.set_num_threads(2)
+    yield
+    torch.set_num_threads(n_torch)
+    numba.set_num_threads(n_numba)
+
+
+def trainer(pilot_steps: int) -> Trainer:
+    config = TrainConfig(
+        device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048,
+        occupancy_resolution=32, field=FIELD,
+    )  # fmt: skip
+    return Trainer(demo_scene(size=32, n_train=12, n_test=2), config)
+
+
+def test_the_threads_are_shared_out_and_given_back(two_threads: None) -> None:
+    second = SecondThread()
+    assert second.is_there
+    here, goes_on = threading.get_ident(), threading.Event()
+
+    def work() -> tuple[bool, int]:
+        goes_on.wait(10)
+        return threading.get_ident() != here, numba.get_num_threads()
+
+    with second.meanwhile(work) as result:
+        assert torch.get_num_threads() == 1 and not result.done()
+        goes_on.set()
+        second.wait()
+        assert result.done()
+    assert result.result() == (True, 1)
+    assert torch.get_num_threads() == 2 and numba.get_num_threads() == 2
+
+
+def test_no_error_leaves_work_behind(two_threads: None) -> None:
+    second, done = SecondThread(), threading.Event()
+    with pytest.raises(KeyError), second.meanwhile(lambda: done.wait(0.2) or done.set()):
+        raise KeyError
+    assert done.is_set() and torch.get_num_threads() == 2
+    with second.meanwhile(lambda: 1 // 0) as result:
+        pass
+    with pytest.raises(ZeroDivisionError):
+        result.result()
+
+
+def test_one_thread_has_no_second(two_threads: None) -> None:
+    torch.set_num_threads(1)
+    assert not SecondThread().is_there
+
+
+@pytest.mark.parametrize("threaded", [True, False])
+def test_samples_are_those_of_the_field_a_step_before(threaded: bool, two_threads: None) -> None:
+    subject = trainer(pilot_steps=3)
+    subject._second.is_there = threaded
+    grid, n_ahead = subject.field.grid, 0
+    table = grid.table.detach().clone()
+    for _ in subject.run():
+        if subject._next is not None:
+            samples, now = subject._next.samples, grid.table.detach().clone()
+            assert len(samples.points) > 100
+            with torch.no_grad():
+                assert not torch.equal(grid(samples.points), samples.features)
+                grid.table.copy_(table)
+                assert torch.equal(grid(samples.points), samples.features)
+                grid.table.copy_(now)
+            n_ahead += 1
+        table = grid.table.detach().clone()
+    assert n_ahead == 27, "all but the pilot's"
+
+
+def test_a_second_thread_changes_nothing_but_the_time(two_threads: None) -> None:
+    curves = []
+    for threaded in (True, False):
+        subject = trainer(pilot_steps=5)
+        subject._second.is_there = threaded
+        curves.append(torch.tensor([report.loss for report in subject.run()]))
+    # torch sums in another order on another number of threads.
+    torch.testing.assert_close(curves[0][:10], curves[1][:10], rtol=1e-4, atol=0)
+    torch.testing.assert_close(curves[0], curves[1], rtol=0.05, atol=0)
