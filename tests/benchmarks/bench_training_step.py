@@ -6,7 +6,8 @@
 A process for each version trains with default settings up to step `--begin`; then they take turns, a few
 steps each, so that whatever else the machine does falls on all of them. Figures are medians over the turns.
 Parts are timed by the thread that calls them, and the sums include what is compiled in the first steps of
-neither.
+neither. On two threads (`--threads 2`) the next step is drawn and sampled beside the loss, so that parts add
+up to more than the step.
 """
 
 from __future__ import annotations
@@ -138,11 +139,12 @@ def measure(options: argparse.Namespace) -> dict[str, dict[str, float]]:
         for name, each in turns.items()
     }
     for name in trainings:
-        by_turn = [
-            here["processor"] / here["rays"] / (there["processor"] / there["rays"])
-            for here, there in zip(turns[name], turns["this version"], strict=True)
-        ]
-        found[name]["processor time a ray, times this version's"] = float(np.median(by_turn))
+        for kind in ("wall", "processor"):
+            by_turn = [
+                here[kind] / here["rays"] / (there[kind] / there["rays"])
+                for here, there in zip(turns[name], turns["this version"], strict=True)
+            ]
+            found[name][f"{kind} time a ray, times this version's"] = float(np.median(by_turn))
     return found
 
 

@@ -26,10 +26,10 @@ SOURCES = Path(__file__).parent, Path(player.__file__).parent
 
 def njit(cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile with `numba.njit`; with `cache`, compiled code is kept until one of `SOURCES` changes
-    (`player.kept_code`)."""
+    (`player.kept_code`). Other threads of Python go on meanwhile."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(**options)(function)
+        dispatcher = numba.njit(nogil=True, **options)(function)
         return keep(dispatcher, *SOURCES) if cache else dispatcher
 
     return compiled

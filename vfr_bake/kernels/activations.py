@@ -64,7 +64,7 @@ def exp_of_minus(y):
     return np.float32(0) if y >= MOST else power
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gelu(x, bias, slopes):
     """Replace `x` [n, width] by the GELU of x + `bias` [width], whose slopes are written to `slopes` [n,
     width]; float32, to 1e-6."""
@@ -79,7 +79,7 @@ def gelu(x, bias, slopes):
             slopes[row, c] = share + value * density
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gelu_backward(grad, slopes, rows, grad_bias):
     """Multiply `grad` [n, width] by the `rows` [n] of `slopes`, and write the sum over its rows to
     `grad_bias` [width]."""
@@ -91,7 +91,7 @@ def gelu_backward(grad, slopes, rows, grad_bias):
             grad_bias[c] += value
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def relu_backward(hidden, bias, weights, grad_out, grad_weights, grad_bias):
     """Back through out = `weights` [width] . relu(h + `bias` [width]), given the h [n, width] in `hidden` and
     `grad_out` [n]: `hidden` becomes the gradient of h, and the gradients of weights and bias are written."""

@@ -59,7 +59,7 @@ def composite(sigmas, features, deltas, starts, counts, weights, taus, out, opac
         _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity)
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def composite_part(sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
     """`composite` on the thread that calls it, while others do theirs."""
     for ray in range(starts.shape[0]):
@@ -82,7 +82,7 @@ def composite_backward(
         )  # fmt: skip
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def composite_part_backward(
     features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights, grad_sigmas,
     grad_features,
@@ -95,7 +95,7 @@ def composite_part_backward(
         )  # fmt: skip
 
 
-@njit(nogil=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def silence(gradients, faint):
     """Set those rows of `gradients` [n_samples, n_channels] to 0 whose length is less than `faint` times the
     root of the mean square length; NaN stays."""
@@ -116,15 +116,15 @@ def silence(gradients, faint):
                 gradients[i, c] = 0
 
 
-@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def distortion(weights, mids, widths, starts, counts, losses, grad_weights):
     """Distortion of each ray (mip-NeRF 360, eq. 15) and its gradient, in one pass forth and one back.
 
     losses[r] = sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 b_i for interval middles m, ascending along a
-    ray, and widths b.
+    ray, and widths b. On the thread that calls it.
     """
     kind = weights.dtype.type
-    for ray in prange(starts.shape[0]):
+    for ray in range(starts.shape[0]):
         first, last = starts[ray], starts[ray] + counts[ray]
         before, before_m = kind(0), kind(0)
         total, total_m = kind(0), kind(0)

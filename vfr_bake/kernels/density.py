@@ -86,7 +86,7 @@ def look_up(x, y, z, field, limits, feature, hidden):
     return np.exp(min(density_logit(feature, field, hidden), limits.largest_logit))
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def density_logits(points, field, out):
     """Write the logits [n_points] at `points` [n_points, 3] of the unit cube to `out`."""
     block = 1024

@@ -76,7 +76,7 @@ def next_sample(rays_o, rays_d, ray, t_near, t_far, i, jitter, step, distance):
         i += max(np.int64(empty / step), 1)
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def march_samples(
     rays_o, rays_d, jitter, step, distance, field, limits, counts, starts, t_mid, points, features, sigmas
 ):  # fmt: skip
@@ -159,7 +159,7 @@ def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity,
             depth[ray] = t_sum / opacity[ray] if tau > 0 else kind(0)
 
 
-@njit(nogil=True, cache=True)
+@njit(cache=True)
 def chebyshev_distance(occupied, distance):
     """Chebyshev distance in cells to the nearest occupied cell, at most 254.
 

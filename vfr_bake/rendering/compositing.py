@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -52,6 +52,8 @@ class RaySamples:
     """[n_served] number of samples of each, 0 where a ray meets nothing."""
     sigmas: Tensor | None = None
     """[n_samples] densities, where they were looked up on the way."""
+    trail: Any = None
+    """What the guide of a training keeps of them, in tensors and plain values."""
 
 
 @torch.no_grad()

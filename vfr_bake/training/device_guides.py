@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -66,7 +68,7 @@ class DeviceProposalGuide(SpaceGuide):
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
-        self._rounds = []
+        rounds = []
         near, far = self._borders
         edges = rays_o.new_tensor([near, far]).expand(len(rays_o), 2)
         weights = rays_o.new_ones(len(rays_o), 1)
@@ -76,21 +78,23 @@ class DeviceProposalGuide(SpaceGuide):
             assert isinstance(grid, ProposalGrid)
             with torch.set_grad_enabled(self._learns):
                 weights = proposal_weights(grid, rays_o, rays_d, edges)
-            self._rounds.append((edges, weights))
-        self._edges = self._resample(edges, weights, self._exponent, jitter[:, 2], self._n_final)
-        return field_samples(field, rays_o, rays_d, self._edges)
+            rounds.append((edges, weights))
+        edges = self._resample(edges, weights, self._exponent, jitter[:, 2], self._n_final)
+        trail = {"edges": edges, "rounds": rounds, "learns": self._learns}
+        return replace(field_samples(field, rays_o, rays_d, edges), trail=trail)
 
     @staticmethod
     def _resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n: int) -> Tensor:
         return kernels.resample(edges.contiguous(), weights.detach(), exponent, jitter, n)
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
-        if not self._learns or not n_rays:
+        trail = samples.trail
+        if not trail["learns"] or not n_rays:
             return
-        final = weights.new_zeros(len(samples.counts), self._edges.shape[1] - 1)
+        final = weights.new_zeros(len(samples.counts), trail["edges"].shape[1] - 1)
         rows = Padding(samples.starts, samples.counts, len(weights)).rows(weights.detach())
         final[:, : rows.shape[1]] = rows
-        losses = [kernels.interlevel(self._edges, final, edges, proposed) for edges, proposed in self._rounds]
+        losses = [kernels.interlevel(trail["edges"], final, *proposed) for proposed in trail["rounds"]]
         (torch.stack(losses).sum() / n_rays).backward()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,13 +19,13 @@ from torch import Tensor
 
 from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels.proposals import spacing
+from vfr_bake.kernels.proposals import Round, spacing
 from vfr_bake.rendering.compositing import RaySamples, distortion
 from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
-from vfr_bake.rendering.space_grid import FINER, Intervals, SpaceGrid
+from vfr_bake.rendering.space_grid import FINER, SpaceGrid
 from vfr_bake.training.optimiser import MILESTONES, GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
@@ -44,10 +45,6 @@ one for so many steps, then in every second for as many, and so on."""
 class Guide(ABC):
     """The sampler in training."""
 
-    samples_ahead = False
-    """Whether a step's samples are taken while the step before it is learned from, in the field before that:
-    of no use on a GPU, and where what is kept of a step's samples is kept until its end."""
-
     @property
     @abstractmethod
     def sampler(self) -> Sampler:
@@ -66,7 +63,8 @@ class Guide(ABC):
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
         """Samples of rays [n_rays, 3] with `jitter` [n_rays, 3] in [0, 1), in this process' `share` of the
-        batch."""
+        batch. What is needed later in their step is in their trail: those of the next step may be taken
+        meanwhile."""
 
     def observe(self, n_rays: int, n_samples: int) -> None:
         """Take note of how many rays and samples the batch had, over all processes."""
@@ -80,8 +78,8 @@ class Guide(ABC):
         """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
         return None
 
-    def tables(self) -> Sequence[TableAdam]:
-        """The tables that learn in this step, with their gradients."""
+    def tables(self, samples: RaySamples) -> Sequence[TableAdam]:
+        """The tables that learn in the step of the samples, with their gradients."""
         return ()
 
     @abstractmethod
@@ -127,7 +125,6 @@ class BoxGuide(Guide):
 class OccupancyGuide(BoxGuide):
     """Marches an object's box on a CPU and keeps its occupancy grid."""
 
-    samples_ahead = True
     _grid: OccupancyGrid
 
     def __init__(
@@ -163,8 +160,6 @@ class OccupancyGuide(BoxGuide):
 class SpaceGridGuide(Guide):
     """Marches an unbounded scene on a CPU and keeps its grid of contracted space."""
 
-    _intervals: Intervals
-
     def __init__(
         self, config: TrainConfig, settings: DeviceSettings, near: float, processes: Processes
     ) -> None:
@@ -192,15 +187,15 @@ class SpaceGridGuide(Guide):
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
         first = jitter[:, 0].contiguous()
-        samples, sigmas, self._intervals = self._grid.march(field, rays_o, rays_d, first, self._finer)
+        samples, sigmas, intervals = self._grid.march(field, rays_o, rays_d, first, self._finer)
         self._grid.observe(samples.points.numpy(), sigmas)
-        return samples
+        return replace(samples, trail=tuple(intervals))
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
         if self._config.distortion == 0:
             return None
         # In angles, from 0 to 1 over the longest ray.
-        mids, widths = (part / math.pi for part in self._intervals)
+        mids, widths = (part / math.pi for part in samples.trail)
         losses = distortion(weights, mids, widths, samples.starts, samples.counts)
         return self._config.distortion * losses.sum()
 
@@ -213,10 +208,11 @@ class SpaceGridGuide(Guide):
 
 class SpaceGuide(Guide):
     """When the proposals of a scene learn and how far they are believed: what its guides have in common on
-    all devices."""
+    all devices.
 
-    _edges: Tensor
-    """[n_rays, n_final + 1] borders of the last samples' intervals, in s."""
+    The trail of its samples has "edges" [n_rays, n_final + 1], the borders of their intervals in s, the
+    "rounds" that led to them, and whether proposals learn from these ("learns").
+    """
 
     def __init__(
         self,
@@ -249,15 +245,15 @@ class SpaceGuide(Guide):
         if self._config.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
-        n_final = self._edges.shape[1] - 1
-        kept = torch.arange(n_final, device=weights.device) < samples.counts[:, None]
-        low, high = self._edges[:, :-1][kept], self._edges[:, 1:][kept]
+        edges = samples.trail["edges"]
+        kept = torch.arange(edges.shape[1] - 1, device=weights.device) < samples.counts[:, None]
+        low, high = edges[:, :-1][kept], edges[:, 1:][kept]
         mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
         losses = self._distortion(weights, mids, widths, samples.starts, samples.counts)
         return self._config.distortion * losses.sum()
 
-    def tables(self) -> Sequence[TableAdam]:
-        return self._adams if self._learns else ()
+    def tables(self, samples: RaySamples) -> Sequence[TableAdam]:
+        return self._adams if samples.trail["learns"] else ()
 
     def state(self) -> dict[str, Any]:
         return {"proposals": self._sampler.state_dict(), "adams": [adam.state() for adam in self._adams]}
@@ -281,12 +277,15 @@ class ProposalGuide(SpaceGuide):
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
-        samples, edges, self._rounds = self._sampler.sample_rounds(
+        samples, edges, rounds = self._sampler.sample_rounds(
             field, rays_o, rays_d, jitter, self._exponent, self._n_final
         )
-        self._edges = torch.from_numpy(edges)
-        return samples
+        found = [tuple(torch.from_numpy(array) for array in each) for each in rounds]
+        trail = {"edges": torch.from_numpy(edges), "rounds": found, "learns": self._learns}
+        return replace(samples, trail=trail)
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
-        if self._learns:
-            self._sampler.add_gradients(self._rounds, self._edges.numpy(), samples, weights, n_rays)
+        trail = samples.trail
+        if trail["learns"]:
+            rounds = [Round(*(tensor.numpy() for tensor in found)) for found in trail["rounds"]]
+            self._sampler.add_gradients(rounds, trail["edges"].numpy(), samples, weights, n_rays)

@@ -257,12 +257,11 @@ class Trainer:
             self._adam.zero_grad(set_to_none=True)
             if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
-            self._second.wait()
             factor = rate_factor(step, progress)
             for group in self._adam.param_groups:
                 group["lr"] = self.pace.network_rate * factor
             self._adam.step()
-            for table in (self._grid_adam, *self._guide.tables()):
+            for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
             if seen is not None:
                 self.effects.observe(seen, n_rays)
@@ -287,7 +286,7 @@ class Trainer:
         """Within it the samples of the next step are taken, on a second thread where there is one, in the
         field as it is at the beginning; before it changes wait for the second thread."""
         self._next = None
-        if not (self._guide.samples_ahead and self._skips(pilot)):
+        if not self._skips(pilot):
             yield
         elif self._second.is_there and self.processes.size == 1:
             with self._second.meanwhile(lambda: self._sampled(step + 1, progress)) as result:
@@ -379,10 +378,11 @@ class Trainer:
         self, loss: Tensor, value: float, samples: RaySamples, weights: Tensor, n_rays: int, pilot: bool
     ) -> bool:
         """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
-        tables = [self._grid_adam, *self._guide.tables()]
+        tables = [self._grid_adam, *self._guide.tables(samples)]
         if value == value and abs(value) != float("inf"):
             if loss.requires_grad:
                 loss.backward()
+            self._second.wait()
             self._guide.add_gradients(samples, weights, n_rays)
             gradients = self._gradients(pilot)
             if self.processes.size > 1:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numba
 import pytest
 import torch
 
-from vfr_bake.config import FieldOptions, TrainConfig
-from vfr_bake.data.demo import demo_scene
+from vfr_bake.config import FieldOptions, Sampling, SceneKind, TrainConfig
+from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.scene import build_scene
 from vfr_bake.training.ahead import SecondThread
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
+KINDS: dict[str, tuple[SceneKind, Sampling]] = {
+    "object": ("object", "auto"),
+    "proposals": ("unbounded", "proposals"),
+    "grid": ("unbounded", "grid"),
+}
 
 
 @pytest.fixture
@@ -29,12 +36,15 @@ def two_threads() -> Iterator[None]:
     numba.set_num_threads(n_numba)
 
 
-def trainer(pilot_steps: int) -> Trainer:
+def trainer(kind: str, pilot_steps: int) -> Trainer:
+    """Of the built-in object, or of a scene that is sampled by `kind`."""
+    scene_kind, sampling = KINDS[kind]
     config = TrainConfig(
-        device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048,
-        occupancy_resolution=32, field=FIELD,
+        device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048, batch_rays=64,
+        occupancy_resolution=32, field=FIELD, sampling=sampling,
     )  # fmt: skip
-    return Trainer(demo_scene(size=32, n_train=12, n_test=2), config)
+    scene = build_scene(demo_capture(size=32, n_train=12, n_test=2), scene_kind)
+    return Trainer(replace(scene, has_alpha=True, masked=False), config)
 
 
 def test_the_threads_are_shared_out_and_given_back(two_threads: None) -> None:
@@ -72,8 +82,9 @@ def test_one_thread_has_no_second(two_threads: None) -> None:
 
 
 @pytest.mark.parametrize("threaded", [True, False])
-def test_samples_are_those_of_the_field_a_step_before(threaded: bool, two_threads: None) -> None:
-    subject = trainer(pilot_steps=3)
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_are_those_of_the_field_a_step_before(kind: str, threaded: bool, two_threads: None) -> None:
+    subject = trainer(kind, pilot_steps=3)
     subject._second.is_there = threaded
     grid, n_ahead = subject.field.grid, 0
     table = grid.table.detach().clone()
@@ -91,10 +102,11 @@ def test_samples_are_those_of_the_field_a_step_before(threaded: bool, two_thread
     assert n_ahead == 27, "all but the pilot's"
 
 
-def test_a_second_thread_changes_nothing_but_the_time(two_threads: None) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_thread_changes_nothing_but_the_time(kind: str, two_threads: None) -> None:
     curves = []
     for threaded in (True, False):
-        subject = trainer(pilot_steps=5)
+        subject = trainer(kind, pilot_steps=5)
         subject._second.is_there = threaded
         curves.append(torch.tensor([report.loss for report in subject.run()]))
     # torch sums in another order on another number of threads.
