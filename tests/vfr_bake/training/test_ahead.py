@@ -93,9 +93,10 @@ def test_samples_are_those_of_the_field_a_step_before(kind: str, threaded: bool,
             samples, now = subject._next.samples, grid.table.detach().clone()
             assert len(samples.points) > 100
             with torch.no_grad():
-                assert not torch.equal(grid(samples.points), samples.features)
+                assert (grid(samples.points) - samples.features).abs().max() > 1e-5
                 grid.table.copy_(table)
-                assert torch.equal(grid(samples.points), samples.features)
+                # To rounding: kernels that march and one that looks up may contract products in other ways.
+                torch.testing.assert_close(grid(samples.points), samples.features, rtol=0, atol=1e-6)
                 grid.table.copy_(now)
             n_ahead += 1
         table = grid.table.detach().clone()
