@@ -135,7 +135,7 @@ class Trainer:
             self._use_numba(scene)
         self._second = SecondThread()
         self._next: Sampled | None = None
-        """Of the next step, if they have been taken."""
+        """The rays and samples of the next step, if they have been taken."""
         self._parameters = [*self._field.network_parameters(), *self.pilot.parameters()]
         self._adam = torch.optim.Adam(
             self._parameters, lr=self.pace.network_rate, eps=EPSILON, betas=BETAS, fused=True
