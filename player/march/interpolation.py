@@ -107,7 +107,7 @@ _EXACT = (Stage(EVERY, _NONE, _NOTHING),)
 _OF_BOX: dict[Quality, tuple[Stage, ...]] = {
     "exact": _EXACT,
     "high": _pattern(2, (_agreement(20),), probed=True),
-    "fast": _pattern(2, (_agreement(45),), probed=True),
+    "fast": _pattern(2, (_agreement(40),), probed=True),
 }
 _OF_SPACE: dict[Quality, tuple[Stage, ...]] = {
     "exact": _EXACT,

@@ -175,7 +175,7 @@ def test_marched_pixels_are_those_of_the_whole_picture(
     same = marched | lattice
     for name in ("rgb", "opacity", "depth", "n_density_samples"):
         assert getattr(other, name)[same].tobytes() == getattr(whole, name)[same].tobytes(), name
-    assert np.abs(other.opacity - exact.opacity).mean() < (0.01 if quality == "high" else 0.02)
+    assert np.abs(other.opacity - exact.opacity).mean() < 0.01
     a, b = (
         frame.rgb * (frame.opacity[..., None] if settings.get("background") else 1)
         for frame in (exact, other)
