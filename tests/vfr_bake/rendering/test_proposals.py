@@ -156,7 +156,7 @@ def test_samples_lie_where_they_say() -> None:
 
 @pytest.mark.parametrize("scale", [0.0, 2.0, 30.0])
 def test_rounds_are_the_equations_in_float64(scale: float) -> None:
-    """Of the edges that each round has; with a scale of 30 densities reach the largest and are opaque."""
+    """What rounds find for their edges; with a scale of 30 densities reach the largest and are opaque."""
     field, sampler, rays_o, rays_d = make()
     for grid in sampler.grids:
         torch.nn.init.uniform_(grid.table, -scale, scale)

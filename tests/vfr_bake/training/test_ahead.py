@@ -37,7 +37,7 @@ def two_threads() -> Iterator[None]:
 
 
 def trainer(kind: str, pilot_steps: int) -> Trainer:
-    """Of the built-in object, or of a scene that is sampled by `kind`."""
+    """A trainer of the built-in object, or of a scene that is sampled by `kind`."""
     scene_kind, sampling = KINDS[kind]
     config = TrainConfig(
         device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048, batch_rays=64,
