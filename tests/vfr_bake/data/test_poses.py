@@ -17,11 +17,9 @@ from PIL import Image
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import mapping, poses
 from vfr_bake.data.check.check import check_data
-from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
-from vfr_bake.data.files import video
-from vfr_bake.data.files.looks import sensor_of
+from vfr_bake.data.features import find_features, match
 from vfr_bake.data.folders import load_folder
-from vfr_bake.data.poses import estimate_cameras, has_pictures, is_video
+from vfr_bake.data.poses import estimate_cameras, has_pictures
 from vfr_bake.data.store.working import WorkingSize
 
 N_CAN = 10
@@ -37,14 +35,6 @@ def real_pictures(name: str) -> Path:
 
 def quiet(stage: str, done: int, of: int) -> None:
     assert 0 <= done <= of, stage
-
-
-@pytest.fixture(autouse=True)
-def kept(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where a test's matches are kept: not in the user's own cache."""
-    root = tmp_path_factory.mktemp("kept")
-    monkeypatch.setattr(poses, "cache_root", lambda: root)
-    return root
 
 
 def centres(model: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -356,158 +346,6 @@ def test_without_pycolmap_it_says_what_to_install(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[poses\]'"):
         estimate_cameras(save(tmp_path, [textured(seed) for seed in range(3)]), quiet)
-
-
-# --- features, sensors ---
-
-
-def test_features_follow_the_picture_to_its_own_pixels(monkeypatch: pytest.MonkeyPatch):
-    """A point found in the reduced picture is where it is found in the whole one."""
-    rgba = np.dstack([textured(3, 640, 480), np.full((480, 640), 255, np.uint8)])
-    whole = find_features(rgba)
-    monkeypatch.setattr("vfr_bake.data.features.MAX_SIDE", 320)
-    reduced = find_features(rgba)
-    pairs = match(whole.descriptors, reduced.descriptors)
-    off = whole.points[pairs[:, 0]] - reduced.points[pairs[:, 1]]
-    assert (
-        len(pairs) > 50 and np.abs(np.median(off, axis=0)).max() < 0.15
-    )  # half a pixel too many shows as 0.5
-
-
-def test_nothing_is_found_where_a_picture_is_transparent():
-    rgba = np.dstack([textured(4), np.full((120, 160), 255, np.uint8)])
-    rgba[:, :80, 3] = 0
-    points = find_features(rgba).points
-    assert len(points) and points[:, 0].min() > 79
-
-
-def test_match_is_what_loops_say():
-    rng = np.random.default_rng(0)
-    a = np.abs(rng.normal(size=(300, 128))).astype(np.float32)
-    b = np.concatenate([a[50:250] + 0.3 * rng.normal(size=(200, 128)), np.abs(rng.normal(size=(40, 128)))])
-    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b.astype(np.float32)))
-    expected = []
-    for i in range(len(a)):
-        distances = np.linalg.norm(a[i] - b, axis=1)
-        j, second = np.argsort(distances)[:2]
-        if distances[j] < 0.8 * distances[second] and np.linalg.norm(a - b[j], axis=1).argmin() == i:
-            expected.append([i, j])
-    assert 20 < len(expected) and match(a, b).tolist() == expected
-    stacked = np.stack([b[:120], b[120:]])
-    assert _n_matches(a, stacked).tolist() == [len(match(a, half)) for half in stacked]
-    assert match(a[:0], b).shape == match(a, b[:1]).shape == (0, 2)
-
-
-def test_a_walk_is_closed_without_all_pairs():
-    """Sixty pictures of a strip that goes round: picture 59 overlaps picture 0."""
-    strip = textured(5, 1600, 120)
-    strip = np.concatenate([strip, strip[:, :200]], axis=1)
-    views = [strip[:, start : start + 160] for start in np.linspace(0, 1600, 60, endpoint=False).astype(int)]
-    opaque = np.full((120, 160), 255, np.uint8)
-    pairs = pairs_to_match([find_features(np.dstack([view, opaque])) for view in views])
-    assert (0, 59) in pairs and (0, 1) in pairs and len(pairs) < 60 * 59 / 4
-    assert len(set(pairs)) == len(pairs) and all(i < j for i, j in pairs)
-
-
-def test_one_camera_for_one_device_and_its_focal_length(tmp_path: Path):
-    exif = Image.Exif()
-    exif[271], exif[272] = "Maker", "Model"
-    exif[0x8769] = {0xA405: 26}  # Pillow before 11.3 does not write what get_ifd was given
-    for name, tags in (("a", exif), ("b", exif), ("c", Image.Exif())):
-        Image.fromarray(textured(0, 400, 300)).save(tmp_path / f"{name}.jpg", exif=tags)
-    a, b, c = (sensor_of(tmp_path / f"{name}.jpg", 400, 300) for name in "abc")
-    assert a == b != c and c.focal is None
-    assert a.focal == pytest.approx(26 / 43.27 * 500)
-    assert mapping.colmap_camera(a).has_prior_focal_length
-    assert mapping.colmap_camera(c).focal_length == 480
-
-
-# --- video ---
-
-
-def write_video(path: Path, shifts: list[float], blurred: set[int] = frozenset()) -> Path:
-    """One frame for each of `shifts`, by which the picture has moved, pixels."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
-    for index, shift in enumerate(shifts):
-        frame = np.roll(textured(6, 320, 120), round(shift), axis=1)[:, :160].copy()
-        if index in blurred:
-            frame = cv2.GaussianBlur(frame, (9, 9), 3)
-        frame[:8] = 4 * index  # tells which it is
-        writer.write(frame)
-    writer.release()
-    return path
-
-
-@pytest.fixture
-def short_video(tmp_path: Path) -> Path:
-    """Twelve frames, each 3 of 160 pixels on, every second one blurred."""
-    return write_video(tmp_path / "walk.avi", [3 * index for index in range(12)], set(range(1, 12, 2)))
-
-
-def frame_numbers(folder: Path) -> list[int]:
-    return [round(np.asarray(Image.open(path))[:5].mean() / 4) for path in sorted(folder.iterdir())]
-
-
-def test_the_sharpest_frame_of_every_step(short_video: Path):
-    calls: list[tuple[int, int]] = []
-    folder = video.extract_frames(short_video, lambda *call: calls.append(call))
-    assert folder == short_video.with_name("walk_frames") and calls[-1] == (12, 12)
-    numbers = frame_numbers(folder / "images")
-    assert not any(number % 2 for number in numbers) and 5 <= len(numbers) <= 6
-    short_video.unlink()  # what is there is taken as it is
-    assert video.extract_frames(short_video, quiet_frames) == folder
-
-
-def quiet_frames(done: int, of: int) -> None:
-    raise AssertionError("nothing is to be done")
-
-
-def test_frames_are_chosen_by_how_far_the_camera_moves(tmp_path: Path):
-    """It stands still for 20 frames, and then moves on for 20."""
-    path = write_video(tmp_path / "a.avi", [0.0] * 20 + [5.0 * index for index in range(1, 21)])
-    numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
-    assert sum(number < 20 for number in numbers) <= 1 and len(numbers) > 12
-    still = write_video(tmp_path / "b.avi", [0.0] * 8)
-    assert len(frame_numbers(video.extract_frames(still, lambda done, of: None) / "images")) == 1
-
-
-def test_a_long_video_gives_no_more_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(video, "MOST_FRAMES", 6)
-    path = write_video(tmp_path / "a.avi", [6.0 * index for index in range(50)])
-    numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
-    assert 3 <= len(numbers) <= 6 and numbers == sorted(numbers)
-    assert np.diff(numbers).min() >= 4 and numbers[-1] > 35  # spread over all of it
-
-
-def test_a_video_becomes_a_folder_of_pictures(short_video: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(poses, "look_at", lambda pictures, *_: pytest.fail(f"{len(pictures)} pictures"))
-    assert is_video(short_video)
-    with pytest.raises(pytest.fail.Exception, match="6 pictures"):
-        estimate_cameras(short_video, quiet)
-
-
-def test_an_interrupted_video_leaves_nothing(short_video: Path):
-    def interrupt(done: int, of: int) -> None:
-        if done == 7:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        video.extract_frames(short_video, interrupt)
-    assert list(short_video.parent.iterdir()) == [short_video]
-
-
-def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"no video" * 100)
-    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
-    assert not video.frames_folder(path).exists()
-
-
-def test_a_video_without_frames(tmp_path: Path):
-    path = tmp_path / "a.avi"
-    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48)).release()
-    assert path.is_file()
-    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
 
 
 def test_of_groups_that_have_nothing_in_common_the_largest_is_taken_and_said(can, tmp_path: Path):

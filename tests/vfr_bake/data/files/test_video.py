@@ -1,0 +1,100 @@
+"""Frames of a video: which are chosen, and videos that cannot be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.vfr_bake.data.test_poses import message, quiet, textured
+from vfr_bake.data import poses
+from vfr_bake.data.files import video
+from vfr_bake.data.poses import estimate_cameras, is_video
+
+
+def write_video(path: Path, shifts: list[float], blurred: set[int] = frozenset()) -> Path:
+    """One frame for each of `shifts`, by which the picture has moved, pixels."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
+    for index, shift in enumerate(shifts):
+        frame = np.roll(textured(6, 320, 120), round(shift), axis=1)[:, :160].copy()
+        if index in blurred:
+            frame = cv2.GaussianBlur(frame, (9, 9), 3)
+        frame[:8] = 4 * index  # tells which it is
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def short_video(tmp_path: Path) -> Path:
+    """Twelve frames, each 3 of 160 pixels on, every second one blurred."""
+    return write_video(tmp_path / "walk.avi", [3 * index for index in range(12)], set(range(1, 12, 2)))
+
+
+def frame_numbers(folder: Path) -> list[int]:
+    return [round(np.asarray(Image.open(path))[:5].mean() / 4) for path in sorted(folder.iterdir())]
+
+
+def test_the_sharpest_frame_of_every_step(short_video: Path):
+    calls: list[tuple[int, int]] = []
+    folder = video.extract_frames(short_video, lambda *call: calls.append(call))
+    assert folder == short_video.with_name("walk_frames") and calls[-1] == (12, 12)
+    numbers = frame_numbers(folder / "images")
+    assert not any(number % 2 for number in numbers) and 5 <= len(numbers) <= 6
+    short_video.unlink()  # what is there is taken as it is
+    assert video.extract_frames(short_video, quiet_frames) == folder
+
+
+def quiet_frames(done: int, of: int) -> None:
+    raise AssertionError("nothing is to be done")
+
+
+def test_frames_are_chosen_by_how_far_the_camera_moves(tmp_path: Path):
+    """It stands still for 20 frames, and then moves on for 20."""
+    path = write_video(tmp_path / "a.avi", [0.0] * 20 + [5.0 * index for index in range(1, 21)])
+    numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
+    assert sum(number < 20 for number in numbers) <= 1 and len(numbers) > 12
+    still = write_video(tmp_path / "b.avi", [0.0] * 8)
+    assert len(frame_numbers(video.extract_frames(still, lambda done, of: None) / "images")) == 1
+
+
+def test_a_long_video_gives_no_more_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(video, "MOST_FRAMES", 6)
+    path = write_video(tmp_path / "a.avi", [6.0 * index for index in range(50)])
+    numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
+    assert 3 <= len(numbers) <= 6 and numbers == sorted(numbers)
+    assert np.diff(numbers).min() >= 4 and numbers[-1] > 35  # spread over all of it
+
+
+def test_a_video_becomes_a_folder_of_pictures(short_video: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(poses, "look_at", lambda pictures, *_: pytest.fail(f"{len(pictures)} pictures"))
+    assert is_video(short_video)
+    with pytest.raises(pytest.fail.Exception, match="6 pictures"):
+        estimate_cameras(short_video, quiet)
+
+
+def test_an_interrupted_video_leaves_nothing(short_video: Path):
+    def interrupt(done: int, of: int) -> None:
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.extract_frames(short_video, interrupt)
+    assert list(short_video.parent.iterdir()) == [short_video]
+
+
+def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"no video" * 100)
+    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
+    assert not video.frames_folder(path).exists()
+
+
+def test_a_video_without_frames(tmp_path: Path):
+    path = tmp_path / "a.avi"
+    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48)).release()
+    assert path.is_file()
+    assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
