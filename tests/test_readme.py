@@ -81,3 +81,5 @@ def test_version_is_the_same_everywhere() -> None:
     assert f'version = "{__version__}"' in project
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"## {__version__}" in changelog
+    citation = (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {__version__}\n" in citation

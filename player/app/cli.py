@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 import threading
+import webbrowser
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from player.app.commands import run, write_result
+from player.app.option_types import DEMO
 from player.app.options import PlaySettings, parse, settings_of
 from player.errors import ConfigError, VfrError
 from player.progress import Bar, duration
@@ -37,7 +41,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.info:
         return _info(arguments)
     if arguments.output is None:
-        return _view(arguments)
+        # The first look at what this is wants no extra.
+        no_viewer = arguments.asset == DEMO and find_spec("viser") is None
+        return _open_page(arguments) if no_viewer else _view(arguments)
     return _play(arguments)
 
 
@@ -59,6 +65,20 @@ def _view(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _open_page(arguments: argparse.Namespace) -> int:
+    """Write the asset's page to a new temporary folder, and open it in a browser if there is a display."""
+    from player.files.files import write_bytes
+    from player.page.page import page
+
+    path = Path(tempfile.mkdtemp(prefix="vfr-play-")) / f"{arguments.asset.name}.html"
+    write_bytes(path, page(_open(arguments.asset, arguments)))
+    print(f"{path}: open it in any browser", flush=True)
+    _say("this page is drawn by the browser; the viewer is an extra: pip install 'vfr-bake[viewer]'")
+    if _has_display():
+        webbrowser.open(path.as_uri())
+    return 0
+
+
 def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
     """The asset, of which as much as there is plays: a line says what is missing."""
     from player.asset.asset import Asset
@@ -73,12 +93,16 @@ def _advise(asset: Path, address: str) -> None:
     """Say how the viewer is left, and what to do where no browser can open here."""
     _say(f"for many visitors, each with the GPU of their own device: {address}/page")
     _say("the viewer runs until Ctrl-C")
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    if not _has_display():
         port = address.rpartition(":")[2]
         _say(f"no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this")
         _say(f"and open that address there; or render files: vfr-play {asset} --orbit 60 --output frames/")
+
+
+def _has_display() -> bool:
+    """Whether a browser can open a window here, as far as the system tells."""
+    windows = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or bool(windows)
 
 
 def _play(arguments: argparse.Namespace) -> int:

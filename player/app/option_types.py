@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 
+DEMO = Path(__file__).parent / "demo"
+"""The baked asset of the built-in scene, which comes with the player."""
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
@@ -16,6 +19,15 @@ def wrong(expected: str, example: str, text: str) -> argparse.ArgumentTypeError:
     "expected a whole number, such as 3, got 'x'"
     """
     return argparse.ArgumentTypeError(f"expected {expected}, such as {example}, got {text!r}")
+
+
+def asset_folder(text: str) -> Path:
+    """The folder of an asset; the word `demo` is that of the built-in scene.
+
+    >>> asset_folder("out/").name, asset_folder("demo") == DEMO, asset_folder("./demo").is_absolute()
+    ('out', True, False)
+    """
+    return DEMO if text == DEMO.name else Path(text)
 
 
 def whole(least: int | None = None, most: int | None = None, example: int = 10) -> Callable[[str], int]:

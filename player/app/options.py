@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from player.app.option_types import background, gigabytes, number, part, positive, size, whole
+from player.app.option_types import asset_folder, background, gigabytes, number, part, positive, size, whole
 from player.errors import ConfigError
 
 PICTURES = (".png", ".webp")
@@ -29,6 +29,7 @@ QUALITY = (
 )
 
 EXAMPLES = """examples:
+  vfr-play demo                                                        the built-in scene, already baked
   vfr-play out/                                                        look at it in a browser
   vfr-play fidelity/ balanced/ fast/                                   and switch between bakes of a scene
   vfr-play out/ --info
@@ -158,8 +159,14 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("asset", type=Path, help="folder of the asset")
-    add("others", type=Path, nargs="*", metavar="asset", help="more of them, to switch to in the viewer")
+    add("asset", type=asset_folder, help="folder of the asset, or the word demo: the built-in scene")
+    add(
+        "others",
+        type=asset_folder,
+        nargs="*",
+        metavar="asset",
+        help="more of them, to switch to in the viewer",
+    )
     views = parser.add_argument_group("views").add_mutually_exclusive_group()
     views.add_argument(
         "--cameras",

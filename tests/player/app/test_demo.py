@@ -1,0 +1,53 @@
+"""The built-in scene as it comes with the player: `vfr-play demo`."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from player.app import cli
+from player.app.option_types import DEMO
+from player.asset.asset import Asset
+from player.page.page import page
+
+
+def test_it_is_small_and_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    assert sum(path.stat().st_size for path in DEMO.iterdir()) < 3_000_000
+    assert cli.main(["demo", "--check"]) == 0
+    assert "FAILED" not in capsys.readouterr().out
+
+
+def test_a_folder_of_that_name_is_another_asset(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "demo").symlink_to(shells_folder, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    sizes = []
+    for name in ("demo", "./demo"):
+        assert cli.main([name, "--info"]) == 0
+        sizes.append(capsys.readouterr().out)
+    assert sizes[0] != sizes[1]
+
+
+@pytest.mark.parametrize("display", ["", ":0"])
+def test_without_the_viewer_its_page_opens(
+    display: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    assert cli.main(["demo"]) == 0
+    (written,) = tmp_path.glob("*/demo.html")
+    assert written.read_bytes() == page(Asset.open(DEMO))
+    assert opened == ([written.as_uri()] if display else [])
+    said = capsys.readouterr()
+    assert said.out == f"{written}: open it in any browser\n"
+    assert "pip install 'vfr-bake[viewer]'" in said.err
