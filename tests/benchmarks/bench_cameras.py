@@ -169,7 +169,8 @@ def compare(data: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         photos = Path(name)
         (photos / "images").mkdir()
-        for number, camera in enumerate(read_cameras(files[0])):
+        # Places and turns are all that is compared; NeRF-synthetic does not tell the size of its pictures.
+        for number, camera in enumerate(read_cameras(files[0], (1, 1))):
             names = (camera.name, f"{camera.name}.png")
             picture = next(path for name in names if (path := data / name).is_file())
             copy = f"{number:05d}{picture.suffix}"

@@ -241,7 +241,7 @@ def test_the_word_demo_loads_it(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_asset_that_comes_with_the_player_shows_it():
-    """Of a view between those that it was trained on; one pixel moved is 26 dB, an empty picture 10."""
+    """The view is between those that it was trained on; one pixel moved is 26 dB, an empty picture 10."""
     camera = demo_cameras(256, 16, phase=0.5)[6]
     asset = Asset.open(DEMO)
     rgba, _ = trace(camera)
