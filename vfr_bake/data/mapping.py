@@ -24,6 +24,10 @@ from vfr_bake.data.threads import Progress, in_threads, n_threads
 
 MIN_MATCHES = 15
 MIN_FOR_PRINCIPAL_POINT = 20
+FIRST_ANGLE = 16.0
+"""COLMAP's own: the wider, the better is the distance to the points known."""
+FIRST_ANGLE_OF_NEIGHBOURS = 4.0
+"""Two neighbouring pictures have it. They share more points, and a third picture finds its place by those."""
 SECONDS_BETWEEN_LOOKS = 0.1
 
 
@@ -155,12 +159,18 @@ def match_pictures(
 
 
 def map_pictures(
-    database: Path, pictures: Path, work: Path, n_pictures: int, progress: Progress
+    database: Path,
+    pictures: Path,
+    work: Path,
+    n_pictures: int,
+    progress: Progress,
+    first_angle: float = FIRST_ANGLE,
 ) -> list[Any]:
     """The `pycolmap.Reconstruction`s that the database's matches allow, that of the most pictures first.
 
-    `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption
-    reaches it through its token, between one picture and the next.
+    `work`: a folder for COLMAP's own output. `first_angle`: degrees between the rays to most points from the
+    two pictures that a model begins with, at least. COLMAP runs in a thread of its own, so that an
+    interruption reaches it through its token, between one picture and the next.
     """
     pycolmap = pycolmap_module()
     options = pycolmap.IncrementalPipelineOptions()
@@ -168,6 +178,7 @@ def map_pictures(
     options.random_seed = 0
     options.min_model_size = 3
     options.extract_colors = False
+    options.mapper.init_min_tri_angle = first_angle
     token = pycolmap.CancellationToken()
     n_placed = 0
 

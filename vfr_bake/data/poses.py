@@ -26,6 +26,8 @@ from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches, stamp
 from vfr_bake.data.mapping import (
+    FIRST_ANGLE,
+    FIRST_ANGLE_OF_NEIGHBOURS,
     Pair,
     Sensor,
     map_pictures,
@@ -128,8 +130,8 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     `photos`: a folder with pictures in `images/` or in itself, or in folders within these, or a video, whose
     frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and
     left as it is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a
-    video, then `features`, `matches`, `cameras`; where those are folded also `walk`, `turns`, `cameras
-    again`), how much of it is done and how much there is.
+    video, then `features`, `matches`, `cameras`; where those are too few `neighbours first`, where they are
+    folded `walk`, `turns`, `cameras again`), how much of it is done and how much there is.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -250,11 +252,13 @@ def _placed(
     """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, with those
     joined into it that fit; if that is folded, others that are not."""
 
-    def built(some: Sequence[Pair], stage: str) -> list[Any]:
+    def built(some: Sequence[Pair], stage: str, first_angle: float = FIRST_ANGLE) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
-            found = map_pictures(database, place, Path(name), len(names), lambda *n: progress(stage, *n))
+            found = map_pictures(
+                database, place, Path(name), len(names), lambda *n: progress(stage, *n), first_angle
+            )
             found = joined(found, database, place)
         if found:
             refine_principal_points(found[0])
@@ -267,6 +271,10 @@ def _placed(
         return bool(models) and models[0].num_reg_images() >= _n_needed(len(names))
 
     models = built(pairs, "cameras")
+    if pairs and not enough(models):
+        # A handful of pictures depends on which two come first, and these are drawn by chance.
+        again = built(pairs, "neighbours first", FIRST_ANGLE_OF_NEIGHBOURS)
+        models = max(models, again, key=lambda found: found[0].num_reg_images() if found else 0)
     if not models or not n_torn(models):
         return models
     walk = built(near_pairs(pairs), "walk")

@@ -271,6 +271,24 @@ def test_three_pictures_must_all_find_their_place(can, tmp_path: Path):
     assert "of at least 3 of 3 pictures, got 0" in text
 
 
+def test_where_a_wide_pair_leads_nowhere_neighbours_come_first(
+    can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    wide = []
+
+    def map_pictures(*arguments):
+        if arguments[-1] == mapping.FIRST_ANGLE:
+            wide.append(arguments)
+            return []
+        return mapping.map_pictures(*arguments)
+
+    monkeypatch.setattr(poses, "map_pictures", map_pictures)
+    stages: list[str] = []
+    report = estimate_cameras(first_pictures(can, tmp_path, 4), lambda stage, *_: stages.append(stage))
+    assert report.n_registered == 4 and len(wide) == 1
+    assert stages[-1] == "neighbours first"
+
+
 def test_the_same_picture_again_and_again(tmp_path: Path):
     assert "got 6 times the same" in message(save(tmp_path, [textured(0)] * 6))
 
