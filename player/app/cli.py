@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 import threading
-import webbrowser
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -67,6 +65,9 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _open_page(arguments: argparse.Namespace) -> int:
     """Write the asset's page to a new temporary folder, and open it in a browser if there is a display."""
+    import tempfile
+    import webbrowser
+
     from player.files.files import write_bytes
     from player.page.page import page
 

@@ -27,6 +27,7 @@ from player.cameras import colmap
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras, write_cameras
 from player.progress import Bar
+from tests.vfr_bake.data.test_poses import similarity
 from vfr_bake.data.demo import trace
 from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.data.poses import estimate_cameras
@@ -76,10 +77,8 @@ def wall_texture(seed: int) -> np.ndarray:
 
 def room_picture(camera: Camera, walls: np.ndarray) -> np.ndarray:
     """The room alone, [height, width, 3] uint8; `walls`: [6, side, side, 3]."""
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    d = np.stack([(columns - camera.cx) / camera.fx, -(rows - camera.cy) / camera.fy, -np.ones_like(rows)])
-    d = (camera.c2w[:3, :3] @ d.reshape(3, -1)).astype(np.float32)
-    origin = ((camera.c2w[:3, 3] - CENTRE) / SCALE).astype(np.float32)[:, None]
+    rays_o, rays_d = camera.rays()
+    origin, d = ((rays_o[:1] - CENTRE) / SCALE).astype(np.float32).T, rays_d.T
     corner = np.where(d < 0, ROOM[0][:, None], ROOM[1][:, None]).astype(np.float32)
     with np.errstate(divide="ignore"):
         t = (corner - origin) / d
@@ -147,19 +146,15 @@ def errors(estimated: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
     >>> [float(error.max().round(6)) for error in errors(moved, known)]
     [0.0, 0.0]
     """
-    a, b = estimated[:, :3, 3], known[:, :3, 3]
-    spread = np.sqrt(((b - b.mean(axis=0)) ** 2).sum(axis=1).mean())
-    u, s, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    turn = (u * signs) @ vt
-    scale = (s * signs).sum() / ((a - a.mean(axis=0)) ** 2).sum()
-    places = scale * (a - a.mean(axis=0)) @ turn.T + b.mean(axis=0)
+    a, b = (cameras[:, :3, 3] - cameras[:, :3, 3].mean(axis=0) for cameras in (estimated, known))
+    scale, turn = similarity(a, b)
+    shares = np.linalg.norm(scale * a @ turn.T - b, axis=1) / np.sqrt((b**2).sum(axis=1).mean())
     # The mean turn between the two sets, which a similarity of places alone leaves less exact.
     u, _, vt = np.linalg.svd((known[:, :3, :3] @ estimated[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     common = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     between = known[:, :3, :3].transpose(0, 2, 1) @ common @ estimated[:, :3, :3]
     cosine = (np.trace(between, axis1=1, axis2=2) - 1) / 2
-    return np.rad2deg(np.arccos(cosine.clip(-1, 1))), np.linalg.norm(places - b, axis=1) / spread
+    return np.rad2deg(np.arccos(cosine.clip(-1, 1))), shares
 
 
 def compare(data: Path) -> None:

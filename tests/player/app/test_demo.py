@@ -26,11 +26,11 @@ def test_a_folder_of_that_name_is_another_asset(
 ) -> None:
     (tmp_path / "demo").symlink_to(shells_folder, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
-    sizes = []
+    said = []
     for name in ("demo", "./demo"):
         assert cli.main([name, "--info"]) == 0
-        sizes.append(capsys.readouterr().out)
-    assert sizes[0] != sizes[1]
+        said.append(capsys.readouterr().out)
+    assert said[0] != said[1]
 
 
 @pytest.mark.parametrize("display", ["", ":0"])
