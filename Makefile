@@ -24,7 +24,7 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium g
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check docs env format system-libraries other-programs clean \
+.PHONY: help demo test check docs env format system-libraries other-programs clean benchmarks \
   test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
 
 help:  ## say what there is
@@ -45,6 +45,9 @@ check: $(VENV)/.dev  ## style and types alone
 
 docs: $(VENV)/.docs  ## the manual as web pages, in build/docs
 	$(BIN)/python -m mkdocs build --strict --clean
+
+benchmarks: $(VENV)/.dev other-programs  ## every figure of the README and of docs/benchmarks.md: two and a half hours
+	$(BIN)/python -m tests.benchmarks
 
 # What takes too long for every change; CONTRIBUTING.md says how long each takes.
 test-all: test-pythons test-lowest test-wheel fuzz kill mutations processors  ## everything below: a day of one machine

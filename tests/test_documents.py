@@ -42,7 +42,7 @@ MANUAL = [document for document in DOCUMENTS if not document.startswith("docs/no
 """What speaks of today. A note says how something was measured on its day, and stays as it is."""
 USER_PAGES = (
     *("index", "install", "photographing", "train", "bake", "play", "page", "export", "python"),
-    *("conventions", "format", "troubleshooting", "benchmarks"),
+    *("conventions", "format", "troubleshooting", "trade", "benchmarks"),
 )
 OF_ANOTHER_TIME = (
     *(

@@ -14,11 +14,13 @@ compared the estimated cameras are moved by the similarity that brings their pla
 from __future__ import annotations
 
 import argparse
+import json
 import resource
 import shutil
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageFilter
@@ -113,10 +115,12 @@ def render_ring(folder: Path, n_views: int, width: int, height: int) -> None:
 
 
 class Stages:
-    """When every stage of an estimation began, by wall clock and processor time, printed as each ends."""
+    """What every stage of an estimation took, in seconds of the wall's clock and of processor time, printed
+    as each ends."""
 
     def __init__(self) -> None:
         self._stage, self._start = "", (time.perf_counter(), time.process_time())
+        self.seconds: dict[str, tuple[float, float]] = {}
 
     def __call__(self, stage: str, done: int, of: int) -> None:
         if stage != self._stage:
@@ -127,6 +131,8 @@ class Stages:
         now = (time.perf_counter(), time.process_time())
         if self._stage:
             wall, processor = now[0] - self._start[0], now[1] - self._start[1]
+            before = self.seconds.get(self._stage, (0.0, 0.0))
+            self.seconds[self._stage] = before[0] + wall, before[1] + processor
             print(f"{self._stage}: {wall:.0f} s, {processor:.0f} s of processor time", flush=True)
         self._start = now
 
@@ -157,8 +163,8 @@ def errors(estimated: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.rad2deg(np.arccos(cosine.clip(-1, 1))), shares
 
 
-def compare(data: Path) -> None:
-    """Print what the estimation of the cameras of a data set took, and how far off they are."""
+def compare(data: Path) -> dict[str, Any]:
+    """Print what the estimation of the cameras of a data set took, and how far off they are; returns it."""
     files = [data / name for name in ("transforms_train.json", "transforms.json") if (data / name).is_file()]
     cameras = {}
     with tempfile.TemporaryDirectory() as name:
@@ -175,14 +181,22 @@ def compare(data: Path) -> None:
         start = time.perf_counter()
         report = estimate_cameras(photos, stages)
         stages.end()
-        print(f"all: {time.perf_counter() - start:.0f} s, {time.process_time():.0f} s of processor time")
-        print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB")
+        found: dict[str, Any] = {
+            "seconds": time.perf_counter() - start,
+            "processor_seconds": time.process_time(),
+        }
+        found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        print(f"all: {found['seconds']:.0f} s, {found['processor_seconds']:.0f} s of processor time")
+        print(f"peak memory: {found['peak_mb'] / 1000:.2f} GB")
         print(report.summary())
         placed = colmap.read_views(photos / "sparse" / "0")
     known = np.stack([cameras[Path(camera.name).name] for camera in placed])
     degrees, shares = errors(np.stack([camera.c2w for camera in placed]), known)
     for what, off, unit in (("turns", degrees, "degrees"), ("places", 100 * shares, "% of their spread")):
-        print(f"{what}: off by {np.sqrt((off**2).mean()):.3f} {unit} (at most {off.max():.3f})")
+        found[what] = {"root_mean_square": float(np.sqrt((off**2).mean())), "greatest": float(off.max())}
+        print(f"{what}: off by {found[what]['root_mean_square']:.3f} {unit} (at most {off.max():.3f})")
+    found |= {"n_placed": len(placed), "n_pictures": len(cameras), "stages": stages.seconds}
+    return found
 
 
 def main() -> None:
@@ -196,11 +210,14 @@ def main() -> None:
     ring.add_argument("--size", type=int, nargs=2, default=(4000, 3000), metavar=("WIDTH", "HEIGHT"))
     comparing = commands.add_parser("compare", help="estimate cameras and compare them with the given ones")
     comparing.add_argument("data", type=Path)
+    comparing.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     if arguments.command == "ring":
         render_ring(arguments.folder, arguments.views, *arguments.size)
-    else:
-        compare(arguments.data)
+        return
+    found = compare(arguments.data)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ and PSNR on held-out views.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("--batch-samples", type=int, help="objects: samples in a batch")
     parser.add_argument("--step-cells", type=float, help="objects: length of a march step, in cells")
     parser.add_argument("--views", type=int, default=25)
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     scene = load_scene(options.data, downscale=options.downscale)
     runs = {kind: Turns(scene, kind, options) for kind in KINDS}
@@ -63,12 +65,17 @@ def main() -> None:
                 run.advance(5.0)
     print("| compositing | steps | steps/s | PSNR, dB |")
     print("|---|---|---|---|")
+    found = {}
     for kind, run in runs.items():
         trainer = run.trainer
         scores = evaluate(trained_model(trainer, scene, {}), scene.test, options.views)
         rate = trainer.next_step / trainer.seconds
-        psnr = np.mean([score.psnr for score in scores])
+        psnr = float(np.mean([score.psnr for score in scores]))
+        found[kind] = {"steps": trainer.next_step, "steps_a_second": rate, "psnr": psnr}
+        found[kind] |= {"minutes": options.minutes, "n_views": len(scores)}
         print(f"| {kind} | {trainer.next_step} | {rate:.2f} | {psnr:.2f} |", flush=True)
+    if options.json is not None:
+        options.json.write_text(json.dumps(found), encoding="utf-8")
 
 
 if __name__ == "__main__":

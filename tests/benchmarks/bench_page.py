@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import json
 import os
 import statistics
 import tempfile
@@ -21,7 +22,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,6 +92,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=400, help="pixels along the longer edge")
     parser.add_argument("--views", type=int, default=3, help="cameras of the asset, evenly spread")
     parser.add_argument("--rounds", type=int, default=2, help="pictures of each, of which the fastest counts")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     asset = Asset.open(arguments.asset)
     every = read_cameras(asset.path("cameras.json"))
@@ -105,23 +107,28 @@ def main() -> None:
         times = page.page.evaluate("() => times")
         begin = time.perf_counter()
         page.picture(cameras[0], quality="exact")
-        drawn = time.perf_counter() - begin
-        print(f"{arguments.asset}: first picture after {times['uploaded'] / 1000 + drawn:.1f} s, of which")
+        first = times["uploaded"] / 1000 + time.perf_counter() - begin
+        print(f"{arguments.asset}: first picture after {first:.1f} s, of which")
         print(
             "  milliseconds after the page was opened: "
             + ", ".join(f"{n} {ms:.0f}" for n, ms in times.items())
         )
-        report_counts(asset, page, cameras)
-        report_times(asset, page, cameras, arguments.rounds)
+        found = {"n_bytes": (Path(folder) / "scene.html").stat().st_size, "first_picture_s": first}
+        found |= {"size": arguments.size, "counts": report_counts(asset, page, cameras)}
+        found["times"] = report_times(asset, page, cameras, arguments.rounds)
         page.close()
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found), encoding="utf-8")
 
 
-def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> None:
+def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict[str, Any]:
+    """Print what the page holds and does for a pixel; returns it."""
     info = page.page.evaluate("() => vfr.info")
     share = 0.0
     print(f"  {info['gpuBytes'] / 1e6:.0f} MB of graphics memory, {info['renderer']}")
     with Renderer(asset, 2) as player:
         n_samples = np.mean([player.render(camera).n_density_samples.mean() for camera in cameras])
+    found: dict[str, Any] = {"gpu_bytes": info["gpuBytes"], "renderer": info["renderer"]}
     print("  quality   fetches a pixel   a pixel that is hit   pixels hit   multiply-adds a pixel")
     for quality in QUALITIES:
         rows = []
@@ -136,15 +143,21 @@ def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> None
             f"  {quality:8} {marched:9.1f} + {weights:.0f} {per_hit:17.1f} {100 * hit:15.1f} % "
             f"{hit * info['multiplyAdds']:18.0f}"
         )
+        found[quality] = {"fetches": marched, "weights": weights, "multiply_adds": hit * info["multiplyAdds"]}
         share = hit
     for name, (fetches, multiply_adds) in OTHERS.items():
+        found[name] = {"fetches": n_samples * fetches, "multiply_adds": share * multiply_adds}
         print(
             f"  {name:8} {n_samples * fetches:9.1f}       {n_samples * fetches / share:17.1f} "
             f"{'':17} {share * multiply_adds:18.0f}   (filtered, on the same {n_samples:.1f} samples a pixel)"
         )
+    return found
 
 
-def report_times(asset: Asset, page: RenderPage, cameras: list[Camera], n_rounds: int) -> None:
+def report_times(
+    asset: Asset, page: RenderPage, cameras: list[Camera], n_rounds: int
+) -> dict[str, dict[str, float]]:
+    """Print what a picture of each quality takes, beside `vfr-play`; returns it in milliseconds."""
     processes = family(os.getpid())
     processes.remove(os.getpid())
 
@@ -152,6 +165,7 @@ def report_times(asset: Asset, page: RenderPage, cameras: list[Camera], n_rounds
         return processor_seconds(processes)
 
     print("  milliseconds a picture, wall and processor: the page, vfr-play, times as much")
+    found = {}
     with Renderer(asset, 2) as player:
         player.render(cameras[0])
         for quality in QUALITIES:
@@ -169,10 +183,13 @@ def report_times(asset: Asset, page: RenderPage, cameras: list[Camera], n_rounds
             wall, used, player_wall, player_used = (
                 1000 * statistics.mean(c) for c in zip(*rows, strict=True)
             )
+            found[quality] = {"wall": wall, "processor": used, "player_wall": player_wall}
+            found[quality]["player_processor"] = player_used
             print(
                 f"  {quality:8} {wall:7.0f} {used:7.0f}   {player.march} {player_wall:6.0f}"
                 f" {player_used:6.0f}   {wall / player_wall:5.1f} {used / player_used:5.1f}"
             )
+    return found
 
 
 if __name__ == "__main__":

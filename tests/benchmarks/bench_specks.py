@@ -13,6 +13,7 @@ one. `--pictures` writes the worst places eight times as large: played, model, s
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,7 @@ from vfr_bake.bench.specks import speck_mask
 from vfr_bake.data import load_scene, reader_as
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model, load_model
-from vfr_bake.training.scores.metrics import over_background
+from vfr_bake.training.scores.metrics import over_background, to_8_bit
 
 THRESHOLDS = (0.05, 0.1, 0.2)
 AROUND, TIMES = 12, 8
@@ -40,12 +41,13 @@ AROUND, TIMES = 12, 8
 
 
 def test_views(asset: Asset, data: Path) -> tuple[list[Camera], list[np.ndarray]]:
-    """Test cameras of a data set, world frame, and their photographs over the asset's background."""
+    """Test cameras of a data set, world frame, and their photographs in 8 bits over the asset's
+    background."""
     reader = reader_as(asset.manifest.provenance.get("train", {}))
     scene = load_scene(str(data), reader=reader)
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]
     background = np.array(asset.manifest.background, np.float32)
-    return cameras, [over_background(image, background) for image in scene.test.images]
+    return cameras, [to_8_bit(over_background(image, background)) / 255 for image in scene.test.images]
 
 
 def models_own(model: Model, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -116,6 +118,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, help="folder of the data set; its test views are looked at")
     parser.add_argument("--views", type=int, default=10, help="views, spread over all")
     parser.add_argument("--pictures", type=Path, help="folder for the worst places")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
     if arguments.model is None and arguments.data is None:
         parser.error("expected --model, --data or both")
@@ -152,6 +155,10 @@ def main() -> int:
     print(f"{'':32}" + "".join(f"{f't = {threshold:g}':>10}" for threshold in THRESHOLDS))
     for name, count in counts.items():
         print(f"{name:32}" + "".join(f"{value * 1e6 / n_pixels:10.0f}" for value in count))
+    if arguments.json is not None:
+        rates = {name: (count * 1e6 / n_pixels).tolist() for name, count in counts.items()}
+        found = {"thresholds": THRESHOLDS, "in_a_million": rates, "n_views": len(chosen), "against": against}
+        arguments.json.write_text(json.dumps(found), encoding="utf-8")
     total = max(int(counts["as played"][THRESHOLDS.index(0.1)]), 1)
     print(f"at t = 0.1: {n_parts} parts of {total} pixels, {lighter / total:.0%} lighter than they should be")
     if model is not None:

@@ -158,10 +158,14 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--downscale", type=int, default=1, help="factor that pictures are reduced by")
     parser.add_argument("--settings", default="{}", help="training settings, as JSON")
-    found = measure(parser.parse_args())
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args()
+    found = measure(options)
     print(f"| | {' | '.join(found)} |\n|---|{'---|' * len(found)}")
     for key in found["this version"]:
         print(f"| {key} | {' | '.join(f'{each.get(key, 0):.4g}' for each in found.values())} |")
+    if options.json is not None:
+        options.json.write_text(json.dumps(found), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,128 @@
+"""Cells, rows and tables in Markdown, and what is told of figures that are not there."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from tests.benchmarks.suite.conditions import QUIET
+from tests.benchmarks.suite.parts import PARTS
+from tests.benchmarks.suite.results import Results
+
+Block = Callable[[Results], list[str]]
+"""Makes the lines of a block from the results."""
+
+
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """
+    >>> table(["a", "b"], [["1", "2"]])
+    ['| a | b |', '|---|---|', '| 1 | 2 |']
+    """
+    lines = [f"| {' | '.join(row)} |" for row in (titles, *rows)]
+    return [lines[0], f"|{'---|' * len(titles)}", *lines[1:]]
+
+
+def number(value: float | None, digits: int, unit: str = "") -> str:
+    """
+    >>> number(1234.56, 1), number(None, 1), number(0.004, 2, " dB")
+    ('1,234.6', '', '0.00 dB')
+    """
+    if value is None:
+        return ""
+    text = f"{value:,.{digits}f}"
+    return (text if float(text.replace(",", "")) else text.lstrip("-")) + unit
+
+
+def give_or_take(value: float | None, uncertainty: float | None, digits: int) -> str:
+    """
+    >>> give_or_take(12.34, 0.26, 1), give_or_take(12.34, None, 1)
+    ('12.3 ± 0.3', '12.3')
+    """
+    if value is None or uncertainty is None:
+        return number(value, digits)
+    return f"{number(value, digits)} ± {number(uncertainty, digits)}"
+
+
+def rate(ms: float, uncertainty: float) -> str:
+    """Frames a second, from milliseconds a frame.
+
+    >>> rate(80, 2), rate(700, 7)
+    ('12.5 ± 0.3', '1.43 ± 0.01')
+    """
+    a_second = 1000 / ms
+    return give_or_take(a_second, a_second * uncertainty / ms, 1 if a_second >= 10 else 2)
+
+
+def duration(seconds: float) -> str:
+    """
+    >>> duration(59.6), duration(600), duration(0.04)
+    ('60 s', '10.0 min', '0.04 s')
+    """
+    if seconds >= 300:
+        return f"{seconds / 60:.1f} min"
+    return (
+        f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1g} s" if seconds < 0.1 else f"{seconds:.1f} s"
+    )
+
+
+def megabytes(n_bytes: float) -> str:
+    """
+    >>> megabytes(4.94e6), megabytes(143.2e6)
+    ('4.9', '143')
+    """
+    return f"{n_bytes / 1e6:.{1 if n_bytes < 1e8 else 0}f}"
+
+
+def gigabytes(mb: float) -> str:
+    return f"{mb / 1000:.1f} GB"
+
+
+def machines(results: Results) -> list[dict[str, Any]]:
+    """The machines of all parts, each once; A is the first."""
+    found: list[dict[str, Any]] = []
+    for part in results.values():
+        if part["machine"] not in found:
+            found.append(part["machine"])
+    return found
+
+
+def letter(index: int) -> str:
+    return chr(ord("A") + index)
+
+
+def where(results: Results, name: str) -> str:
+    """Machine and commit of a part; * where other programs took more than counts as quiet."""
+    part = results[name]
+    beside = "*" if max(part["others"], part["others_before"]) > QUIET else ""
+    return f"{letter(machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
+
+
+def present(results: Results, names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """The parts that are there, and those that are not."""
+    names = list(names)
+    return [name for name in names if name in results], [name for name in names if name not in results]
+
+
+def missing(names: Sequence[str]) -> list[str]:
+    """The line that names the command for figures that are not there, behind a blank one."""
+    if not names:
+        return []
+    if all(PARTS[name].core for name in names):
+        return ["", f"Not measured yet: {', '.join(names)} (`make benchmarks`)."]
+    return ["", f"Not measured yet: `python -m tests.benchmarks --only {' '.join(names)}`."]
+
+
+def titled(titles: Sequence[str], rows: Sequence[Sequence[str]], lacking: Sequence[str]) -> list[str]:
+    """A table if it has a row, and the line about parts that are not there."""
+    lines = [*(table(titles, rows) if rows else []), *missing(lacking)]
+    return lines if rows else lines[1:]
+
+
+def command(results: Results, name: str, starts: str) -> str:
+    """The first command of a part that starts so, without what only says where its figures go."""
+    words = shlex.split(next(line for line in results[name]["commands"] if line.startswith(starts)))
+    if "--json" in words:
+        at = words.index("--json")
+        del words[at : at + 2]
+    return f"`{shlex.join(words)}`"

@@ -1,0 +1,57 @@
+"""The documents that have figures of the benchmarks: each between two comments, and made from the results.
+
+<!-- benchmarks: NAME -->
+what `BLOCKS[NAME]` makes of the results
+<!-- /benchmarks -->
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from player.files.files import write_bytes
+from tests.benchmarks.pages import tables, trade
+from tests.benchmarks.pages.plots import plots
+from tests.benchmarks.suite.conditions import REPOSITORY
+from tests.benchmarks.suite.results import Results
+
+BLOCKS = tables.BLOCKS | trade.BLOCKS
+DOCUMENTS = ("README.md", "docs/benchmarks.md", "docs/trade.md")
+BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)", re.DOTALL)
+
+
+def rendered(text: str, results: Results) -> str:
+    """A document with its blocks made anew. Raises KeyError for a block that nobody knows."""
+
+    def block(found: re.Match[str]) -> str:
+        lines = BLOCKS[found[2]](results)
+        return "\n".join([found[1], *lines, "", found[3]])
+
+    return BLOCK.sub(block, text)
+
+
+def prose(text: str) -> str:
+    """A document without its blocks."""
+    return BLOCK.sub("", text)
+
+
+def rendered_files(results: Results) -> dict[Path, bytes]:
+    """What each file is, documents and plots."""
+    files = {}
+    for name in DOCUMENTS:
+        path = REPOSITORY / name
+        files[path] = rendered(path.read_text(encoding="utf-8"), results).encode()
+    for name, picture in plots(results).items():
+        files[REPOSITORY / "docs" / name] = picture.encode()
+    return files
+
+
+def render_all(results: Results) -> list[Path]:
+    """Write what is not yet so; returns it."""
+    written = []
+    for path, data in rendered_files(results).items():
+        if not path.is_file() or path.read_bytes() != data:
+            write_bytes(path, data)
+            written.append(path)
+    return written

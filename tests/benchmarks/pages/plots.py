@@ -1,0 +1,42 @@
+"""The plots of docs/trade.md, as SVG."""
+
+from __future__ import annotations
+
+from tests.benchmarks.suite.results import Results
+from tests.benchmarks.suite.scenes import SCENES
+from vfr_bake.bench.plot import Mark, plot
+
+FILE = 'xmlns="http://www.w3.org/2000/svg" font-family="sans-serif" font-size="13" style="background:#fff"'
+"""What an SVG file has beside an SVG inside of a page."""
+
+
+def plot_name(scene: str) -> str:
+    """The file in docs/."""
+    return f"trade_{scene}.svg"
+
+
+def plots(results: Results) -> dict[str, str]:
+    """Those of the scenes that are there, by the name of the file."""
+    names = {scene: f"trade_{scene}" for scene in (*SCENES, "dials")}
+    return {plot_name(scene): _plot(results, scene) for scene, name in names.items() if name in results}
+
+
+def _plot(results: Results, scene: str) -> str:
+    """PSNR against frames a second; the area of a mark is the asset's share of the largest one's bytes."""
+    figures = results[f"trade_{scene}"]["figures"]
+    size = SCENES["lego" if scene == "dials" else scene].size
+    rows = [row for row in figures["settings"] if row["asset"] is not None]
+    most = max(row["n_bytes"] for row in rows)
+    series: dict[str, list[Mark]] = {}
+    for row in rows:
+        times = row["times"].get(size) or next(iter(row["times"].values()))
+        k, megabytes = row["n_fetches"] or "all", row["n_bytes"] / 1e6
+        rate = 1000 / times["median"]
+        label = (
+            f"k = {k}, {row['quality']}: {row['scores']['psnr']:.2f} dB, {rate:.3g} frames a second, "
+            f"{megabytes:.1f} MB"
+        )
+        mark = Mark(rate, row["scores"]["psnr"], row["n_bytes"] / most, label, row["on_front"])
+        series.setdefault(f"{row['asset'].rpartition('_')[2]}, {megabytes:.1f} MB", []).append(mark)
+    picture = plot(series, f"frames a second, {size}", "PSNR, dB")
+    return picture.replace("<svg ", f"<svg {FILE} ", 1) + "\n"

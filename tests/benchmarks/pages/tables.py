@@ -1,0 +1,414 @@
+"""The tables of docs/benchmarks.md and of the README."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.pages.cells import (
+    Block,
+    command,
+    duration,
+    gigabytes,
+    give_or_take,
+    letter,
+    machines,
+    megabytes,
+    missing,
+    number,
+    present,
+    rate,
+    titled,
+    where,
+)
+from tests.benchmarks.suite.parts import LIMITS_MB, MINUTES, PRESETS, REFINED_AT, SEEDS
+from tests.benchmarks.suite.played import LOOKUPS
+from tests.benchmarks.suite.results import Results
+from tests.benchmarks.suite.scenes import SCENES
+
+BAKES = [f"bake_{scene}_{preset}" for scene, presets in PRESETS.items() for preset in presets]
+VERSIONS = ("python", "numpy", "numba", "onnxruntime", "torch")
+"""Libraries whose versions are shown, of those that the results have."""
+QUALITIES = ("exact", "high", "fast")
+
+
+def asset_name(part: str) -> str:
+    """
+    >>> asset_name("bake_lego_balanced"), asset_name("dial_lego_head32")
+    ('lego, balanced', 'lego, head32')
+    """
+    _, scene, what = part.split("_", 2)
+    return f"{scene}, {what}"
+
+
+def own_setting(results: Results, part: str, quality: str = "exact") -> dict[str, Any] | None:
+    """The row of the trade that plays a baked asset with its own number of lookups."""
+    for name, result in results.items():
+        if name.startswith("trade_"):
+            for row in result["figures"]["settings"]:
+                own = row["what"].get("n_fetches") == row["n_fetches"]
+                if row["asset"] == part and row["quality"] == quality and own:
+                    return row
+    return None
+
+
+def frame_of(row: dict[str, Any], size: str) -> dict[str, Any]:
+    """The times of a row's frames of a size; of the first one where that was not timed."""
+    return row["times"].get(size) or next(iter(row["times"].values()))
+
+
+def machine_table(results: Results) -> list[str]:
+    rows = []
+    for index, machine in enumerate(machines(results)):
+        parts = [part for part in results.values() if part["machine"] == machine]
+        versions = [(name, {part["libraries"][name] for part in parts}) for name in VERSIONS]
+        told = ", ".join(f"{name} {' and '.join(sorted(some))}" for name, some in versions)
+        dates = sorted({part["date"] for part in parts})
+        days = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+        row = [letter(index), machine["processor"], f"{machine['cores']}, {machine['memory_gb']} GB"]
+        rows.append([*row, " ".join(machine["features"]), told, days])
+    titles = ["name", "processor", "cores, memory", "features", "versions", "measured on"]
+    return titled(titles, rows, []) if rows else missing(["train_lego"])[1:]
+
+
+def training(results: Results) -> list[str]:
+    there, lacking = present(results, [f"train_{name}" for name in SCENES])
+    rows = []
+    for name in there:
+        figures, scored = results[name]["figures"], f"eval_{name[6:]}"
+        score = ""
+        if scored in results:
+            found = results[scored]["figures"]
+            mean = give_or_take(found["psnr"], found["psnr_uncertainty"], 2)
+            score = f"**{mean} dB** ({found['n_views']} views), SSIM {found['ssim']:.3f}"
+        else:
+            lacking.append(scored)
+        took = f"{duration(figures['training_seconds'])} training, {duration(figures['seconds'])} in all; "
+        row = [name[6:], command(results, name, "vfr-train"), where(results, name), f"{figures['steps']:,}"]
+        rows.append([*row, took + gigabytes(figures["peak_mb"]), score])
+    titles = ["data", "command", "machine, commit", "steps", "time, memory", "PSNR of the held-out views"]
+    return titled(titles, rows, lacking)
+
+
+def minutes(results: Results) -> list[str]:
+    names = {**{f"{m:g}": f"lego_{m:g}" for m in MINUTES}, "9.25": "lego"}
+    needed = [f"{kind}_{name}" for name in names.values() for kind in ("train", "eval")]
+    _, lacking = present(results, needed)
+    if lacking:
+        return missing(lacking)[1:]
+    steps = [f"{results[f'train_{name}']['figures']['steps']:,}" for name in names.values()]
+    scores = [f"{results[f'eval_{name}']['figures']['psnr']:.2f}" for name in names.values()]
+    return titled(["minutes", *names], [["steps", *steps], ["PSNR, dB", *scores]], [])
+
+
+def compositing(results: Results) -> list[str]:
+    there, lacking = present(results, ["compositing_lego"])
+    rows = []
+    for name in there:
+        features, colours = (results[name]["figures"][kind] for kind in ("features", "colour"))
+        row = [f"lego, {features['minutes']:g} minutes", where(results, name)]
+        row += [f"{some['psnr']:.2f} dB ({some['n_views']} views)" for some in (features, colours)]
+        rows.append([*row, f"{features['steps'] / colours['steps']:.1f} times as many"])
+    titles = ["data", "machine, commit", "features", "colours", "steps of features in equal time"]
+    return titled(titles, rows, lacking)
+
+
+def step(results: Results) -> list[str]:
+    there, lacking = present(results, ["steps_lego"])
+    rows = [
+        [part, f"{value:.3g}"]
+        for name in there
+        for part, value in results[name]["figures"]["this version"].items()
+        if "times this version's" not in part
+    ]
+    return titled(["a step of lego on two threads", "milliseconds, or number"], rows, lacking)
+
+
+def cameras(results: Results) -> list[str]:
+    told = {
+        "cameras_lego": "lego_800_train, a rendered object on nothing",
+        "cameras_fox": "fox",
+        "cameras_ring": "a rendered ring of 300 views of 12 megapixels",
+    }
+    there, lacking = present(results, told)
+    rows = []
+    for name in there:
+        found = results[name]["figures"]
+        stages = ", ".join(f"{stage} {duration(some[0])}" for stage, some in found["stages"].items())
+        off = [
+            f"{found[what]['root_mean_square']:.3f}{unit} (at most {found[what]['greatest']:.3f})"
+            for what, unit in (("places", " %"), ("turns", ""))
+        ]
+        took = f"{duration(found['seconds'])} ({stages}); {gigabytes(found['peak_mb'])}"
+        placed = f"{found['n_placed']} of {found['n_pictures']}"
+        rows.append([told[name], where(results, name), took, placed, *off])
+    titles = [
+        "data",
+        "machine, commit",
+        "time, memory",
+        "placed",
+        "places, of their spread",
+        "turns, degrees",
+    ]
+    return titled(titles, rows, lacking)
+
+
+def baking(results: Results) -> list[str]:
+    there, lacking = present(results, BAKES)
+    rows = []
+    for name in there:
+        found, played = results[name]["figures"], own_setting(results, name)
+        row = [
+            asset_name(name),
+            where(results, name),
+            f"{found['resolution']}, {found['feature_resolution']}",
+        ]
+        row += [f"{found['n_channels']}, {found['n_fetches']}", f"{found['n_vertices'] / 1e6:.1f} M"]
+        row += [f"**{megabytes(found['n_bytes'])}**", duration(found["seconds"]), gigabytes(found["peak_mb"])]
+        row += [f"{found['samples_median']:.0f}, {found['samples_p95']:.0f}"]
+        row += [give_or_take(found["loss_db"], found["loss_db_spread"], 2)]
+        rows.append([*row, number(played and played["scores"]["loss_db"], 2)])
+    titles = ["data, preset", "machine, commit", "cells an axis: densities, features", "channels, lookups"]
+    titles += ["vertices", "MB", "time", "memory", "samples a ray", "lost on witnesses, dB"]
+    return titled([*titles, "lost on test views, dB"], rows, lacking)
+
+
+def curve(results: Results) -> list[str]:
+    names = [*(f"bytes_lego_{mb}" for mb in LIMITS_MB), "bake_lego_balanced"]
+    there, lacking = present(results, names)
+    rows = []
+    for name in sorted(there, key=lambda name: results[name]["figures"]["n_bytes"]):
+        found = results[name]["figures"]
+        asked = f"at most {name.rpartition('_')[2]} MB" if name.startswith("bytes") else "no limit"
+        row = [asked, where(results, name), megabytes(found["n_bytes"])]
+        row += [f"{found['resolution']}, {found['feature_resolution']}", f"{found['n_channels']}"]
+        lost = give_or_take(found["loss_db"], found["loss_db_spread"], 2)
+        rows.append([*row, lost, number(found["psnr_to_model"], 1)])
+    titles = ["asked", "machine, commit", "MB", "cells an axis", "channels", "lost, dB", "dB to the model"]
+    return titled(titles, rows, lacking)
+
+
+def ours(results: Results) -> list[str]:
+    there, lacking = present(results, ["bake_lego_balanced", "bake_fox_balanced"])
+    rows = []
+    for name in there:
+        found = results[name]["figures"]
+        lost = f"loses {give_or_take(found['loss_db'], found['loss_db_spread'], 2)} dB"
+        rows.append([asset_name(name), lost, f"{megabytes(found['n_bytes'])} MB", "any CPU; browser"])
+    return titled(["ours", "PSNR", "bytes", "plays on"], rows, lacking)
+
+
+def expected_lookups(results: Results) -> list[str]:
+    there, lacking = present(results, [name for name in BAKES if name.endswith("balanced")])
+    ks = [k for k in LOOKUPS if any(k in results[name]["figures"]["lookups"] for name in there)]
+    rows = []
+    for name in there:
+        found = results[name]["figures"]
+        losses = [number(found["lookups"].get(k), 2) for k in ks]
+        samples = f"{found['samples_median']:.0f}, {found['samples_p95']:.0f}"
+        rows.append([asset_name(name), where(results, name), samples, *losses])
+    return titled(["asset", "machine, commit", "samples a ray", *ks], rows, lacking)
+
+
+def lookups(results: Results) -> list[str]:
+    there, lacking = present(results, ["lookups_lego", "lookups_fox"])
+    ks = [k for k in LOOKUPS if k != "0"]
+    rows = [row for name in there for row in _lookup_rows(name, results[name]["figures"], ks)]
+    return titled(["scene, refined for", *ks], rows, lacking)
+
+
+def _lookup_rows(name: str, found: dict[str, Any], ks: list[str]) -> list[list[str]]:
+    """Mean loss over views and seeds, give or take what the views leave open, and the range of the seeds."""
+    scene = name.partition("_")[2]
+    rows = []
+    every = {seed: np.array(found[f"every, seed {seed}"]["0"]) for seed in SEEDS}
+    for refined, asked in REFINED_AT.items():
+        cells = []
+        for k in ks:
+            if asked not in ("0", k):
+                cells.append("")
+                continue
+            lost = np.array([every[s] - np.array(found[f"{refined}, seed {s}"][k]) for s in SEEDS])
+            views, seeds = lost.mean(axis=0), lost.mean(axis=1)
+            spread = 1.96 * views.std(ddof=1) / len(views) ** 0.5
+            seen = f"({number(seeds.min(), 2)} to {number(seeds.max(), 2)})"
+            cells.append(f"{give_or_take(lost.mean(), spread, 2)} {seen}")
+        told = "every sample" if asked == "0" else f"{asked} lookups"
+        rows.append([f"{scene}, {told}", *cells])
+    return rows
+
+
+def page(results: Results) -> list[str]:
+    there, lacking = present(results, ["page"])
+    rows = []
+    for name in there:
+        for asset, found in results[name]["figures"].items():
+            counts, times = found["counts"], found["times"]["fast"]
+            exact = counts["exact"]
+            cost = f"{exact['fetches']:.0f} + {exact['weights']:.0f}, {exact['multiply_adds']:,.0f}"
+            merf, smerf = (
+                f"{some['fetches']:.0f}, {some['multiply_adds']:.0f}"
+                for some in (counts["MERF"], counts["SMERF"])
+            )
+            row = [asset_name(asset), where(results, name), f"{found['n_bytes'] / 1e6:.1f} MB"]
+            row += [
+                f"{counts['gpu_bytes'] / 1e6:.0f} MB",
+                cost,
+                f"{merf}; {smerf}",
+                f"{found['first_picture_s']:.1f} s",
+            ]
+            more = times["processor"] / times["player_processor"]
+            row += [
+                f"{times['processor']:.0f} ms",
+                f"{times['player_processor']:.0f} ms: {more:.1f} times less",
+            ]
+            rows.append(row)
+    titles = ["asset", "machine, commit", "page", "graphics memory", "fetches, multiply-adds a pixel"]
+    titles += ["MERF; SMERF", "first picture", "a picture, `fast`", "`vfr-play`, exact, with numba"]
+    return titled(titles, rows, lacking)
+
+
+def playing(results: Results) -> list[str]:
+    """Frames a second by march and quality."""
+    there, lacking = present(results, ["play_lego", "play_fox"])
+    rows = []
+    for name in there:
+        for asset, found in results[name]["figures"].items():
+            size = "x".join(map(str, found["size"]))
+            for march in ("numba", "numpy"):
+                some = {row["quality"]: row for row in found["rows"] if row["march"] == march}
+                rates = [rate(some[q]["ms"], some[q]["uncertainty"]) for q in QUALITIES]
+                memory = gigabytes(max(row["peak_mb"] for row in some.values()))
+                lost = [
+                    f"{number(found['losses'][q]['loss_db'], 2)}, {number(found['losses'][q]['worst_db'], 2)}"
+                    for q in QUALITIES[1:]
+                ]
+                row = [f"{asset_name(asset)}, {size}", march, where(results, name), *rates, memory]
+                rows.append([*row, *(lost if march == "numba" else ["", ""])])
+    titles = ["asset, size", "march", "machine, commit", *QUALITIES, "memory"]
+    return titled([*titles, "`high` loses, dB", "`fast` loses, dB"], rows, lacking)
+
+
+def frame_parts(results: Results) -> list[str]:
+    """Where the time of an exact frame goes, and how long the first picture takes."""
+    needed = [f"trade_{scene}" for scene in SCENES]
+    there, lacking = present(results, needed)
+    rows = []
+    for name in there:
+        size = SCENES[name[6:]].size
+        for part in (f"bake_{name[6:]}_{preset}" for preset in PRESETS[name[6:]]):
+            row = own_setting(results, part)
+            if row is None:
+                continue
+            times = frame_of(row, size)
+            parts = [number(times[key], 0) for key in ("march", "lookups", "head")]
+            cells = [f"{asset_name(part)}, {size}", where(results, name)]
+            cells += [give_or_take(times["median"], times["uncertainty"], 0), *parts]
+            rows.append([*cells, f"{row['first_picture_ms'] / 1000:.1f} s", gigabytes(row["peak_mb"])])
+    titles = ["asset, size", "machine, commit", "ms a frame", "march", "lookups", "head"]
+    return titled([*titles, "first picture", "memory"], rows, lacking)
+
+
+def exporting(results: Results) -> list[str]:
+    there, lacking = present(results, ["export_lego"])
+    rows = []
+    for name in there:
+        for file, found in results[name]["figures"].items():
+            times = found["seconds"]
+            words = f"vfr-export out/ {file} {found['options']}".strip()
+            took = duration(times["median"])
+            if times["n"] > 1:
+                took += f" ({times['low']:.1f} to {times['high']:.1f})"
+            row = [f"`{words}`", where(results, name), took, duration(found["processor_seconds"]["median"])]
+            rows.append([*row, gigabytes(found["peak_mb"]), megabytes(found["n_bytes"])])
+    titles = ["command", "machine, commit", "time", "processor time", "memory", "MB"]
+    return titled(titles, rows, lacking)
+
+
+def specks(results: Results) -> list[str]:
+    there, lacking = present(results, ["specks_lego"])
+    rows = []
+    for name in there:
+        found = results[name]["figures"]
+        for variant, counts in found["in_a_million"].items():
+            rows.append([variant, *(f"{count:.0f}" for count in counts)])
+    titles = ["specks of lego, balanced, in a million pixels", "by 0.05", "by 0.1", "by 0.2"]
+    return titled(titles, rows, lacking)
+
+
+def expect(results: Results) -> list[str]:
+    """The README's table."""
+    needed = [
+        "train_lego",
+        "eval_lego",
+        "bake_lego_balanced",
+        "bake_lego_fast",
+        "page",
+        "trade_lego",
+        "play_lego",
+    ]
+    _, lacking = present(results, needed)
+    if lacking:
+        return missing(lacking)[1:]
+    trained, score = results["train_lego"]["figures"], results["eval_lego"]["figures"]
+    balanced, fast = (results[f"bake_lego_{preset}"]["figures"] for preset in ("balanced", "fast"))
+    pages, machine = results["page"]["figures"], results["train_lego"]["machine"]
+    lost = {preset: own_setting(results, f"bake_lego_{preset}") for preset in ("balanced", "fast")}
+    losses = {preset: number(row and row["scores"]["loss_db"], 2, " dB") for preset, row in lost.items()}
+    played = results["play_lego"]["figures"]
+    rates = {
+        f"{preset}{'' if q == 'exact' else f', `--quality {q}`'}": next(
+            1000 / row["ms"]
+            for row in played[f"bake_lego_{preset}"]["rows"]
+            if row["march"] == "numba" and row["quality"] == q
+        )
+        for preset, q in (
+            ("balanced", "exact"),
+            ("balanced", "fast"),
+            ("fidelity", "exact"),
+            ("fast", "exact"),
+        )
+    }
+    told = ", ".join(f"{name} {number(value, 0 if value >= 10 else 1)}" for name, value in rates.items())
+    page_mb = pages["bake_lego_balanced"]["n_bytes"] / 1e6
+    rows = [
+        [
+            "`vfr-train --minutes 9.25`",
+            f"{trained['seconds'] / 60:.1f} minutes, {score['psnr']:.2f} dB mean PSNR on all "
+            f"{score['n_views']} test views",
+        ],
+        [
+            "`vfr-bake`, preset balanced",
+            f"{balanced['seconds'] / 60:.1f} minutes, {megabytes(balanced['n_bytes'])} MB; as a page "
+            f"{page_mb:.1f} MB",
+        ],
+        [
+            "lost by baking, against the photographs",
+            f"balanced {losses['balanced']}; fast, in {megabytes(fast['n_bytes'])} MB, {losses['fast']}",
+        ],
+        ["`vfr-play` at 800x800, frames a second", told],
+    ]
+    on = f"{machine['cores']} cores of an {machine['processor']}"
+    return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {on}:", "", *titled(["what", "figure"], rows, [])]
+
+
+BLOCKS: dict[str, Block] = {
+    "machines": machine_table,
+    "training": training,
+    "minutes": minutes,
+    "compositing": compositing,
+    "step": step,
+    "cameras": cameras,
+    "baking": baking,
+    "bytes": curve,
+    "ours": ours,
+    "expected-lookups": expected_lookups,
+    "lookups": lookups,
+    "page": page,
+    "playing": playing,
+    "frame-parts": frame_parts,
+    "exporting": exporting,
+    "specks": specks,
+    "expect": expect,
+}

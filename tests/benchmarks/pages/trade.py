@@ -1,0 +1,155 @@
+"""The tables of docs/trade.md: what speed and bytes cost, and what to choose when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+from tests.benchmarks.pages.cells import (
+    Block,
+    give_or_take,
+    megabytes,
+    missing,
+    number,
+    present,
+    rate,
+    titled,
+    where,
+)
+from tests.benchmarks.pages.plots import plot_name
+from tests.benchmarks.pages.tables import asset_name, frame_of
+from tests.benchmarks.suite.results import Results
+from tests.benchmarks.suite.scenes import SCENES
+
+Row = dict[str, Any]
+
+
+class Wish(NamedTuple):
+    """What somebody wants, and how it chooses among settings."""
+
+    wanted: str
+    fits: Callable[[Row, float], bool]
+    """Whether a row, whose frame takes so many milliseconds, will do."""
+    cost: Callable[[Row, float], tuple[float, ...]]
+    """The least of these is chosen."""
+
+
+def _loss(row: Row) -> float:
+    return row["scores"]["loss_db"]
+
+
+WISHES = (
+    Wish("finals, and pictures that are compared", lambda row, ms: True, lambda row, ms: (_loss(row), ms)),
+    Wish(
+        "what nobody sees a difference in: at most 0.1 dB lost, as fast as that goes",
+        lambda row, ms: _loss(row) <= 0.1,
+        lambda row, ms: (ms, row["n_bytes"]),
+    ),
+    Wish(
+        "moving around: 10 frames a second",
+        lambda row, ms: ms <= 100,
+        lambda row, ms: (_loss(row), ms),
+    ),
+    Wish("moving smoothly: 25 frames a second", lambda row, ms: ms <= 40, lambda row, ms: (_loss(row), ms)),
+    Wish(
+        "a small download: at most 3 MB",
+        lambda row, ms: row["n_bytes"] <= 3e6,
+        lambda row, ms: (_loss(row), ms),
+    ),
+    Wish(
+        "the fewest bytes that lose at most 1 dB",
+        lambda row, ms: _loss(row) <= 1,
+        lambda row, ms: (row["n_bytes"], _loss(row), ms),
+    ),
+)
+
+
+def played_rows(results: Results, name: str) -> list[Row]:
+    """The settings of a trade that are of an asset."""
+    return [row for row in results[name]["figures"]["settings"] if row["asset"] is not None]
+
+
+def setting_name(row: Row) -> str:
+    """
+    >>> setting_name({"asset": "bake_lego_fast", "n_fetches": 0, "quality": "high"})
+    'lego, fast; k = all, `high`'
+    """
+    quality = "" if row["quality"] == "exact" else f", `{row['quality']}`"
+    return f"{asset_name(row['asset'])}; k = {row['n_fetches'] or 'all'}{quality}"
+
+
+def choose(results: Results) -> list[str]:
+    """What to choose when, of an object and of a capture."""
+    there, lacking = present(results, ["trade_lego", "trade_fox"])
+    rows = []
+    for wish in WISHES:
+        for name in there:
+            size = SCENES[name[6:]].size
+            some = [(row, frame_of(row, size)["median"]) for row in played_rows(results, name)]
+            fitting = [(row, ms) for row, ms in some if wish.fits(row, ms)]
+            if not fitting:
+                rows.append([wish.wanted, f"{name[6:]}: none of these", "", "", "", ""])
+                continue
+            row, _ = min(fitting, key=lambda pair: wish.cost(*pair))
+            times = frame_of(row, size)
+            preset = row["asset"].rpartition("_")[2]
+            quality = "" if row["quality"] == "exact" else f" --quality {row['quality']}"
+            cells = [wish.wanted, setting_name(row), number(_loss(row), 2)]
+            cells += [rate(times["median"], times["uncertainty"]), megabytes(row["n_bytes"])]
+            bake = f"`vfr-bake model.pt out/ --preset {preset}`"
+            rows.append([*cells, f"{bake}, `vfr-play out/ --samples {row['n_fetches']}{quality}`"])
+    titles = ["for", "choose", "lost, dB", "frames a second", "MB", "commands"]
+    return titled(titles, rows, lacking)
+
+
+def scene_section(results: Results, scene: str) -> list[str]:
+    """The plot of a scene, and its settings that nothing else beats."""
+    name = f"trade_{scene}"
+    if name not in results:
+        return missing([name])[1:]
+    figures, size = results[name]["figures"], SCENES[scene].size if scene in SCENES else SCENES["lego"].size
+    conditions = figures["conditions"]
+    rows = []
+    for row in sorted(played_rows(results, name), key=_loss):
+        if row["on_front"] or scene == "dials":
+            times, small = frame_of(row, size), next(iter(row["times"].values()))
+            scores = row["scores"]
+            cells = [
+                setting_name(row),
+                f"{scores['psnr']:.2f}",
+                number(_loss(row), 2),
+                f"{scores['ssim']:.4f}",
+            ]
+            cells += [rate(some["median"], some["uncertainty"]) for some in (small, times)]
+            rows.append([*cells, megabytes(row["n_bytes"])])
+    own = "x".join(map(str, conditions["front_at"]))
+    told = (
+        f"Test views: {conditions['n_views']}; threads: {conditions['threads']}; timed frames of a setting "
+        f"and size: {conditions['frames_a_setting_and_size']}; machine and commit: {where(results, name)}."
+    )
+    titles = ["setting", "PSNR, dB", "lost, dB", "SSIM", f"frames a second, {own}", size, "MB"]
+    alt = f"{scene}: PSNR in dB against frames a second at {size}; size of a mark: bytes"
+    return [f"![{alt}]({plot_name(scene)})", "", told, "", *titled(titles, rows, [])]
+
+
+def full_model(results: Results) -> list[str]:
+    """What the models themselves take, which is what baking is for."""
+    there, lacking = present(results, [f"trade_{scene}" for scene in SCENES])
+    rows = []
+    for name in there:
+        for row in results[name]["figures"]["settings"]:
+            if row["asset"] is None:
+                times = next(iter(row["times"].values()))
+                seconds = give_or_take(times["median"] / 1000, times["uncertainty"] / 1000, 1)
+                rows.append([name[6:], f"{row['scores']['psnr']:.2f}", seconds, megabytes(row["n_bytes"])])
+    return titled(
+        ["full model", "PSNR, dB", "seconds a picture of the photographs' size", "MB"], rows, lacking
+    )
+
+
+BLOCKS: dict[str, Block] = {
+    "choose": choose,
+    "full-model": full_model,
+    **{f"trade-{scene}": partial(scene_section, scene=scene) for scene in (*SCENES, "dials")},
+}

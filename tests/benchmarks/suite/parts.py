@@ -1,0 +1,140 @@
+"""All parts of the benchmarks, in the order in which they are run and recorded."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from tests.benchmarks.suite import played
+from tests.benchmarks.suite.scenes import SCENES, Scene, bake, score, train
+from tests.benchmarks.suite.work import Part
+
+LEGO, FOX, CAN, DEMO = (SCENES[name] for name in ("lego", "fox", "can", "demo"))
+LONGEST_PART, LONGEST_CORE = 120.0, 150.0
+"""Minutes that a part, and all parts of the core together, may take on two cores."""
+PRESETS = {
+    "lego": {"fidelity": 5.5, "balanced": 3.5, "fast": 2.5, "phone": 2.5},
+    "fox": {"balanced": 5.5, "phone": 5.0},
+    "can": {"balanced": 8.0},
+    "demo": {"balanced": 2.0},
+}
+"""Presets that each scene is baked with, and the minutes that they take."""
+LIMITS_MB = ("1", "2", "3")
+"""The curve of bytes: limits on the size of lego's asset, balanced."""
+DIALS = {
+    "head32": ("--head-width", "32"),
+    "head128": ("--head-width", "128"),
+    "channels8": ("--n-channels", "8"),
+    "cells400": ("--resolution", "400"),
+}
+"""Settings of which one at a time is changed in lego's asset, balanced."""
+MINUTES = (1.0, 2.0, 5.0)
+"""Shorter trainings of lego."""
+SEEDS = (0, 1, 2)
+REFINED_AT = {"every": "0", "k3": "3", "k5": "5", "k8": "8"}
+"""Numbers of lookups that the assets of the part `lookups` are baked and refined for; 0: every sample."""
+
+
+def bakes(scene: Scene) -> tuple[str, ...]:
+    """The parts that bake the presets of a scene."""
+    return tuple(f"bake_{scene.name}_{preset}" for preset in PRESETS[scene.name])
+
+
+def _training(scene: Scene, minutes: float) -> Part:
+    return Part(f"train_{scene.name}", partial(train, scene=scene), minutes, data=scene.data)
+
+
+def _score(scene: Scene, minutes: float) -> Part:
+    trained = f"train_{scene.name}"
+    measure = partial(score, scene=scene, model_of=trained)
+    return Part(f"eval_{scene.name}", measure, minutes, (trained,), scene.data)
+
+
+def _shorter(minutes: float) -> list[Part]:
+    """Lego trained for fewer minutes, and its score."""
+    trained = f"train_lego_{minutes:g}"
+    measures = partial(train, scene=LEGO, minutes=minutes), partial(score, scene=LEGO, model_of=trained)
+    return [
+        Part(trained, measures[0], minutes + 0.5, data=LEGO.data, core=False),
+        Part(f"eval_lego_{minutes:g}", measures[1], 4.0, (trained,), LEGO.data, core=False),
+    ]
+
+
+def _bake(name: str, model_of: str, minutes: float, *options: str, core: bool = True) -> Part:
+    return Part(name, lambda work: bake(work, model_of, *options), minutes, (model_of,), core=core)
+
+
+def _trade(name: str, scene: Scene, of: tuple[str, ...], minutes: float, core: bool = True) -> Part:
+    samples = ("1", "2", "3", "5", "8", "0")
+    needs = (f"train_{scene.name}", *of)
+    return Part(name, lambda work: played.trade(work, scene, of, samples), minutes, needs, scene.data, core)
+
+
+def _lookups(scene: Scene, minutes: float) -> list[Part]:
+    """Trainings with three seeds, each baked for every sample and for a few lookups; then all are played."""
+    parts, columns = [], {}
+    for seed in SEEDS:
+        trained = f"train_{scene.name}_seed{seed}"
+        training = partial(train, scene=scene, minutes=4, seed=seed)
+        parts.append(Part(trained, training, 4.5, data=scene.data, core=False))
+        for name, k in REFINED_AT.items():
+            baked = f"bake_{scene.name}_seed{seed}_{name}"
+            parts.append(_bake(baked, trained, 6.0, "--k", k, core=False))
+            columns[f"{name}, seed {seed}"] = baked
+    needs = tuple(columns.values())
+    measure = partial(played.lookups, scene=scene, bakes=columns)
+    return [*parts, Part(f"lookups_{scene.name}", measure, minutes, needs, scene.data, core=False)]
+
+
+def _core() -> list[Part]:
+    presets = [
+        _bake(f"bake_{name}_{preset}", f"train_{name}", minutes, "--preset", preset)
+        for name, some in PRESETS.items()
+        for preset, minutes in some.items()
+    ]
+    balanced, pages = "bake_lego_balanced", (*bakes(LEGO)[1:], "bake_fox_phone")
+    return [
+        *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 13.5), (CAN, 13.5), (DEMO, 10.0))),
+        *(_score(*pair) for pair in ((LEGO, 4.0), (FOX, 3.5), (CAN, 5.0), (DEMO, 1.0))),
+        *presets,
+        *(_bake(f"bytes_lego_{mb}", "train_lego", 3.5, "--max-mb", mb) for mb in LIMITS_MB),
+        _trade("trade_lego", LEGO, bakes(LEGO), 6.0),
+        _trade("trade_fox", FOX, bakes(FOX), 6.0),
+        _trade("trade_can", CAN, bakes(CAN), 6.0),
+        _trade("trade_demo", DEMO, bakes(DEMO), 2.0),
+        *(
+            Part(
+                f"play_{scene.name}",
+                partial(played.qualities, scene=scene, bakes=bakes(scene)),
+                3.0,
+                bakes(scene),
+                scene.data,
+            )
+            for scene in (LEGO, FOX)
+        ),
+        Part("export_lego", partial(played.exports, asset_of=balanced), 4.0, (balanced,)),
+        Part("page", partial(played.page, bakes=pages), 4.0, pages),
+        Part("cameras_lego", partial(played.cameras, data="lego_800_train"), 4.0, data="lego_800_train"),
+    ]
+
+
+def _more() -> list[Part]:
+    """What takes longer than it tells, and is run when it is asked for."""
+    dials = [
+        _bake(f"dial_lego_{name}", "train_lego", 4.0, *words, core=False) for name, words in DIALS.items()
+    ]
+    dialled = ("bake_lego_balanced", *(part.name for part in dials))
+    return [
+        *(part for minutes in MINUTES for part in _shorter(minutes)),
+        *dials,
+        _trade("trade_dials", LEGO, dialled, 8.0, core=False),
+        *_lookups(LEGO, 25.0),
+        *_lookups(FOX, 25.0),
+        Part("cameras_fox", partial(played.cameras, data="fox"), 3.0, data="fox", core=False),
+        Part("cameras_ring", played.ring, 20.0, core=False),
+        Part("compositing_lego", played.compositing, 9.0, data="lego_400", core=False),
+        Part("steps_lego", played.steps, 6.0, data="lego_400", core=False),
+        Part("specks_lego", played.specks, 4.0, ("train_lego", "bake_lego_balanced"), core=False),
+    ]
+
+
+PARTS = {part.name: part for part in (*_core(), *_more())}

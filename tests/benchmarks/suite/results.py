@@ -1,0 +1,56 @@
+"""The file of results: for each part what it found, and under which conditions."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from player.files.files import write_bytes
+from tests.benchmarks.suite.conditions import REPOSITORY
+
+RESULTS = REPOSITORY / "docs" / "benchmarks.json"
+"""Beside the pages that are rendered from it, so that the source package has both."""
+KEYS = {
+    *("commit", "date", "machine", "load_before", "load_after", "others_before", "others", "libraries"),
+    *("seeds", "commands", "seconds", "figures"),
+}
+"""What is kept of a part. `others_before` and `others` are the shares of all processors that other programs
+took before it and during it."""
+
+Results = dict[str, dict[str, Any]]
+
+
+def read_results(path: Path = RESULTS) -> Results:
+    """The parts of a file, by name; none where there is no file. Raises ValueError for something else."""
+    if not path.exists():
+        return {}
+    document = json.loads(path.read_text(encoding="utf-8"))
+    parts = document["parts"]
+    for name, part in parts.items():
+        if set(part) != KEYS:
+            raise ValueError(f"{path.name}: {name}: expected the keys {sorted(KEYS)}, got {sorted(part)}")
+    return parts
+
+
+def write_results(parts: Results, order: list[str], path: Path = RESULTS) -> None:
+    """Write the parts in this order, numbers rounded to six digits; parts that are not in `order` are left
+    out."""
+    kept = {name: _rounded(parts[name]) for name in order if name in parts}
+    text = json.dumps({"parts": kept}, indent=1, ensure_ascii=False, allow_nan=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def _rounded(value: Any) -> Any:
+    """
+    >>> _rounded({"psnr": [32.23456789, 3], "ssim": float("inf")})
+    {'psnr': [32.2346, 3], 'ssim': None}
+    """
+    if isinstance(value, dict):
+        return {key: _rounded(some) for key, some in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(some) for some in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value

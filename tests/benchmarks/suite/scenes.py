@@ -1,0 +1,130 @@
+"""The scenes that are measured: trained, scored and baked, each step by a command that a user has."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.suite.work import Work
+
+SEED = 0
+"""The commands' own."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A data set, and how it is measured."""
+
+    name: str
+    data: str
+    """Folder of the data sets, or "demo"."""
+    minutes: float | None = None
+    """Minutes of training, where they are not what the command takes by itself."""
+    reading: tuple[str, ...] = ()
+    """Options of vfr-train that say how pictures are read."""
+    photographs_alone: bool = False
+    """Whether its cameras are left out and estimated."""
+    size: str = "800x800"
+    """Pixels of the frames that are timed."""
+    views: int = 8
+    """Test views of which the trade is measured."""
+    frames: int = 12
+    """Timed frames of a setting, with which the trade's median is known."""
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        Scene("lego", "lego_400", 9.25),
+        Scene("fox", "fox", reading=("--downscale", "2"), size="540x960", views=4, frames=6),
+        Scene("can", "can", photographs_alone=True, size="720x1280", views=3, frames=6),
+        Scene("demo", "demo", 10),
+    )
+}
+
+
+def data_of(work: Work, scene: Scene) -> str:
+    """What the commands are given as DATA."""
+    if scene.photographs_alone and not work.quick:
+        return str(work.file(f"train_{scene.name}", "photos"))
+    return work.data(scene.data)
+
+
+def train(work: Work, scene: Scene, minutes: float | None = None, seed: int = SEED) -> dict[str, Any]:
+    """Train, from photographs alone where the scene has them so; `minutes` instead of the scene's."""
+    data = data_of(work, scene)
+    if scene.photographs_alone and not work.quick:
+        shutil.copytree(Path(work.data(scene.data)) / "images", Path(data) / "images")
+    model, report = work.folder / "model.pt", work.folder / "train.json"
+    minutes = minutes or scene.minutes
+    length = () if minutes is None else ("--minutes", f"{minutes:g}")
+    settings = (*scene.reading, *length, "--seed", str(seed), "--eval-views", "0")
+    usage = work.command("vfr-train", data, model, *settings, "--json", report)
+    work.seeds.append(seed)
+    trained = work.read("train.json")
+    return {
+        "steps": trained["steps"],
+        "training_seconds": trained["seconds"],
+        "ended_early": trained["ended_early"],
+        **usage._asdict(),
+    }
+
+
+def score(work: Work, scene: Scene, model_of: str) -> dict[str, Any]:
+    """The full model of the part `model_of` against all test views."""
+    model = work.file(model_of, "model.pt")
+    usage = work.command("vfr-eval", model, data_of(work, scene), "--json", work.folder / "eval.json")
+    found = work.read("eval.json")
+    every = [view["psnr"] for view in found["per_view"]]
+    return {
+        "psnr": found["psnr"],
+        "psnr_uncertainty": uncertainty_of_mean(every),
+        "psnr_worst": min(every),
+        "ssim": found["ssim"],
+        "n_views": found["n_views"],
+        **usage._asdict(),
+    }
+
+
+def bake(work: Work, model_of: str, *options: str) -> dict[str, Any]:
+    """Bake the model of the part `model_of`."""
+    asset = work.folder / "asset"
+    report = work.folder / "bake.json"
+    usage = work.command("vfr-bake", work.file(model_of, "model.pt"), asset, *options, "--json", report)
+    baked, told = work.read("bake.json"), work.read("asset/report.json")
+    manifest = work.read("asset/manifest.json")
+    last = told["stages"][-1]
+    return {
+        "n_bytes": sum(told["bytes"].values()),
+        "bytes": told["bytes"],
+        "loss_db": baked["loss_db"],
+        "loss_db_spread": baked["loss_db_spread"],
+        "psnr_to_model": baked["psnr_to_full_model"],
+        "n_vertices": baked["n_vertices"],
+        "resolution": manifest["resolution"],
+        "feature_resolution": manifest["feature_resolution"],
+        "n_channels": manifest["n_channels"],
+        "n_fetches": manifest["n_fetches"],
+        "samples_median": last["samples_median"],
+        "samples_p95": last["samples_p95"],
+        "lookups": told["lookups"],
+        "stages_seconds": told["seconds"],
+        "missed": told["missed"],
+        **usage._asdict(),
+    }
+
+
+def uncertainty_of_mean(values: list[float]) -> float | None:
+    """Half of the interval around a mean that has it with 95 %, from the values' own spread.
+
+    >>> round(uncertainty_of_mean([1.0, 2.0, 3.0, 4.0]), 3)
+    1.265
+    >>> uncertainty_of_mean([1.0])
+    """
+    if len(values) < 2:
+        return None
+    return float(1.96 * np.std(values, ddof=1) / np.sqrt(len(values)))

@@ -1,0 +1,118 @@
+"""What a part of the benchmarks is, and what it works with: its folder, its data and the commands it runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tests.benchmarks.suite.conditions import REPOSITORY
+
+COMMANDS = {
+    "vfr-train": "import sys, vfr_bake.cli as c; sys.exit(c.train_main())",
+    "vfr-bake": "import sys, vfr_bake.cli as c; sys.exit(c.bake_main())",
+    "vfr-eval": "import sys, vfr_bake.cli as c; sys.exit(c.eval_main())",
+    "vfr-bench": "import sys, vfr_bake.cli as c; sys.exit(c.bench_main())",
+    "vfr-play": "import sys, player.app.cli as c; sys.exit(c.main())",
+    "vfr-export": "import sys, exporters.cli as c; sys.exit(c.main())",
+}
+LITTLE: dict[str, tuple[str, ...]] = {
+    "vfr-train": (
+        *("--steps", "60", "--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
+        *("--head-width", "24", "--occupancy-resolution", "32", "--batch-samples", "2048"),
+    ),
+    "vfr-bake": ("--mesh-resolution", "32", "--check-views", "1", "--refine-steps", "20"),
+    "vfr-bench": ("--views", "1", "--frames", "2", "--sizes", "24x24", "--samples", "1", "5"),
+}
+"""What is added to a command to try out the machinery."""
+
+
+class PartError(Exception):
+    """A command of a part failed."""
+
+
+class Usage(NamedTuple):
+    """What one command took."""
+
+    seconds: float
+    processor_seconds: float
+    peak_mb: float
+
+
+@dataclass
+class Work:
+    """What a part is given."""
+
+    part: str
+    root: Path
+    """The folder that has one folder for each part."""
+    data_root: Path
+    """The folder of the data sets."""
+    quick: bool = False
+    """Whether only the machinery is tried out: everything as little as possible."""
+    commands: list[str] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=list)
+
+    @property
+    def folder(self) -> Path:
+        """Where the part writes."""
+        return self.root / self.part
+
+    def file(self, part: str, name: str) -> Path:
+        """What another part has written."""
+        return self.root / part / name
+
+    def data(self, name: str) -> str:
+        """A data set, or "demo" for the built-in scene."""
+        return name if name == "demo" and not self.quick else str(self.data_root / name)
+
+    def little(self, usual: int | str, quick: int | str) -> str:
+        """A setting, or the one to try the machinery out with."""
+        return str(quick if self.quick else usual)
+
+    def command(self, name: str, *arguments: str | Path) -> Usage:
+        """Run a command of the package, or the script `name` of this folder. Raises PartError."""
+        words = [*map(str, arguments), *(LITTLE.get(name, ()) if self.quick else ())]
+        self.commands.append(self.told(name, words))
+        print(f"$ {self.commands[-1]}", file=sys.stderr, flush=True)
+        begin = ["-c", COMMANDS[name]] if name in COMMANDS else ["-m", f"tests.benchmarks.{name}"]
+        start = time.monotonic()
+        process = subprocess.Popen([sys.executable, *begin, *words], cwd=REPOSITORY, stdout=sys.stderr)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise PartError(f"{self.part}: {name} ended with {process.returncode}")
+        used = usage.ru_utime + usage.ru_stime
+        return Usage(time.monotonic() - start, used, usage.ru_maxrss / 1000)
+
+    def told(self, name: str, words: list[str]) -> str:
+        """The command as a reader types it: no folder of this machine is in it."""
+        shown = " ".join(words).replace(f"{self.root}/", "").replace(f"{self.data_root}/", "")
+        return f"{name if name in COMMANDS else f'python -m tests.benchmarks.{name}'} {shown}"
+
+    def read(self, name: str) -> Any:
+        """A JSON file of the part."""
+        return json.loads((self.folder / name).read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One piece of the benchmarks, which is run whole or not at all."""
+
+    name: str
+    measure: Callable[[Work], dict[str, Any]]
+    """Returns the figures."""
+    minutes: float
+    """About how long it takes on two cores."""
+    needs: tuple[str, ...] = ()
+    """Parts whose files it reads."""
+    data: str | None = None
+    """The data set that it reads, beside what those parts have written."""
+    core: bool = True
+    """Whether `make benchmarks` runs it."""
