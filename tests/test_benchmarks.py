@@ -6,6 +6,8 @@ import doctest
 import importlib
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -127,7 +129,7 @@ class Bench:
     def run(self, *names: str, commit: str = "0a", machine: dict[str, Any] = MACHINE) -> list[str]:
         self.ran.clear()
         runner = Runner(self.parts, self.settings, commit, machine)
-        runner.quiet = lambda: 0.01
+        runner.quiet, runner.settle = lambda: 0.01, lambda: None
         self.failed = runner.run(names)
         return self.ran
 
@@ -241,6 +243,24 @@ def test_a_machine_that_stays_busy_is_refused_unless_that_is_wanted() -> None:
         share == 0.6
         and said[-1] == "other programs take 60% of the processors: measured beside them, as asked"
     )
+
+
+ORPHAN = """
+import os, subprocess, sys
+from tests.benchmarks.suite import conditions
+conditions.adopt_orphans()
+loop = "import time; end = time.process_time() + 0.2\\nwhile time.process_time() < end: pass"
+subprocess.run(["sh", "-c", f'{sys.executable} -c "$0" & exit 0', loop])
+conditions.bury_orphans()
+print(sum(os.times()[2:4]))
+"""
+
+
+def test_what_a_child_leaves_behind_counts_as_ours() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ORPHAN], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    assert float(done.stdout) > 0.2
 
 
 def test_the_machine_without_flags_or_a_name_is_told_all_the_same() -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from tests.benchmarks.pages.documents import render_all
 from tests.benchmarks.suite import conditions
+from tests.benchmarks.suite.little import write_data_sets
 from tests.benchmarks.suite.parts import PARTS
 from tests.benchmarks.suite.results import RESULTS, read_results
 from tests.benchmarks.suite.runner import Runner, Settings
@@ -52,8 +53,6 @@ def main() -> int:
     settings.wait, settings.busy_anyway = arguments.wait, arguments.busy_anyway
     settings.again, settings.quick = arguments.again, arguments.quick
     if arguments.quick:
-        from tests.benchmarks.suite.little import write_data_sets
-
         settings.results, settings.data_root = folder / "benchmarks.json", folder / "data"
         write_data_sets(settings.data_root)
     elif changed := conditions.changed_files():
@@ -66,6 +65,7 @@ def main() -> int:
     runner = Runner(PARTS, settings, commit, machine)
     if arguments.list:
         return _list(set(runner.order([*PARTS])))
+    conditions.adopt_orphans()
     try:
         failed = runner.run(names)
     except conditions.BusyError as error:

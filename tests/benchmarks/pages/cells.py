@@ -51,7 +51,8 @@ def rate(ms: float, uncertainty: float) -> str:
     ('12.5 ± 0.3', '1.43 ± 0.01')
     """
     a_second = 1000 / ms
-    return give_or_take(a_second, a_second * uncertainty / ms, 1 if a_second >= 10 else 2)
+    digits = 0 if a_second >= 100 else 1 if a_second >= 10 else 2
+    return give_or_take(a_second, a_second * uncertainty / ms, digits)
 
 
 def duration(seconds: float) -> str:

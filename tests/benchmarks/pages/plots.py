@@ -24,12 +24,12 @@ def plots(results: Results) -> dict[str, str]:
 def _plot(results: Results, scene: str) -> str:
     """PSNR against frames a second; the area of a mark is the asset's share of the largest one's bytes."""
     figures = results[f"trade_{scene}"]["figures"]
-    size = SCENES["lego" if scene == "dials" else scene].size
+    size = figures["size"]
     rows = [row for row in figures["settings"] if row["asset"] is not None]
     most = max(row["n_bytes"] for row in rows)
     series: dict[str, list[Mark]] = {}
     for row in rows:
-        times = row["times"].get(size) or next(iter(row["times"].values()))
+        times = row["times"][size]
         k, megabytes = row["n_fetches"] or "all", row["n_bytes"] / 1e6
         rate = 1000 / times["median"]
         label = (

@@ -53,11 +53,6 @@ def own_setting(results: Results, part: str, quality: str = "exact") -> dict[str
     return None
 
 
-def frame_of(row: dict[str, Any], size: str) -> dict[str, Any]:
-    """The times of a row's frames of a size; of the first one where that was not timed."""
-    return row["times"].get(size) or next(iter(row["times"].values()))
-
-
 def machine_table(results: Results) -> list[str]:
     rows = []
     for index, machine in enumerate(machines(results)):
@@ -296,12 +291,12 @@ def frame_parts(results: Results) -> list[str]:
     there, lacking = present(results, needed)
     rows = []
     for name in there:
-        size = SCENES[name[6:]].size
+        size = results[name]["figures"]["size"]
         for part in (f"bake_{name[6:]}_{preset}" for preset in PRESETS[name[6:]]):
             row = own_setting(results, part)
             if row is None:
                 continue
-            times = frame_of(row, size)
+            times = row["times"][size]
             parts = [number(times[key], 0) for key in ("march", "lookups", "head")]
             cells = [f"{asset_name(part)}, {size}", where(results, name)]
             cells += [give_or_take(times["median"], times["uncertainty"], 0), *parts]

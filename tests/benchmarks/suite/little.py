@@ -9,12 +9,13 @@ from PIL import Image
 
 from player.cameras.transforms import write_cameras
 from tests.benchmarks.suite.scenes import SCENES
-from vfr_bake.data.demo import demo_views
 
 
 def write_data_sets(root: Path) -> None:
     """The built-in scene as NeRF-synthetic, 12 views to train on and 2 to test, under every name; what is
     there stays."""
+    from vfr_bake.data.demo import demo_views  # only where something is written: numba takes memory
+
     if root.is_dir():
         return
     splits = list(zip(("train", "test"), demo_views(size=32, n_train=12, n_test=2), strict=True))

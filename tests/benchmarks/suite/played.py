@@ -24,7 +24,10 @@ EXPORTS: dict[str, tuple[str, int]] = {
 
 
 def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, ...]) -> dict[str, Any]:
-    """`vfr-bench` of some assets of a scene: every number of lookups and every quality."""
+    """`vfr-bench` of some assets of a scene: every number of lookups and every quality.
+
+    `size` of the figures is that of the frames by which settings are compared.
+    """
     assets = [work.file(name, "asset") for name in bakes]
     model = work.file(f"train_{scene.name}", "model.pt")
     report = work.folder / "trade.json"
@@ -46,7 +49,8 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
         )
     kept = ("front_at", "threads", "march", "frames_a_setting_and_size")
     conditions = {key: found["conditions"][key] for key in kept}
-    return {"settings": rows, "conditions": conditions | {"n_views": len(found["conditions"]["views"])}}
+    conditions["n_views"] = len(found["conditions"]["views"])
+    return {"settings": rows, "conditions": conditions, "size": [*rows[0]["times"]][-1]}
 
 
 def qualities(work: Work, scene: Scene, bakes: tuple[str, ...]) -> dict[str, Any]:
@@ -96,17 +100,17 @@ def page(work: Work, bakes: tuple[str, ...]) -> dict[str, Any]:
 
 
 def cameras(work: Work, data: str) -> dict[str, Any]:
-    """Cameras that are estimated against those that are known."""
-    work.command("bench_cameras", "compare", work.data(data), "--json", work.folder / "cameras.json")
-    return work.read("cameras.json")
+    """Cameras that are estimated against those that are known; of a rendered ring to try it out."""
+    if work.quick:
+        return ring(work)
+    return _script(work, "bench_cameras", "compare", work.data(data))
 
 
 def ring(work: Work) -> dict[str, Any]:
     """The same of a rendered ring, whose cameras are known exactly."""
-    folder = work.folder / "ring"
-    work.command("bench_cameras", "ring", folder, "--views", "300", "--size", "4000", "3000")
-    work.command("bench_cameras", "compare", folder, "--json", work.folder / "cameras.json")
-    return work.read("cameras.json")
+    folder, size = work.folder / "ring", (work.little(4000, 480), work.little(3000, 360))
+    work.command("bench_cameras", "ring", folder, "--views", work.little(300, 30), "--size", *size)
+    return _script(work, "bench_cameras", "compare", folder)
 
 
 def lookups(work: Work, scene: Scene, bakes: dict[str, str]) -> dict[str, Any]:

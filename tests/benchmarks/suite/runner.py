@@ -46,6 +46,7 @@ class Runner:
         self.quiet: Callable[[], float] = lambda: conditions.wait_until_quiet(
             settings.wait, settings.busy_anyway, _say
         )
+        self.settle: Callable[[], object] = conditions.bury_orphans
 
     def order(self, names: Sequence[str]) -> list[str]:
         """The parts `names` that are to be run, each behind what it needs and lacks."""
@@ -102,6 +103,7 @@ class Runner:
         before = 0.0 if settings.quick else self.quiet()
         load_before, clock, begin = os.getloadavg(), conditions.OthersClock(), time.monotonic()
         figures = part.measure(work)
+        self.settle()
         result = {
             "commit": self._commit,
             "date": date.today().isoformat(),

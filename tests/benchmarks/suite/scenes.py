@@ -26,6 +26,7 @@ class Scene:
     """Minutes of training, where they are not what the command takes by itself."""
     reading: tuple[str, ...] = ()
     """Options of vfr-train that say how pictures are read."""
+    unbounded: bool = False
     photographs_alone: bool = False
     """Whether its cameras are left out and estimated."""
     size: str = "800x800"
@@ -40,8 +41,8 @@ SCENES = {
     scene.name: scene
     for scene in (
         Scene("lego", "lego_400", 9.25),
-        Scene("fox", "fox", reading=("--downscale", "2"), size="540x960", views=4, frames=6),
-        Scene("can", "can", photographs_alone=True, size="720x1280", views=3, frames=6),
+        Scene("fox", "fox", reading=("--downscale", "2"), unbounded=True, size="540x960", views=4, frames=6),
+        Scene("can", "can", unbounded=True, photographs_alone=True, size="720x1280", views=3, frames=6),
         Scene("demo", "demo", 10),
     )
 }
@@ -63,6 +64,8 @@ def train(work: Work, scene: Scene, minutes: float | None = None, seed: int = SE
     minutes = minutes or scene.minutes
     length = () if minutes is None else ("--minutes", f"{minutes:g}")
     settings = (*scene.reading, *length, "--seed", str(seed), "--eval-views", "0")
+    if work.quick and scene.unbounded:  # what stands in for its pictures is of an object
+        settings = ("--kind", "unbounded", *settings)
     usage = work.command("vfr-train", data, model, *settings, "--json", report)
     work.seeds.append(seed)
     trained = work.read("train.json")

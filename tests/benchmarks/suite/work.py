@@ -24,8 +24,8 @@ COMMANDS = {
 }
 LITTLE: dict[str, tuple[str, ...]] = {
     "vfr-train": (
-        *("--steps", "60", "--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
-        *("--head-width", "24", "--occupancy-resolution", "32", "--batch-samples", "2048"),
+        *("--steps", "150", "--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
+        *("--head-width", "24", "--occupancy-resolution", "32", "--batch-samples", "4096"),
     ),
     "vfr-bake": ("--mesh-resolution", "32", "--check-views", "1", "--refine-steps", "20"),
     "vfr-bench": ("--views", "1", "--frames", "2", "--sizes", "24x24", "--samples", "1", "5"),
