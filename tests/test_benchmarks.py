@@ -12,10 +12,12 @@ from collections.abc import Callable
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
 from tests.benchmarks.pages.documents import BLOCK, BLOCKS, DOCUMENTS, prose, rendered, rendered_files
+from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.suite import conditions
 from tests.benchmarks.suite.parts import LONGEST_CORE, LONGEST_PART, PARTS
 from tests.benchmarks.suite.results import KEYS, RESULTS, read_results, write_results
@@ -81,6 +83,78 @@ def test_a_page_without_results_names_the_commands() -> None:
             assert re.search(r"`make benchmarks`|`python -m tests.benchmarks --only [\w ]+`", found[0]), (
                 found[2]
             )
+
+
+# Tables -------------------------------------------------------------------------------------------
+
+
+def result(figures: dict[str, Any], *commands: str, **conditions: Any) -> dict[str, Any]:
+    """A part's result as it is recorded."""
+    versions = dict.fromkeys(("python", "numpy", "numba", "onnxruntime", "torch"), "1.0")
+    usual = {"commit": "0a1b2c3d4e", "machine": MACHINE, "others_before": 0.0, "others": 0.01}
+    kept = dict.fromkeys(KEYS) | usual | {"date": "2026-11-24", "libraries": versions, "commands": commands}
+    return kept | {"figures": figures} | conditions
+
+
+def setting(asset: str, loss: float, ms: float, mb: float, quality: str = "exact") -> dict[str, Any]:
+    """A row of the trade."""
+    return {
+        "asset": asset, "n_fetches": 5, "quality": quality, "what": {"n_fetches": 5}, "n_bytes": mb * 1e6,
+        "on_front": True, "peak_mb": 400.0, "first_picture_ms": 1000.0,
+        "scores": {"psnr": 32 - loss, "loss_db": loss, "ssim": 0.97, "psnr_to_model": 40.0},
+        "times": {"800x800": {"median": ms, "uncertainty": 1.0, "march": 9.0, "lookups": 9.0, "head": 9.0}},
+    }  # fmt: skip
+
+
+ROWS = [
+    setting("bake_lego_fidelity", -0.02, 300, 17),
+    setting("bake_lego_balanced", 0.08, 90, 5),
+    setting("bake_lego_balanced", 0.2, 30, 5, "fast"),
+    setting("bake_lego_fast", 0.6, 70, 2.4),
+]
+CONDITIONS = {"n_views": 8, "threads": 2, "frames_a_setting_and_size": 12}
+TRADE = result({"settings": ROWS, "conditions": CONDITIONS, "size": "800x800"})
+
+
+def test_what_is_chosen_keeps_to_what_was_wanted() -> None:
+    rows = [line.split(" | ") for line in BLOCKS["choose"]({"trade_lego": TRADE}) if "| lego" in line]
+    assert [row[1:3] + row[4:5] for row in rows] == [
+        ["lego, fidelity; k = 5", "-0.02", "17.0"],  # finals
+        ["lego, balanced; k = 5", "0.08", "5.0"],  # at most 0.1 dB, the fastest
+        ["lego, balanced; k = 5", "0.08", "5.0"],  # 10 frames a second, the best
+        ["lego, balanced; k = 5, `fast`", "0.20", "5.0"],  # 25 frames a second
+        ["lego, fast; k = 5", "0.60", "2.4"],  # 3 MB
+        ["lego, fast; k = 5", "0.60", "2.4"],  # the fewest bytes
+    ]
+    assert rows[3][3] == "33.3 ± 1.1" and rows[3][5].endswith("--samples 5 --quality fast` |")
+
+
+def test_a_wish_that_nothing_fits_is_told() -> None:
+    slow = result({"settings": ROWS[:1], "conditions": CONDITIONS, "size": "800x800"})
+    assert sum("none of these" in line for line in BLOCKS["choose"]({"trade_lego": slow})) == 3
+
+
+def test_a_row_tells_machine_commit_and_what_ran_beside() -> None:
+    trained = {"steps": 18_920, "training_seconds": 555.0, "seconds": 570.0, "peak_mb": 1100.0}
+    command = "vfr-train lego_400 train_lego/model.pt --json train_lego/train.json --minutes 9.25"
+    scored = {"psnr": 32.234, "psnr_uncertainty": 0.21, "n_views": 200, "ssim": 0.969}
+    results = {"train_lego": result(trained, command), "eval_lego": result(scored)}
+    told = "`vfr-train lego_400 train_lego/model.pt --minutes 9.25`"
+    took = "9.2 min training, 9.5 min in all; 1.1 GB"
+    score = "**32.23 ± 0.21 dB** (200 views), SSIM 0.969"
+    lines = BLOCKS["training"](results)
+    assert lines[2] == f"| lego | {told} | A, 0a1b2c3 | 18,920 | {took} | {score} |"
+    assert lines[-1] == "Not measured yet: train_fox, train_can, train_demo (`make benchmarks`)."
+    results["train_lego"] = result(trained, command, machine=MACHINE | {"cores": 4}, others=0.4)
+    assert "| A*, 0a1b2c3 |" in BLOCKS["training"](results)[2]
+    assert len(BLOCKS["machines"](results)) == 4
+
+
+def test_plots_have_a_mark_for_every_setting() -> None:
+    ((name, picture),) = plots({"trade_lego": TRADE}).items()
+    marks = ElementTree.fromstring(picture).findall("{http://www.w3.org/2000/svg}circle/*")
+    assert name == "trade_lego.svg" and len(marks) == len(ROWS)
+    assert marks[0].text == "k = 5, exact: 32.02 dB, 3.33 frames a second, 17.0 MB"
 
 
 # Results ------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def main() -> None:
     found = {}
     for kind, run in runs.items():
         trainer = run.trainer
-        scores = evaluate(trained_model(trainer, scene, {}), scene.test, options.views)
+        scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
         rate = trainer.next_step / trainer.seconds
         psnr = float(np.mean([score.psnr for score in scores]))
         found[kind] = {"steps": trainer.next_step, "steps_a_second": rate, "psnr": psnr}

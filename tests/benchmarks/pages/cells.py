@@ -99,6 +99,12 @@ def where(results: Results, name: str) -> str:
     return f"{letter(machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
 
 
+def measured_on(results: Results, names: Sequence[str]) -> list[str]:
+    """A line for tables that have no column for it, behind a blank one."""
+    places = list(dict.fromkeys(where(results, name) for name in names))
+    return ["", f"Machine and commit: {'; '.join(places)}."] if places else []
+
+
 def present(results: Results, names: Iterable[str]) -> tuple[list[str], list[str]]:
     """The parts that are there, and those that are not."""
     names = list(names)

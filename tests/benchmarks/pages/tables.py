@@ -14,6 +14,7 @@ from tests.benchmarks.pages.cells import (
     give_or_take,
     letter,
     machines,
+    measured_on,
     megabytes,
     missing,
     number,
@@ -112,12 +113,13 @@ def compositing(results: Results) -> list[str]:
 def step(results: Results) -> list[str]:
     there, lacking = present(results, ["steps_lego"])
     rows = [
-        [part, f"{value:.3g}"]
+        [part, f"{value:,.0f}" if value >= 100 else f"{value:.3g}"]
         for name in there
         for part, value in results[name]["figures"]["this version"].items()
         if "times this version's" not in part
     ]
-    return titled(["a step of lego on two threads", "milliseconds, or number"], rows, lacking)
+    titles = ["a step of lego on two threads", "milliseconds, or number"]
+    return [*titled(titles, rows, lacking), *measured_on(results, there)]
 
 
 def cameras(results: Results) -> list[str]:
@@ -210,7 +212,7 @@ def lookups(results: Results) -> list[str]:
     there, lacking = present(results, ["lookups_lego", "lookups_fox"])
     ks = [k for k in LOOKUPS if k != "0"]
     rows = [row for name in there for row in _lookup_rows(name, results[name]["figures"], ks)]
-    return titled(["scene, refined for", *ks], rows, lacking)
+    return [*titled(["scene, refined for", *ks], rows, lacking), *measured_on(results, there)]
 
 
 def _lookup_rows(name: str, found: dict[str, Any], ks: list[str]) -> list[list[str]]:
@@ -329,7 +331,7 @@ def specks(results: Results) -> list[str]:
         for variant, counts in found["in_a_million"].items():
             rows.append([variant, *(f"{count:.0f}" for count in counts)])
     titles = ["specks of lego, balanced, in a million pixels", "by 0.05", "by 0.1", "by 0.2"]
-    return titled(titles, rows, lacking)
+    return [*titled(titles, rows, lacking), *measured_on(results, there)]
 
 
 def expect(results: Results) -> list[str]:

@@ -114,7 +114,7 @@ def scene_section(results: Results, scene: str) -> list[str]:
         return missing([name])[1:]
     figures = results[name]["figures"]
     conditions, size = figures["conditions"], figures["size"]
-    sizes = [*figures["settings"][0]["times"]]
+    sizes = sorted(figures["settings"][0]["times"], key=lambda some: int(some.partition("x")[0]))
     rows = []
     for row in sorted(played_rows(results, name), key=_loss):
         if row["on_front"] or scene == "dials":
@@ -125,7 +125,8 @@ def scene_section(results: Results, scene: str) -> list[str]:
                 number(_loss(row), 2),
                 f"{scores['ssim']:.4f}",
             ]
-            cells += [rate(some["median"], some["uncertainty"]) for some in row["times"].values()]
+            times = [row["times"][some] for some in sizes]
+            cells += [rate(some["median"], some["uncertainty"]) for some in times]
             rows.append([*cells, megabytes(row["n_bytes"])])
     told = (
         f"Test views: {conditions['n_views']}; threads: {conditions['threads']}; timed frames of a setting "

@@ -50,7 +50,8 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
     kept = ("front_at", "threads", "march", "frames_a_setting_and_size")
     conditions = {key: found["conditions"][key] for key in kept}
     conditions["n_views"] = len(found["conditions"]["views"])
-    return {"settings": rows, "conditions": conditions, "size": [*rows[0]["times"]][-1]}
+    own = "x".join(map(str, conditions["front_at"]))
+    return {"settings": rows, "conditions": conditions, "size": own if work.quick else scene.size}
 
 
 def qualities(work: Work, scene: Scene, bakes: tuple[str, ...]) -> dict[str, Any]:
@@ -108,8 +109,8 @@ def cameras(work: Work, data: str) -> dict[str, Any]:
 
 def ring(work: Work) -> dict[str, Any]:
     """The same of a rendered ring, whose cameras are known exactly."""
-    folder, size = work.folder / "ring", (work.little(4000, 480), work.little(3000, 360))
-    work.command("bench_cameras", "ring", folder, "--views", work.little(300, 30), "--size", *size)
+    folder, size = work.folder / "ring", (work.little(4000, 1000), work.little(3000, 750))
+    work.command("bench_cameras", "ring", folder, "--views", work.little(300, 45), "--size", *size)
     return _script(work, "bench_cameras", "compare", folder)
 
 
