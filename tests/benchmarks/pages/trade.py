@@ -108,7 +108,7 @@ def choose(results: Results) -> list[str]:
 
 
 def scene_section(results: Results, scene: str) -> list[str]:
-    """The plot of a scene, and its settings that nothing else beats."""
+    """The plot of a scene, and its settings that nothing else beats; of the dials those with their own k."""
     name = f"trade_{scene}"
     if name not in results:
         return missing([name])[1:]
@@ -117,7 +117,8 @@ def scene_section(results: Results, scene: str) -> list[str]:
     sizes = sorted(figures["settings"][0]["times"], key=lambda some: int(some.partition("x")[0]))
     rows = []
     for row in sorted(played_rows(results, name), key=_loss):
-        if row["on_front"] or scene == "dials":
+        own = row["what"]["n_fetches"] == row["n_fetches"]
+        if row["on_front"] if scene != "dials" else own:
             scores = row["scores"]
             cells = [
                 setting_name(row),

@@ -133,7 +133,7 @@ def wait_until_quiet(
                 return share
             raise BusyError(
                 f"processors: expected other programs to take at most {QUIET:.0%} of them, got {share:.0%} "
-                f"after {waited:.0f} minutes: end them, wait longer (--wait), or go on with --busy-anyway"
+                f"after {round(waited, 1):g} minutes: end them, or give --wait more, or --busy-anyway"
             )
         say(
             f"other programs take {share:.0%} of the processors: waiting, {waited:.1f} of {minutes:g} minutes"

@@ -112,7 +112,7 @@ def _core() -> list[Part]:
     ]
     balanced, pages = "bake_lego_balanced", (*bakes(LEGO)[1:], "bake_fox_phone")
     return [
-        Part("compiled", compiled, 4.0),
+        Part("compiled", compiled, 3.0),
         *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 13.5), (CAN, 13.5), (DEMO, 10.0))),
         *(_score(*pair) for pair in ((LEGO, 4.0), (FOX, 3.5), (CAN, 8.5), (DEMO, 1.0))),
         *presets,

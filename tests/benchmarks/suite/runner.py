@@ -76,7 +76,7 @@ class Runner:
         """Run them; returns what failed, and why. Raises BusyError."""
         ordered = self.order(names)
         minutes = sum(self._parts[name].minutes for name in ordered)
-        _say(f"{len(ordered)} of {len(names)} parts to run, about {minutes:.0f} minutes on two cores")
+        _say(f"parts to run: {len(ordered)}, about {minutes:.0f} minutes on two cores")
         for number, name in enumerate(ordered, start=1):
             part = self._parts[name]
             lacking = [needed for needed in part.needs if needed in self._failed]
