@@ -150,6 +150,55 @@ def test_a_row_tells_machine_commit_and_what_ran_beside() -> None:
     assert len(BLOCKS["machines"](results)) == 4
 
 
+def test_the_readme_tells_what_the_parts_found() -> None:
+    baked = {"seconds": 192.0, "n_bytes": 4.94e6}
+    presets = ("fidelity", "balanced", "fast")
+    frames = {
+        f"bake_lego_{preset}": {
+            "rows": [
+                {"march": "numba", "quality": quality, "ms": ms} for quality in ("exact", "high", "fast")
+            ]
+        }
+        for preset, ms in zip(presets, (320, 90, 70), strict=True)
+    }
+    results = {
+        "train_lego": result({"seconds": 570.0}),
+        "eval_lego": result({"psnr": 32.234, "n_views": 200}),
+        "bake_lego_balanced": result(baked),
+        "bake_lego_fast": result(baked | {"n_bytes": 2.4e6}),
+        "trade_lego": TRADE,
+        "play_lego": result(frames),
+        "page": result({"bake_lego_balanced": {"n_bytes": 5.2e6}}),
+    }
+    lines = BLOCKS["expect"](results)
+    assert lines[0] == "Lego of NeRF-synthetic at 400x400, no GPU, on 2 cores (one):"
+    told = [line.split(" | ")[1].removesuffix(" |") for line in lines[4:]]
+    assert told == [
+        "9.5 minutes, 32.23 dB mean PSNR on all 200 test views",
+        "3.2 minutes, 4.9 MB; as a page 5.2 MB",
+        "balanced 0.08 dB; fast, in 2.4 MB, 0.60 dB",
+        "balanced 11, balanced, `--quality fast` 11, fidelity 3.1, fast 14",
+    ]
+
+
+def test_cameras_are_told_by_stage() -> None:
+    off = {"root_mean_square": 0.052, "greatest": 0.087}
+    found = {
+        "seconds": 220.0,
+        "peak_mb": 617.0,
+        "turns": off,
+        "places": off,
+        "n_placed": 45,
+        "n_pictures": 45,
+    }
+    found["stages"] = {"features": [42.8, 15.6], "cameras": [5.2, 2.4]}
+    row = BLOCKS["cameras"]({"cameras_fox": result(found)})[2]
+    took = "220 s (features 43 s, cameras 5.2 s); 0.6 GB"
+    assert (
+        row == f"| fox | A, 0a1b2c3 | {took} | 45 of 45 | 0.052 % (at most 0.087) | 0.052 (at most 0.087) |"
+    )
+
+
 def test_plots_have_a_mark_for_every_setting() -> None:
     ((name, picture),) = plots({"trade_lego": TRADE}).items()
     marks = ElementTree.fromstring(picture).findall("{http://www.w3.org/2000/svg}circle/*")

@@ -128,7 +128,7 @@ def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict
     print(f"  {info['gpuBytes'] / 1e6:.0f} MB of graphics memory, {info['renderer']}")
     with Renderer(asset, 2) as player:
         n_samples = np.mean([player.render(camera).n_density_samples.mean() for camera in cameras])
-    found: dict[str, Any] = {"gpu_bytes": info["gpuBytes"], "renderer": info["renderer"]}
+    told: dict[str, Any] = {"gpu_bytes": info["gpuBytes"], "renderer": info["renderer"]}
     print("  quality   fetches a pixel   a pixel that is hit   pixels hit   multiply-adds a pixel")
     for quality in QUALITIES:
         rows = []
@@ -143,15 +143,15 @@ def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict
             f"  {quality:8} {marched:9.1f} + {weights:.0f} {per_hit:17.1f} {100 * hit:15.1f} % "
             f"{hit * info['multiplyAdds']:18.0f}"
         )
-        found[quality] = {"fetches": marched, "weights": weights, "multiply_adds": hit * info["multiplyAdds"]}
+        told[quality] = {"fetches": marched, "weights": weights, "multiply_adds": hit * info["multiplyAdds"]}
         share = hit
     for name, (fetches, multiply_adds) in OTHERS.items():
-        found[name] = {"fetches": n_samples * fetches, "multiply_adds": share * multiply_adds}
+        told[name] = {"fetches": n_samples * fetches, "multiply_adds": share * multiply_adds}
         print(
             f"  {name:8} {n_samples * fetches:9.1f}       {n_samples * fetches / share:17.1f} "
             f"{'':17} {share * multiply_adds:18.0f}   (filtered, on the same {n_samples:.1f} samples a pixel)"
         )
-    return found
+    return told
 
 
 def report_times(

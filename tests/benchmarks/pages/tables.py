@@ -386,7 +386,7 @@ def expect(results: Results) -> list[str]:
         ],
         ["`vfr-play` at 800x800, frames a second", told],
     ]
-    on = f"{machine['cores']} cores of an {machine['processor']}"
+    on = f"{machine['cores']} cores ({machine['processor']})"
     return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {on}:", "", *titled(["what", "figure"], rows, [])]
 
 
