@@ -16,37 +16,50 @@ import torch
 from torch import Tensor
 
 from vfr_bake.kernels import activations
+from vfr_bake.kernels.bfloat16 import as_array
 
 SPATIAL = 2
 """Layers before the directions come in; the second has no activation."""
+BLOCK = 32
+"""Rows in bfloat16 are filled up to a multiple of this: oneDNN writes code for each number of rows that it
+meets, which takes longer than the product."""
 
 
-def fused_head(features: Tensor, basis: Tensor, width: int, layers: Sequence[torch.nn.Module]) -> Tensor:
+def fused_head(
+    features: Tensor, basis: Tensor, layers: Sequence[torch.nn.Module], products: torch.dtype
+) -> Tensor:
     """Colours [n, 3] of `features` [n, n_channels], float32 on a CPU, with GELU between the layers.
 
     `basis` [n, n_sh] is multiplied by what the second of the `layers` (`torch.nn.Linear`) predicts behind the
-    bottleneck of `width`. Differentiable with respect to the features and the layers.
+    bottleneck. Differentiable with respect to the features and the layers.
+
+    `products`: float32, or bfloat16 for what the layers between the first and the last take and give, forward
+    and backward; sums are in float32.
     """
     weights = [parameter for layer in layers for parameter in layer.parameters()]
-    return _FusedHead.apply(features, basis, width, *weights)  # type: ignore[return-value]
+    return _FusedHead.apply(features, basis, products, *weights)  # type: ignore[return-value]
 
 
 class _FusedHead(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features: Tensor, basis: Tensor, width: int, *parameters: Tensor) -> Tensor:
-        weights, biases = parameters[::2], parameters[1::2]
-        inputs, slopes = [features], []
+    def forward(ctx, features: Tensor, basis: Tensor, products: torch.dtype, *parameters: Tensor) -> Tensor:
+        biases = parameters[1::2]
+        first, *between, last = parameters[::2]
+        weights = [first, *(weight.to(products) for weight in between), last]
+        inputs, slopes = [], []
+        n_rays = len(features)
+        x = torch.nn.functional.pad(features, (0, 0, 0, _left_over(n_rays, products)))
         for number, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
+            inputs.append(x.to(weight.dtype))
+            x = torch.mm(inputs[-1], weight.t())
             if number + 1 == SPATIAL:
-                x = torch.addmm(bias, inputs[-1], weight.t())
-                x[:, width:] *= basis
+                activations.times_basis(as_array(x)[:n_rays], bias.numpy(), basis.numpy())
             else:
-                x = torch.mm(inputs[-1], weight.t())
                 slopes.append(torch.empty_like(x))
-                activations.gelu(x.numpy(), bias.numpy(), slopes[-1].numpy())
-            inputs.append(x)
-        colours = torch.addmm(biases[-1], inputs[-1], weights[-1].t()).sigmoid_()
-        ctx.width, ctx.n_layers = width, len(weights)
+                activations.gelu(as_array(x), bias.numpy(), as_array(slopes[-1]))
+        inputs.append(x.to(last.dtype))
+        colours = torch.addmm(biases[-1], inputs[-1], last.t())[:n_rays].sigmoid_()
+        ctx.n_layers, ctx.products = len(weights), products
         ctx.save_for_backward(basis, colours, *weights, *inputs, *slopes)
         return colours
 
@@ -58,18 +71,32 @@ class _FusedHead(torch.autograd.Function):
         gradients: list[Tensor] = []
         # Rays without a gradient are left out.
         rows = grads[0].any(dim=1).nonzero()[:, 0]
-        basis, colours = basis[rows], colours[rows]
+        n_rows, colours = len(rows), colours[rows]
         grad = grads[0][rows] * colours * (1 - colours)
+        if left_over := _left_over(n_rows, ctx.products):  # the last one again, with a gradient of 0
+            grad = torch.nn.functional.pad(grad, (0, 0, 0, left_over))
+            rows = torch.cat([rows, rows[-1:].expand(left_over)])
         for number in reversed(range(n)):
+            grad = grad.to(weights[number].dtype)
             grad_bias = torch.empty(len(weights[number]))
-            if number == n - 1 or number + 1 == SPATIAL:
+            if number == n - 1:
                 torch.sum(grad, dim=0, out=grad_bias)
+            elif number + 1 == SPATIAL:
+                activations.times_basis_backward(
+                    as_array(grad), basis.numpy(), rows.numpy(), grad_bias.numpy()
+                )
             else:
-                activations.gelu_backward(grad.numpy(), slopes.pop().numpy(), rows.numpy(), grad_bias.numpy())
-            gradients += [grad_bias, torch.mm(grad.t(), inputs[number][rows])]
+                activations.gelu_backward(
+                    as_array(grad), as_array(slopes.pop()), rows.numpy(), grad_bias.numpy()
+                )
+            grad_weight = torch.mm(grad.t(), inputs[number].index_select(0, rows))
+            gradients += [grad_bias, grad_weight.float()]
             grad = torch.mm(grad, weights[number])
-            if number == SPATIAL:
-                grad[:, ctx.width :] *= basis
         grad_features = grads[0].new_zeros(len(grads[0]), grad.shape[1])
-        grad_features[rows] = grad
+        grad_features[rows[:n_rows]] = grad[:n_rows]
         return grad_features, None, None, *reversed(gradients)
+
+
+def _left_over(n_rows: int, products: torch.dtype) -> int:
+    """How many rows of zeros fill `n_rows` up."""
+    return -n_rows % BLOCK if products == torch.bfloat16 else 0

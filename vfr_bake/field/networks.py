@@ -136,6 +136,8 @@ class Head(nn.Module):
         self.activation = {"gelu": gelu, "relu": relu}[config.activation]
         self.plain_sh = config.view_encoding == "sh"
         self._is_fused = self.activation is gelu and not self.plain_sh
+        self.products = torch.float32
+        """Type of the matrix products on a CPU where a gradient is wanted; weights are float32 always."""
         self.n_sh_features = 1 if self.plain_sh else config.n_sh_features
         self.harmonics = SphericalHarmonics(config.sh_degree)
         n_sh = config.sh_degree**2 * self.n_sh_features
@@ -154,7 +156,8 @@ class Head(nn.Module):
         fits = features.device.type == "cpu" and features.dtype == torch.float32
         if self._is_fused and fits and not torch.compiler.is_compiling():
             basis = self.harmonics(dirs).repeat_interleave(self.n_sh_features, dim=-1)
-            return fused_head(features, basis, self.width, [*self.spatial, *self.directional, self.out])
+            products = self.products if torch.is_grad_enabled() else torch.float32
+            return fused_head(features, basis, [*self.spatial, *self.directional, self.out], products)
         h = self.spatial[1](self.activation(self.spatial[0](features)))
         encoded = self.harmonics(dirs)
         if not self.plain_sh:

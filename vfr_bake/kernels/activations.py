@@ -8,14 +8,10 @@ times a polynomial of t, to 8e-8 (Abramowitz and Stegun 1964, 26.2.17): one expo
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from vfr_bake.kernels import njit
+from vfr_bake.kernels.bfloat16 import float_of_bits, get, put
 from vfr_bake.kernels.hash_grid import FLAGS
 
 PER_LOG = np.float32(1.4426950408889634)
@@ -34,18 +30,6 @@ SLOPE = np.float32(0.2316419)
 B1, B2, B3, B4, B5 = map(np.float32, (0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429))
 PEAK = np.float32(0.3989422804014327)
 """1 / sqrt(2 pi), the density at 0."""
-
-
-def _float_of_bits(_: Any, bits: Any) -> Any:
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-float_of_bits: Any = intrinsic(_float_of_bits)
-"""float_of_bits(bits): the float32 whose bits an int32 has."""
 
 
 @njit(inline="always")
@@ -67,16 +51,16 @@ def exp_of_minus(y):
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gelu(x, bias, slopes):
     """Replace `x` [n, width] by the GELU of x + `bias` [width], whose slopes are written to `slopes` [n,
-    width]; float32, to 1e-6."""
+    width]; to 1e-6 in float32, and rounded to bfloat16 where these are."""
     for row in range(x.shape[0]):
         for c in range(x.shape[1]):
-            value = x[row, c] + bias[c]
+            value = get(x, row, c) + bias[c]
             density = PEAK * exp_of_minus(value * value * HALF)
             t = ONE / (ONE + SLOPE * abs(value))
             tail = density * (t * (B1 + t * (B2 + t * (B3 + t * (B4 + t * B5)))))
             share = ONE - tail if value >= 0 else tail
-            x[row, c] = value * share
-            slopes[row, c] = share + value * density
+            put(x, row, c, value * share)
+            put(slopes, row, c, share + value * density)
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
@@ -85,10 +69,37 @@ def gelu_backward(grad, slopes, rows, grad_bias):
     `grad_bias` [width]."""
     grad_bias[:] = 0
     for row in range(grad.shape[0]):
+        behind = rows[row]
         for c in range(grad.shape[1]):
-            value = grad[row, c] * slopes[rows[row], c]
-            grad[row, c] = value
-            grad_bias[c] += value
+            put(grad, row, c, get(grad, row, c) * get(slopes, behind, c))
+        for c in range(grad.shape[1]):
+            grad_bias[c] += get(grad, row, c)
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def times_basis(x, bias, basis):
+    """Add `bias` [width] to `x` [n, width], and multiply its last columns by `basis` [n, n_basis], in
+    place."""
+    first = x.shape[1] - basis.shape[1]
+    for row in range(x.shape[0]):
+        for c in range(first):
+            put(x, row, c, get(x, row, c) + bias[c])
+        for c in range(basis.shape[1]):
+            put(x, row, first + c, (get(x, row, first + c) + bias[first + c]) * basis[row, c])
+
+
+@njit(cache=True, fastmath=FLAGS, error_model="numpy")
+def times_basis_backward(grad, basis, rows, grad_bias):
+    """Multiply the last columns of `grad` [n, width] by the `rows` [n] of `basis`, and write the sum over its
+    rows to `grad_bias` [width]."""
+    first = grad.shape[1] - basis.shape[1]
+    grad_bias[:] = 0
+    for row in range(grad.shape[0]):
+        behind = rows[row]
+        for c in range(first, grad.shape[1]):
+            put(grad, row, c, get(grad, row, c) * basis[behind, c - first])
+        for c in range(grad.shape[1]):
+            grad_bias[c] += get(grad, row, c)
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")

@@ -20,6 +20,7 @@ from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
+from vfr_bake.kernels.bfloat16 import fast_products
 from vfr_bake.rendering.compositing import RaySamples, composite, composite_field
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
@@ -149,6 +150,7 @@ class Trainer:
             self._guide = ProposalGuide(self.config, self.pace, scene.near)
         else:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
+        self._field.head.products = fast_products()
         grid = self._field.grid
         # Several processes have to add up their gradients before the step.
         self._grid_adam = GridAdam(grid.table) if self.processes.size > 1 else FusedGridAdam(grid)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels.activations import gelu, gelu_backward, relu_backward
+from vfr_bake.kernels import bfloat16, njit
+from vfr_bake.kernels.activations import (
+    gelu,
+    gelu_backward,
+    relu_backward,
+    times_basis,
+    times_basis_backward,
+)
+from vfr_bake.kernels.bfloat16 import as_array, fast_products, get, put
 
 HARD = np.array([0.0, -0.0, 1e-42, -1e-42, 1.0, -1.0, 7.9, -7.9, 8.1, -8.1, 90.0, -90.0, 1e18, -1e18])
 
@@ -38,6 +48,81 @@ def test_gelu_keeps_nan_and_takes_nothing() -> None:
     gelu(np.empty((0, 3), np.float32), np.zeros(3, np.float32), np.empty((0, 3), np.float32))
     grad_bias = np.ones(3, np.float32)
     gelu_backward(np.empty((0, 3), np.float32), slopes, np.empty(0, np.int64), grad_bias)
+    assert not grad_bias.any()
+
+
+@njit()
+def copy(source: np.ndarray, target: np.ndarray) -> None:
+    for c in range(source.shape[1]):
+        put(target, 0, c, get(source, 0, c))
+
+
+def test_kernels_round_to_bfloat16_as_torch_does() -> None:
+    ties = torch.tensor([[1 + 2**-8, 1 + 3 * 2**-8, 1 + 2**-8 + 2**-23, -1 - 2**-8, 3.4e38, 2.0**-133 * 1.5]])
+    ends = torch.tensor([[torch.inf, -torch.inf, torch.nan, *HARD]], dtype=torch.float32)
+    all_bits = torch.tensor([[0x7FFFFFFF, -1, 0x7F800001]], dtype=torch.int32).view(torch.float32)  # NaN
+    values = torch.cat([ties, ends, all_bits, torch.randn(1, 1000)], dim=1)
+    rounded, again = torch.empty(values.shape, dtype=torch.bfloat16), torch.empty_like(values)
+    copy(as_array(values), as_array(rounded))
+    torch.testing.assert_close(rounded, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
+    copy(as_array(rounded), as_array(again))
+    torch.testing.assert_close(again, rounded.float(), rtol=0, atol=0, equal_nan=True)
+
+
+def test_which_processors_multiply_in_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, has_them, expected in (
+        ("znver4", True, torch.bfloat16), ("znver3", False, torch.float32),
+        ("sapphirerapids", True, torch.float32), ("generic", False, torch.float32),
+    ):  # fmt: skip
+        monkeypatch.setattr(bfloat16.binding, "get_host_cpu_name", lambda name=name: name)
+        features = {"avx512bf16": True} if has_them else {}
+        monkeypatch.setattr(bfloat16.binding, "get_host_cpu_features", lambda features=features: features)
+        assert fast_products() == expected, name
+
+
+def test_activations_in_bfloat16_are_those_of_float64_rounded() -> None:
+    x = torch.cat([torch.linspace(-12, 12, 4000), torch.tensor(HARD, dtype=torch.float32)])[None].bfloat16()
+    bias, rows = np.linspace(-1, 1, x.shape[1]).astype(np.float32), np.array([1])
+    exact = (x[0].double() + torch.from_numpy(bias).double()).requires_grad_()
+    values = torch.nn.functional.gelu(exact)
+    values.sum().backward()
+    assert exact.grad is not None
+    ours, slopes = x.clone(), torch.empty(2, x.shape[1]).bfloat16()
+    gelu(as_array(ours), bias, as_array(slopes[1:]))
+    # Half of the last of eight binary digits, beside what float32 is allowed.
+    torch.testing.assert_close(ours[0].double(), values.detach(), rtol=2**-8, atol=1e-6)
+    torch.testing.assert_close(slopes[1].double(), exact.grad, rtol=2**-8, atol=1e-6)
+    grad = torch.full_like(x, 3.0)
+    grad_bias = np.empty(x.shape[1], np.float32)
+    gelu_backward(as_array(grad), as_array(slopes), rows, grad_bias)
+    torch.testing.assert_close(grad[0], 3 * slopes[1], rtol=0, atol=0)
+    np.testing.assert_array_equal(grad_bias, grad[0].float().numpy())
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
+def test_products_with_the_basis_match_float64(kind: torch.dtype) -> None:
+    torch.manual_seed(0)
+    rows = torch.tensor([4, 0, 2])
+    x, grad, bias, basis = (
+        torch.randn(5, 7).to(kind),
+        torch.randn(3, 7).to(kind),
+        torch.randn(7),
+        torch.randn(5, 4),
+    )
+    basis[2] = 0
+    factors = torch.cat([torch.ones(5, 3), basis], dim=1).double()
+    expected, expected_grad = (x.double() + bias) * factors, grad.double() * factors[rows]
+    grad_bias = torch.empty(7)
+    times_basis(as_array(x), bias.numpy(), basis.numpy())
+    times_basis_backward(as_array(grad), basis.numpy(), rows.numpy(), grad_bias.numpy())
+    # Half of the last of eight binary digits (of 24, twice).
+    digits = 2**-8 if kind == torch.bfloat16 else 2**-22
+    torch.testing.assert_close(x.double(), expected, rtol=digits, atol=1e-6)
+    torch.testing.assert_close(grad.double(), expected_grad, rtol=digits, atol=1e-6)
+    torch.testing.assert_close(grad_bias.double(), expected_grad.sum(dim=0), rtol=0, atol=9 * digits)
+    nothing = np.empty((0, 7), np.float32), np.empty((0, 4), np.float32)
+    times_basis(nothing[0], bias.numpy(), nothing[1])
+    times_basis_backward(nothing[0], basis.numpy(), np.empty(0, np.int64), grad_bias.numpy())
     assert not grad_bias.any()
 
 
@@ -94,8 +179,63 @@ def test_fused_head_matches_float64(n_rays: int, n_layers: int) -> None:
     assert not ours[1][1::3].any()
 
 
-def test_fused_head_takes_nothing_and_keeps_nan() -> None:
+@pytest.fixture
+def without_onednn() -> Iterator[None]:
+    """Torch's own products of bfloat16, which are the same on every machine."""
+    before = torch.backends.mkldnn.set_flags(False)[0]
+    yield
+    torch.backends.mkldnn.set_flags(before)
+
+
+@pytest.mark.usefixtures("without_onednn")
+def test_fused_head_in_bfloat16_is_near_float64() -> None:
+    torch.manual_seed(0)
+    config = FieldConfig(n_levels=4, head_width=64, sh_degree=3, n_sh_features=2)
+    head, exact = Head(config), Head(config).double()
+    exact.load_state_dict(head.state_dict())
+    features, wanted = torch.randn(200, 8), torch.randn(200, 3)
+    wanted[1::3] = 0
+    dirs = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    theirs = gradients(exact, features.double(), dirs.double(), wanted.double())
+    in_float32 = gradients(head, features, dirs, wanted)
+    head.products = torch.bfloat16
+    ours = gradients(head, features, dirs, wanted)
+    for our, single, their in zip(ours, in_float32, theirs, strict=True):
+        # Factors are rounded by 2^-9 in each of five layers, forward and back.
+        assert our.dtype == torch.float32
+        assert float((our - their).norm()) <= 10 * 2**-9 * float(their.norm())
+        assert float((single - their).norm()) <= 1e-5 * float(their.norm())
+    assert (ours[0] != in_float32[0]).any() and not ours[1][1::3].any()
+    with torch.no_grad():  # pictures are shown by the weights as they are
+        torch.testing.assert_close(head(features, dirs), in_float32[0], rtol=0, atol=0)
+
+
+@pytest.mark.usefixtures("without_onednn")
+def test_products_in_bfloat16_have_few_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
     head = Head(FieldConfig(n_levels=2, head_width=8))
+    head.products = torch.bfloat16
+    multiply, sizes = torch.mm, set[tuple[torch.Size, torch.Size]]()
+
+    def mm(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        sizes.add((a.shape, b.shape))
+        return multiply(a, b)
+
+    monkeypatch.setattr(torch, "mm", mm)
+    found = []
+    for n_rays in (33, 47, 64):  # more than 32, in products with and without the rays that are left out
+        wanted = torch.ones(n_rays, 3)
+        wanted[34::3] = 0
+        gradients(head, torch.randn(n_rays, 4), torch.ones(n_rays, 3), wanted)
+        found.append(sizes.copy())
+        sizes.clear()
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.usefixtures("without_onednn")
+@pytest.mark.parametrize("products", [torch.float32, torch.bfloat16])
+def test_fused_head_takes_nothing_and_keeps_nan(products: torch.dtype) -> None:
+    head = Head(FieldConfig(n_levels=2, head_width=8))
+    head.products = products
     none = gradients(head, torch.empty(0, 4), torch.empty(0, 3), torch.empty(0, 3))
     assert none[0].shape == (0, 3) and not any(gradient.any() for gradient in none[1:])
     features, dirs = torch.full((2, 4), torch.nan), torch.tensor([[0.0, 0.0, 1.0]] * 2)

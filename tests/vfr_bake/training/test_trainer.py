@@ -67,6 +67,15 @@ def test_same_seed_same_field(scene: Scene) -> None:
     assert torch.equal(*tables)
 
 
+def test_the_head_multiplies_as_the_processor_does_best(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind in (torch.bfloat16, torch.float32):
+        monkeypatch.setattr("vfr_bake.training.trainer.fast_products", lambda kind=kind: kind)
+        head = Trainer(scene, config(steps=1)).field.head
+        assert head.products == kind and all(p.dtype == torch.float32 for p in head.parameters())
+
+
 def test_the_minutes_end_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that moves on by a second whenever it is looked at."""
     clock = itertools.count()
