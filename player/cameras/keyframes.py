@@ -22,38 +22,45 @@ def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
     >>> [round(camera.fx, 6) for camera in smooth_path(views, 2)]
     [5.0, 10.0, 20.0]
     """
-    places = np.stack([view.c2w[:3, 3] for view in views])
-    turns = _continuous([quaternion(view.c2w[:3, :3]) for view in views])
-    focal = [view.fy / view.height * views[0].height for view in views]
-    path = []
-    for index in range(len(views) - 1):
-        around = places[np.clip(np.arange(index - 1, index + 3), 0, len(views) - 1)]
-        for step in range(n_between):
-            share = step / n_between
-            c2w = np.eye(4)
-            c2w[:3, :3] = rotation_matrix(_slerp(turns[index], turns[index + 1], share))
-            c2w[:3, 3] = _spline(around, share)
-            path.append(_zoomed(views[0], c2w, focal[index] ** (1 - share) * focal[index + 1] ** share))
-    return [*path, _zoomed(views[0], views[-1].c2w, focal[-1])]
+    path = [
+        camera_on_path(views, index, step / n_between)
+        for index in range(len(views) - 1)
+        for step in range(n_between)
+    ]
+    return [*path, _zoomed(views[0], views[-1].c2w, _focal(views[0], views[-1]))]
+
+
+def camera_on_path(views: Sequence[Camera], index: int, share: float) -> Camera:
+    """One camera of `smooth_path`: at `share`, 0 to 1, of the way from `views[index]` to the next.
+
+    >>> views = [Camera(str(x), np.eye(4), 4, 4, f, f, 2.0, 2.0) for x, f in enumerate((5.0, 20.0))]
+    >>> round(camera_on_path(views, 0, 0.5).fx, 6)
+    10.0
+    """
+    around = [views[i].c2w[:3, 3] for i in np.clip(np.arange(index - 1, index + 3), 0, len(views) - 1)]
+    one, other = views[index], views[index + 1]
+    a, b = quaternion(one.c2w[:3, :3]), quaternion(other.c2w[:3, :3])
+    c2w = np.eye(4)
+    c2w[:3, :3] = rotation_matrix(_slerp(a, -b if a @ b < 0 else b, share))  # the short way
+    c2w[:3, 3] = _spline(around, share)
+    fy = _focal(views[0], one) ** (1 - share) * _focal(views[0], other) ** share
+    return _zoomed(views[0], c2w, fy)
+
+
+def _focal(size: Camera, view: Camera) -> float:
+    """`fy` of a picture as high as that of `size` with the vertical field of view of `view`."""
+    return view.fy / view.height * size.height
 
 
 def _zoomed(camera: Camera, c2w: np.ndarray, fy: float) -> Camera:
     return replace(camera, c2w=c2w, fx=camera.fx * fy / camera.fy, fy=fy)
 
 
-def _spline(points: np.ndarray, share: float) -> np.ndarray:
+def _spline(points: Sequence[np.ndarray], share: float) -> np.ndarray:
     """The Catmull-Rom point between the second and the third of four."""
     a, b, c, d = points
     linear, square, cube = c - a, 2 * a - 5 * b + 4 * c - d, 3 * b - 3 * c + d - a
     return b + share / 2 * (linear + share * (square + share * cube))
-
-
-def _continuous(turns: list[np.ndarray]) -> list[np.ndarray]:
-    """The quaternions with signs chosen so that the way from each to the next is the short one."""
-    for index in range(1, len(turns)):
-        if turns[index] @ turns[index - 1] < 0:
-            turns[index] = -turns[index]
-    return turns
 
 
 def _slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:

@@ -22,7 +22,7 @@ import numpy as np
 
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera, focus_point
-from player.cameras.keyframes import smooth_path
+from player.cameras.keyframes import camera_on_path
 from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
@@ -84,13 +84,12 @@ def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> 
         other = random.choice(nearest) if len(nearest) else index
         angle = float(np.arccos(np.clip(sides[index] @ sides[other], -1, 1)))
         share = min(random.uniform(0.25, 0.5), LARGEST_TURN / max(angle, 1e-9))
-        path = smooth_path([cameras[index], cameras[other]], PLACES)
         axis = random.normal(size=3)
         turn = _turn(axis / np.linalg.norm(axis), min(angle, LARGEST_TURN) / 4 * random.uniform(0.5, 1))
         move = np.eye(4)
         move[:3, :3] = turn
         move[:3, 3] = focus - turn @ focus
-        camera = path[round(share * PLACES)]
+        camera = camera_on_path([cameras[index], cameras[other]], 0, round(share * PLACES) / PLACES)
         if wide:
             aside = random.normal(size=3)
             aside *= random.uniform(0, ASIDE) / np.linalg.norm(aside)
