@@ -197,17 +197,6 @@ def test_missing_extra_is_named(
     assert not list(tmp_path.iterdir())
 
 
-def test_same_bytes_again(shells_asset: Path, tmp_path: Path) -> None:
-    for name, options in (
-        ("a.ply", {}), ("a.obj", {}), ("a.glb", {}), ("a.stl", {}), ("a.json", {"frame": "model"}),
-        ("b.ply", {"points": 40}), ("a.onnx", {}), ("a.usdc", {}), ("a.usda", {}),
-        ("a.vdb", {"colour": True}), ("a.npz", {"colour": True}),
-    ):  # fmt: skip
-        for folder in ("one", "two"):
-            export.export_asset(shells_asset, tmp_path / folder / name, ExportOptions(**options))
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
-
-
 def test_views_and_sizes_are_python_s() -> None:
     assert [np.arange(9)[part(text)].tolist() for text in ("2", "-1", "::4", "7:")] == [
         [2], [8], [0, 4, 8], [7, 8]
