@@ -23,7 +23,7 @@ from player.errors import ConfigError, OutputError, TrainingError
 from player.march.march import march
 from player.render import render
 from tests.vertex_grids import rows_of
-from vfr_bake.baking.bake import _Bake, bake
+from vfr_bake.baking.bake import BakeResult, _Bake, bake
 from vfr_bake.baking.cells import corners_of, pixel_footprints
 from vfr_bake.baking.distillation import TrainingRays, player_fetches
 from vfr_bake.baking.grids import code_step, encode_features, head_sensitivity, project
@@ -48,9 +48,32 @@ from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import psnr
 
+FINE: dict[str, Any] = {
+    "resolution": 96,
+    "feature_resolution": 96,
+    "mesh_resolution": 16,
+    "refine_steps": 0,
+    "check_views": 1,
+}
+
 
 def quiet(stage: str, done: int, of: int) -> None:
     """No progress."""
+
+
+@pytest.fixture(scope="module")
+def fine(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BakeResult]:
+    """The asset of FINE, and what was told of it."""
+    folder = tmp_path_factory.mktemp("fine") / "asset"
+    return folder, bake(model, folder, BakeConfig(**FINE), quiet)
+
+
+@pytest.fixture(scope="module")
+def default_sizes(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An asset whose grids are as fine as the preset has them."""
+    folder = tmp_path_factory.mktemp("default") / "asset"
+    bake(model, folder, BakeConfig(mesh_resolution=96, refine_steps=0, check_views=1), quiet)
+    return folder
 
 
 def test_projection_is_the_best_of_its_rank() -> None:
@@ -101,13 +124,11 @@ def test_every_corner_of_a_visible_cell_is_stored() -> None:
     assert {tuple(v) for v in np.argwhere(corners_of(cells))} == expected
 
 
-def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, tmp_path: Path) -> None:
+def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, fine: tuple[Path, BakeResult]) -> None:
     # Cells a third of a pixel wide: one ray a pixel would miss most of them.
     camera, in_model = model.cameras[3], model.model_cameras()[3]
-    settings = BakeConfig(resolution=96, mesh_resolution=16, refine_steps=0, check_views=1)
-    bake(model, tmp_path / "asset", settings, quiet)
     large = camera.resized(256, 256)
-    played = render(Asset.open(tmp_path / "asset"), large, n_fetches=0)
+    played = render(Asset.open(fine[0]), large, n_fetches=0)
     _, opacity, _ = model.occupancy.composited_features(model.field, *in_model.resized(256, 256).rays())
     solid = opacity.reshape(256, 256) > 0.95
     assert solid.mean() > 0.1
@@ -331,20 +352,15 @@ def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tm
             BakeConfig(**{name: 0})
 
 
-def test_a_budget_is_kept_by_storing_less_of_each_value(model: Model, tmp_path: Path) -> None:
-    small: dict[str, Any] = {
-        "resolution": 96,
-        "feature_resolution": 96,
-        "mesh_resolution": 16,
-        "refine_steps": 0,
-        "check_views": 1,
-    }
-    whole = bake(model, tmp_path / "all", BakeConfig(**small), quiet)
-    manifest = Asset.open(tmp_path / "all").manifest
+def test_a_budget_is_kept_by_storing_less_of_each_value(
+    model: Model, fine: tuple[Path, BakeResult], tmp_path: Path
+) -> None:
+    folder, whole = fine
+    manifest = Asset.open(folder).manifest
     sections = [section for part in manifest.parts for section in part.sections]
     symbols = sum(section.bytes for section in sections if section.kind == "symbols")
     limit = (whole.n_bytes - symbols / 2) / 1e6
-    result = bake(model, tmp_path / "half", BakeConfig(max_mb=limit, **small), quiet)
+    result = bake(model, tmp_path / "half", BakeConfig(max_mb=limit, **FINE), quiet)
     half = Asset.open(tmp_path / "half").manifest
     assert (half.n_channels, half.resolution) == (manifest.n_channels, manifest.resolution)
     assert 0.5 * limit < result.n_bytes / 1e6 <= limit
@@ -389,9 +405,8 @@ def test_views_of_a_scene_stand_aside_of_the_way_between_two_cameras(model: Mode
     assert step < off_the_walk[1].max() < 4 * step and np.median(off_the_walk[1]) > 0.1 * step
 
 
-def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "asset", BakeConfig(mesh_resolution=96, refine_steps=0, check_views=1), quiet)
-    mesh = read_ply(tmp_path / "asset" / "mesh.ply")
+def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, default_sizes: Path) -> None:
+    mesh = read_ply(default_sizes / "mesh.ply")
     distance = np.abs(demo.signed_distance(mesh.vertices))
     half = model.world_from_model[0, 0]
     voxel, pixel = 2 * half / 96, 2 * half / 64
@@ -410,18 +425,15 @@ def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
 
 
 def test_grids_are_as_fine_as_the_pictures_and_features_never_finer_than_the_field(
-    model: Model, tmp_path: Path
+    model: Model, default_sizes: Path
 ) -> None:
     per_pixel = PRESETS["balanced"].cells_per_pixel
     cell_of_a_pixel = 2 * per_pixel / float(np.median(pixel_footprints(model)))
     assert 40 < cell_of_a_pixel < 144
-    bake(model, tmp_path / "a", BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1), quiet)
-    made = Asset.open(tmp_path / "a").manifest
+    made = Asset.open(default_sizes).manifest
     assert made.resolution == round(cell_of_a_pixel)
     assert made.feature_resolution == round(PRESETS["balanced"].feature_share * made.resolution)
-    finest = BakeConfig(
-        resolution=500, feature_resolution=400, mesh_resolution=16, refine_steps=0, check_views=1
-    )
-    bake(model, tmp_path / "b", finest, quiet)
-    made = Asset.open(tmp_path / "b").manifest
-    assert (made.resolution, made.feature_resolution) == (144, 96)
+    layout, _ = _Bake(
+        model, BakeConfig(resolution=500, feature_resolution=400, check_views=1), quiet
+    )._cells()
+    assert (layout.densities.resolution, layout.features.resolution) == (144, 96)
