@@ -25,15 +25,22 @@ LACKING = {
 Open3D where pyproject.toml does not ask for it, and Ctrl-C that is sent to a process."""
 LONGEST = (
     "tests/vfr_bake/baking/test_bake.py",
-    "tests/test_real_data.py",
-    "tests/test_real_scene.py",
-    "tests/vfr_bake/test_cli.py",
-    "tests/vfr_bake/training/test_trainer.py",
     "tests/player/compiled/test_processor.py",
+    "tests/test_real_scene.py",
+    "tests/test_real_data.py",
+    "tests/vfr_bake/data/models/test_folds.py",
+    "tests/vfr_bake/training/test_trainer.py",
+    "tests/vfr_bake/test_cli.py",
+    "tests/vfr_bake/training/test_devices.py",
+    "tests/reliability/test_reliability.py",
+    "tests/vfr_bake/training/test_processes.py",
+    "tests/player/page/test_renderer.py",
     "tests/player/viewer/test_viewer.py",
-    "tests/vfr_bake/bench/test_bench.py",
+    "tests/test_current_folder.py",
 )
-"""Files that take longest, begun first: no worker is then left alone with one of them at the end."""
+"""Files that take longest, begun first: no worker is then left alone with one of them at the end. The first
+two are begun at the same time, in a clean checkout before anything is compiled: the second compiles for other
+processors, so that they do not both compile the same."""
 N_TESTS = {"programs": 13, "open3d": 35, "signals": 1}
 """Tests marked `needs(...)`: so many are skipped where that is lacking, and no other test anywhere."""
 
