@@ -1,5 +1,5 @@
-"""The samples of rays one by one, for those who want more of them than a picture: the compiled twin of
-`player.march.march.sample_rays`."""
+"""The samples of rays one by one, and where they lie, for those who want more of them than a picture: the
+compiled twin of `player.march.march.sample_rays`."""
 
 from __future__ import annotations
 
@@ -10,61 +10,87 @@ import numpy as np
 from player.asset.grid import SparseGrid
 from player.compiled.lanes import LANES
 from player.compiled.march import enter
-from player.compiled.packets import N_SAMPLES, SUMS, TAU, march_packet_ways
+from player.compiled.packets import N_SAMPLES, SUMS, TAU, march_packet_ways, place_fetches
 from player.compiling import compiled
 from player.march.fetches import Samples
-from player.march.march import SampledRays
-from player.march.path import path_of
+from player.march.path import Path, path_of
 from player.scratch import check_scratch, scratch
 
 F32 = np.float32
 MOST_AT_ONCE = 1 << 20
-"""Samples that are held beside those that are handed out: 20 MB."""
+"""Samples that are held beside those that are handed out: 34 MB."""
+
+
+class PlacedSamples(NamedTuple):
+    """n rays and what they meet: a `player.march.march.SampledRays`, and where that is."""
+
+    path: Path
+    samples: Samples
+    ways: np.ndarray
+    tau: np.ndarray
+    n_density_samples: np.ndarray
+    points: np.ndarray
+    """[n_samples, 3] float32: where the samples are, cells of the finest level of the densities."""
 
 
 class _Met(NamedTuple):
-    """Samples as they are found, [n] each: the columns of `Samples`, and ways."""
+    """Samples as they are found, [n] each: the columns of `Samples`, ways, and points [n, 3]."""
 
     ray: np.ndarray
     s: np.ndarray
     weights: np.ndarray
     ways: np.ndarray
+    points: np.ndarray
 
 
-def sample_rays(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> SampledRays:
-    """`player.march.march.sample_rays`, compiled: same result to float32 rounding."""
+def sample_rays(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> PlacedSamples:
+    """`player.march.march.sample_rays`, compiled: same result to float32 rounding, and the samples' points as
+    `Path.at` has them."""
     lookup, steps, packets, most_samples = enter(grid, rays_o, rays_d)
     n_rays, room = len(rays_o), max(MOST_AT_ONCE, most_samples * LANES)
     samples, sums = scratch((3, most_samples, LANES), F32), scratch((SUMS, LANES), F32)
     tau, counts = scratch(n_rays, F32, 0), scratch(n_rays, np.int32, 0)
-    met = _Met(scratch(room, np.int64), *(scratch(room, F32) for _ in range(3)))
+    met = _Met(scratch(room, np.int64), *(scratch(room, F32) for _ in range(3)), scratch((room, 3), F32))
+    work = samples, sums, scratch((3, LANES), F32), scratch(LANES, F32), scratch(LANES, np.int64)
     parts, number = [], 0
     while number < len(packets):
-        n, number = _sample_packets(lookup, steps, packets, number, samples, sums, met, tau, counts)
+        n, number = _sample_packets(lookup, steps, packets, number, work, met, tau, counts)
         parts.append([column[:n].copy() for column in met])
-    check_scratch(packets, samples, sums, tau, counts, met)
-    ray, s, weights, ways = (
+    check_scratch(packets, *work, tau, counts, met)
+    ray, s, weights, ways, points = (
         (np.concatenate(column) for column in zip(*parts, strict=True))
         if parts
         else (column[:0] for column in met)
     )
-    return SampledRays(path_of(grid, rays_o, rays_d), Samples(ray, s, weights), ways, tau, counts)
+    return PlacedSamples(path_of(grid, rays_o, rays_d), Samples(ray, s, weights), ways, tau, counts, points)
 
 
 @compiled
-def _sample_packets(lookup, steps, packets, number, samples, sums, met, tau, counts):
+def _sample_packets(lookup, steps, packets, number, work, met, tau, counts):
     """The samples with weight of the packets from `number` on, as long as there is room for those of another.
     Returns their number, and that of the packet to go on with."""
+    samples, sums, places, weights, placed = work
     n, most = 0, len(met.ray) - samples.shape[1] * LANES
     while number < len(packets) and n <= most:
         rows = march_packet_ways(lookup, steps, packets, number, samples, sums)
-        for lane in range(min(LANES, len(tau) - number * LANES)):
+        n_lanes = min(LANES, len(tau) - number * LANES)
+        for lane in range(n_lanes):
             ray = number * LANES + lane
             tau[ray], counts[ray] = sums[TAU, lane], int(sums[N_SAMPLES, lane])
+            placed[lane] = n
             for j in range(rows):
                 if samples[1, j, lane] > F32(0.0):
                     met.ray[n], met.s[n] = ray, samples[0, j, lane]
                     met.weights[n], met.ways[n] = samples[1, j, lane], samples[2, j, lane]
                     n += 1
+        for j in range(rows):
+            for lane in range(LANES):
+                weights[lane] = samples[1, j, lane]
+            place_fetches(steps, packets, number, samples, j * LANES, places, weights)
+            for lane in range(n_lanes):
+                if samples[1, j, lane] > F32(0.0):
+                    for axis in range(3):
+                        met.points[placed[lane], axis] = places[axis, lane]
+                    placed[lane] += 1
         number += 1
     return n, number

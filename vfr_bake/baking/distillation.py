@@ -213,30 +213,28 @@ class PlayerFetches(NamedTuple):
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
     `player.march.march` composes them with k = `n_fetches`."""
-    entries, samples, ways, tau, _ = sample_rays(grid, rays_o, rays_d)
+    entries, samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d)
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)
     is_hit[hits] = True
     counts = np.bincount(samples.ray, minlength=len(opacity))
     merged = is_hit[samples.ray] & (counts[samples.ray] > n_fetches) & (n_fetches > 0)
-    ray, s, weights, lengths = (column[is_hit[samples.ray] & ~merged] for column in (*samples, ways))
+    kept = is_hit[samples.ray] & ~merged
+    ray, points, weights, lengths = (column[kept] for column in (samples.ray, places, samples.weights, ways))
     if merged.any():
-        many = Samples(*(column[merged] for column in samples))
-        bins = equal_mass_bins(many, n_fetches)
-        places = bins.s.copy()
-        points = np.ascontiguousarray(entries.at(bins.ray, places).T)
-        gaps = np.flatnonzero(~corners(grid.rows, points * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
+        bins = equal_mass_bins(Samples(*(column[merged] for column in samples)), n_fetches)
+        at = np.ascontiguousarray(entries.at(bins.ray, bins.s).T)
+        gaps = np.flatnonzero(~corners(grid.rows, at * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
         if len(gaps):
-            places[gaps] = many.s[heaviest(bins, gaps)]
+            at[gaps] = places[merged][heaviest(bins, gaps)]
         ray = np.concatenate([ray, bins.ray])
-        s = np.concatenate([s, places])
+        points = np.concatenate([points, at])
         weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_fetches)])
         lengths = np.concatenate([lengths, np.zeros(len(bins.ray), np.float32)])
         order = np.argsort(ray, kind="stable")
-        ray, s, weights, lengths = ray[order], s[order], weights[order], lengths[order]
+        ray, points, weights, lengths = ray[order], points[order], weights[order], lengths[order]
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    points = np.ascontiguousarray(entries.at(ray, s).T)
     return PlayerFetches(hits, opacity[hits], counts, points, weights.astype(np.float32), lengths)
 
 

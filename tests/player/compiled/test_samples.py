@@ -37,8 +37,9 @@ def compare(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> int:
     np.testing.assert_allclose(a.samples.weights[kept_a], b.samples.weights[kept_b], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(a.ways[kept_a], b.ways[kept_b], rtol=1e-4)
     np.testing.assert_allclose(a.tau[same], b.tau[same], rtol=1e-4, atol=1e-6)
-    at = b.path.at(b.samples.ray, b.samples.s)
-    assert at.shape == (3, len(b.samples.s))
+    at = b.path.at(b.samples.ray, b.samples.s).T
+    assert b.points.shape == at.shape == (len(b.samples.s), 3)
+    np.testing.assert_allclose(b.points, at, rtol=0, atol=2e-5 * grid.resolution)
     return len(b.samples.s)
 
 
@@ -62,5 +63,6 @@ def test_more_samples_than_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> 
     grid, some = GRIDS["haze"](), rays(1000, seed=2)
     whole = compiled.sample_rays(grid, *some)
     monkeypatch.setattr(compiled, "MOST_AT_ONCE", 1)
-    for a, b in zip(compiled.sample_rays(grid, *some).samples, whole.samples, strict=True):
+    parts = compiled.sample_rays(grid, *some)
+    for a, b in zip((*parts.samples, parts.points), (*whole.samples, whole.points), strict=True):
         np.testing.assert_array_equal(a, b)

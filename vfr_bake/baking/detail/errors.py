@@ -139,14 +139,14 @@ def samples_of(grid: SparseGrid, rays: TeacherRays) -> Iterator[Segments]:
     """The samples with weight of the rays, some rays at a time."""
     for first in range(0, len(rays.opacity), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
-        path, samples, *_ = sample_rays(grid, rays.rays_o[some], rays.rays_d[some])
+        sampled = sample_rays(grid, rays.rays_o[some], rays.rays_d[some])
+        samples = sampled.samples
         weights = samples.weights.astype(np.float64)
         running = np.cumsum(weights)
         begins = np.searchsorted(samples.ray, np.arange(len(rays.rays_o[some])))
         before = np.concatenate([[0.0], running])[begins]
         left = 1 - (running - weights - before[samples.ray])
-        points = np.ascontiguousarray(path.at(samples.ray, samples.s).T, np.float32)
-        yield Segments(points, samples.weights, left, samples.ray)
+        yield Segments(sampled.points, samples.weights, left, samples.ray)
 
 
 def heavy_vertices(levels: LevelsOfFeatures, n: int, rays: TeacherRays) -> np.ndarray:
