@@ -159,7 +159,8 @@ class _Bake:
         with self._part("codes"):
             arrays = self._spend(stored.head, needed, teacher, tuning.ranges, len(head))
             level_steps = detail.level_steps(needed.layout.played(arrays))
-        del teacher, needed
+        manifest = self._manifest(layout, arrays, {}, level_steps)
+        del teacher, needed, stored, layout, again  # what is written is played and meshed in their room
         figures: dict[str, Any] = {
             "n_vertices": int(arrays.densities.first_rows[-1]),
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
@@ -179,7 +180,7 @@ class _Bake:
             return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
 
         with self._part("writing and checking"):
-            manifest = self._manifest(layout, arrays, figures, level_steps)
+            manifest = replace(manifest, provenance=manifest.provenance | {"baked": figures})
             cameras = write_cameras(self.model.cameras)
             write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
         last = self.held_out.stages[-1]
@@ -248,6 +249,8 @@ class _Bake:
             head = fold_head(model.field.head, first @ projection.back * step)
             grid = layout.grid(density, features)
             played = held_out.march(replace(grid, features=features), 0)
+            n_samples = float(played.n_density_samples[played.hits].mean()) if len(played.hits) else 0.0
+            teacher = teacher.some(self.plan.rays_that_fit(n_rays, n_samples))
             own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
             held_out.measure_march("grid", own, runner(fold_head(model.field.head, first)))
             held_out.measure_march("rank", played, runner(head))

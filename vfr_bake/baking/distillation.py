@@ -28,9 +28,13 @@ from vfr_bake.kernels.stored_features import compose, corner_rows
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
-RAYS_AT_ONCE = 1 << 14
+RAYS_AT_ONCE = 1 << 12
+"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 FIELD_RAYS_AT_ONCE = 1 << 13
 """Rays whose field features are evaluated at once."""
+UNROUNDED = 1 << 16
+"""The kernel that composes rounds codes to whole numbers: features are counted in parts of one, so small that
+it does not matter."""
 N_TYPICAL = 4096
 """Training rays that tell the typical size of composites."""
 
@@ -140,8 +144,12 @@ class TeacherRays:
     """[n] float32 opacity of the model."""
 
     def some(self, n: int) -> TeacherRays:
-        """About n of the rays, spread evenly."""
-        return TeacherRays(*(column[:: max(len(self.opacity) // n, 1)] for column in vars(self).values()))
+        """n of the rays, spread evenly; all where there are no more."""
+        n_all = len(self.opacity)
+        if n >= n_all:
+            return self
+        chosen = np.arange(n) * n_all // n
+        return TeacherRays(*(column[chosen] for column in vars(self).values()))
 
 
 def render_teacher(
@@ -185,8 +193,11 @@ def collect_training_rays(
         parts.append((*fetched, *shown))
     if not any(len(part[0]) for part in parts):
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
-    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    opacity, counts, points, weights, lengths, dirs, colours, full_opacity = columns
+    columns = [list(column) for column in zip(*parts, strict=True)]
+    parts.clear()  # or all samples would be there twice, and not one column of them
+    opacity, counts, points, weights, lengths, dirs, colours, full_opacity = (
+        np.concatenate(columns.pop(0)) for _ in range(len(columns))
+    )
     starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     shown = (dirs, opacity, colours, full_opacity)
     return TrainingRays(starts, points, weights, lengths, *shown, grid.rows, grid.feature_scale, densities)
@@ -261,22 +272,29 @@ def with_field_features(
     as if the vertices stored them unrounded. They are evaluated where the rays meet them, because those of a
     large grid would take gigabytes."""
     features = np.zeros((len(played.hits), model.field.config.n_channels), np.float32)
+    numbers = np.empty(len(layout.features), np.int32)
     for first in range(0, len(features), FIELD_RAYS_AT_ONCE):
         rays = played.hits[first : first + FIELD_RAYS_AT_ONCE]
         fetches = player_fetches(grid, rays_o[rays], rays_d[rays], 0)
-        features[first + fetches.hits] = _field_features(model, layout, grid, fetches)
+        features[first + fetches.hits] = _field_features(model, layout, grid, fetches, numbers)
     return played._replace(features=features)
 
 
-def _field_features(model: Model, layout: Layout, grid: SparseGrid, fetches: PlayerFetches) -> np.ndarray:
-    """[n_hits, n_channels] composites of the field's features at the stored vertices. The kernel that
-    composes codes would round them."""
+def _field_features(
+    model: Model, layout: Layout, grid: SparseGrid, fetches: PlayerFetches, numbers: np.ndarray
+) -> np.ndarray:
+    """[n_hits, n_channels] composites of the field's features at the stored vertices. `numbers` [n_features]
+    int32 is worked in."""
     rows, shares = corners(grid.rows, fetches.points * grid.feature_scale, MIN_TOTAL)
-    met, where = np.unique(rows, return_inverse=True)
+    numbers[:] = 0
+    numbers[rows] = 1
+    met = np.flatnonzero(numbers)
+    numbers[met] = np.arange(len(met))
     at = unit_points(layout.features.index[met], layout.features.resolution, layout.contracted)
     vertices = model.field.features(at)
-    fetched = np.zeros((len(rows), vertices.shape[1]), np.float32)
-    for corner, share in zip(where.reshape(rows.shape).T, shares.T, strict=True):
-        fetched += share[:, None] * vertices[corner]
-    fetched *= fetches.weights[:, None]
-    return np.add.reduceat(fetched, np.cumsum(fetches.counts) - fetches.counts)
+    vertices *= np.float32(UNROUNDED)
+    starts = np.concatenate([[0], np.cumsum(fetches.counts)])
+    out = np.empty((len(fetches.hits), vertices.shape[1]), np.float32)
+    compose(starts, numbers[rows], shares, fetches.weights, vertices, out)
+    out *= np.float32(1 / UNROUNDED)
+    return out

@@ -46,8 +46,11 @@ RAYS_OF_CELL = 0.8
 meets something."""
 RAY_BYTES = {False: 300, True: 1_900}
 """Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
-20 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all rays
-of an unbounded scene do, at 33. While the samples are put together they are there twice."""
+up to 32 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all
+rays of an unbounded scene do, at 33, and where they have more, fewer rays are taken."""
+HIT_BYTES, SAMPLE_BYTES = 210, 32
+"""The same of a ray that meets something, and of each of its samples: 20 bytes, and 12 more while they are put
+together."""
 CHANNEL_BYTES = 6
 """Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
 the code that is played."""
@@ -110,6 +113,11 @@ class Plan:
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
         most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
         return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, most))
+
+    def rays_that_fit(self, n_rays: int, n_samples: float) -> int:
+        """The rays that meet something for which there is room where `n_rays` were planned, if each has
+        `n_samples` samples on average: through fog they have hundreds."""
+        return int(n_rays * self.ray_bytes / (HIT_BYTES + SAMPLE_BYTES * n_samples))
 
     @property
     def n_bytes(self) -> int:

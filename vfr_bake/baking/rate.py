@@ -46,7 +46,8 @@ from vfr_bake.baking.refinement import Stored
 from vfr_bake.kernels.stored_features import slants
 from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_coarser
 
-RAYS_AT_ONCE = 1 << 14
+RAYS_AT_ONCE = 1 << 12
+"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 N_RAYS = 1_000_000
 """Rays that tell how much vertices change what is seen, at most: more of them tell it better."""
 AROUND: dict[Grid, float] = {"densities": 5.0, "features": 1.0}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -44,3 +46,26 @@ def test_training_rays_are_those_that_meet_something(
     np.testing.assert_allclose(composed[:, 0], FEATURE * training_rays.opacity, rtol=1e-5)
     one = collect_training_rays(teacher_rays([ALONG]), grid, n_fetches)
     assert len(one) == 1 and np.array_equal(one.composed(grid.features.astype(np.float32)), composed[:1])
+
+
+def test_samples_are_put_together_column_by_column(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays through fog have hundreds of samples: there is no room for all columns of them twice."""
+    monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 100)
+    monkeypatch.setattr("player.compiled.samples.MOST_AT_ONCE", 1)
+    rays, grid = teacher_rays([ALONG] * 3000), fog(0.1)
+    collect_training_rays(rays.some(100), grid, 0)  # compiles
+    tracemalloc.start()
+    try:
+        held = collect_training_rays(rays, grid, 0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    kept = sum(column.nbytes for column in (held.points, held.weights, held.lengths))
+    assert kept > 3000 * 60 * 20, "20 bytes for each of more than 60 samples a ray"
+    assert peak < kept + held.points.nbytes + 0.1 * kept
+
+
+def test_some_rays_are_spread_evenly() -> None:
+    rays = teacher_rays([ALONG] * 10)
+    assert rays.some(4).colours[:, 0].tolist() == [0, 6, 15, 21]
+    assert rays.some(10) is rays and rays.some(99) is rays

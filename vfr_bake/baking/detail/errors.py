@@ -28,7 +28,8 @@ from vfr_bake.baking.distillation import TeacherRays, corners
 from vfr_bake.kernels.sample_weights import add_corner_weights
 from vfr_bake.kernels.stored_features import compose
 
-RAYS_AT_ONCE = 1 << 14
+RAYS_AT_ONCE = 1 << 12
+"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 
 _NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 
@@ -196,16 +197,20 @@ def density_errors(levels: LevelsOfDensities, rays: TeacherRays) -> np.ndarray:
     which = np.full(len(levels.grid.table), -1)
     which[levels.numbers] = np.arange(n_bricks)
     out = np.zeros((n_levels, n_bricks))
+    grids = [levels.at(level) for level in range(n_levels)]
     for first in range(0, len(rays.opacity), RAYS_AT_ONCE):
         some = TeacherRays(*(column[first : first + RAYS_AT_ONCE] for column in vars(rays).values()))
         parts = []
-        for level in range(n_levels):
-            grid = levels.at(level)
+        for grid in grids:
             (samples,) = samples_of(grid, some)
             bricks = which[brick_number(grid.cells(samples.points.T), grid.n_per_axis)]
             depths = -np.log1p(-np.minimum(samples.weights / np.maximum(samples.left, 1e-9), 1 - 1e-9))
             known = bricks >= 0
-            parts.append((samples.ray[known] * n_bricks + bricks[known], depths[known], samples.left[known]))
+            keys = samples.ray[known] * n_bricks + bricks[known]
+            # A ray's samples in a brick follow each other: they are added up before anything is sorted.
+            begins = np.flatnonzero(np.diff(keys, prepend=-1))
+            depths = np.add.reduceat(depths[known], begins) if len(begins) else depths[:0]
+            parts.append((keys[begins], depths, samples.left[known][begins]))
         for level in range(1, n_levels):
             (own, own_depths, left), (keys, depths, _) = parts[0], parts[level]
             segments, where = np.unique(np.concatenate([own, keys]), return_inverse=True)
