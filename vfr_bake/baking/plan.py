@@ -66,19 +66,20 @@ VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
 fast as the millions of a bake."""
-STEP_COST, HEAD_COST = {False: 1.75, True: 0.65}, {False: 0.95, True: 0.28}
+STEP_COST, HEAD_COST = {False: 2.0, True: 1.2}, {False: 1.3, True: 0.45}
 """Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
 unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
-and the following are those of lego, of fox at half size and of the built-in scene."""
-VERTEX_COST, SEEN_COST = {False: 0.32, True: 0.1}, {False: 0.42, True: 1.0}
+and the following count what one thread waits for on two cores (docs/notes/2026-11-24-bakes-of-weak-models.md).
+"""
+VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 """Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
 OWN_HEAD = 4
 """How many times as long a step takes with the model's own head."""
-REST_COST = {False: 2_700_000, True: 1_200_000}
+REST_COST, OWN_REST_COST = {False: 8_000_000, True: 3_300_000}, {False: 20_000_000, True: 3_700_000}
 """Time of all else, which hardly depends on the scene, in the same unit: what is measured, the mesh, the
-files."""
-CHOSEN_COST = {False: 3_300_000, True: 1_600_000}
-"""Time in which it is chosen what is stored of refined values, detail and codes, in the same unit."""
+files; and by how much it is longer with the model's own head."""
+CHOSEN_COST = {False: 0.36, True: 0.12}
+"""Time of a vertex when it is chosen what is stored of refined values, detail and codes, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,8 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     ray_seconds = (time.perf_counter() - begin) / n_rays
     fine, coarse = plan.resolutions
     n_all = plan.n_rays(plan.n_cells)
-    work = n_all + VERTEX_COST[unbounded] * plan.n_cells * (1 + (fine / coarse) ** 3)
+    n_vertices = plan.n_cells * (1 + (fine / coarse) ** 3)
+    work = n_all + VERTEX_COST[unbounded] * n_vertices
     if unbounded:
         work += SEEN_COST[True] * rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
@@ -205,7 +207,9 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)
     if config.refine_steps is None:
         refinement = min(refinement, refinement_seconds(choice, before))
-    return before + refinement + ray_seconds * (CHOSEN_COST[unbounded] + REST_COST[unbounded])
+    rest = CHOSEN_COST[unbounded] * n_vertices + REST_COST[unbounded]
+    rest += 0 if choice.head_width else OWN_REST_COST[unbounded]
+    return before + refinement + ray_seconds * rest
 
 
 def refinement_seconds(choice: BakeChoice, before: float) -> float:

@@ -21,12 +21,15 @@ from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
+    CHOSEN_COST,
     FEWEST_RAYS,
     HIT_BYTES,
     N_RAYS,
+    OWN_REST_COST,
     RAYS_OF_CELL,
     SAMPLE_BYTES,
     UNBOUNDED_RAYS,
+    VERTEX_COST,
     expected_seconds,
     make_plan,
 )
@@ -119,9 +122,7 @@ def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:
     assert [plan.n_rays(n) for n in (1e3, 5e5, 3e6)] == [FEWEST_RAYS, 5e5 * RAYS_OF_CELL, N_RAYS]
 
 
-def test_rays_through_fog_are_fewer(
-    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rays_through_fog_are_fewer(model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They have hundreds of samples, for which there is as much room as for those that were expected."""
     plan = replace(make_plan(model, BakeConfig(resolution=48)), unbounded=True)
     n = plan.rays_that_fit(500_000, 112)
@@ -191,6 +192,31 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
     slow, once = expected(0.02, 0.02), expected(0.01, 0.01)
     assert expected(100.0, 0.01) == pytest.approx(once, rel=1e-9)
     assert slow == pytest.approx(2 * once, rel=1e-9) and once > 0
+
+
+def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the same clock: 1 second for each of the teacher's rays."""
+    now = 0.0
+
+    def answer(model: Model, views: object, n_rays: int, *_: object) -> SimpleNamespace:
+        nonlocal now
+        now += n_rays
+        return SimpleNamespace(opacity=np.ones(n_rays))
+
+    monkeypatch.setattr("vfr_bake.baking.plan.time", SimpleNamespace(perf_counter=lambda: now))
+    monkeypatch.setattr("vfr_bake.baking.plan.render_teacher", answer)
+    config = BakeConfig(**SMALL)
+    plan = replace(make_plan(model, config), room=1e12)
+    few, many = (
+        expected_seconds(model, config, replace(plan, n_cells=n * N_RAYS / RAYS_OF_CELL)) for n in (1, 2)
+    )
+    n_vertices = 2 * N_RAYS / RAYS_OF_CELL  # as many of densities as of features
+    assert many - few == pytest.approx((VERTEX_COST[False] + CHOSEN_COST[False]) * n_vertices, rel=1e-6)
+    own = expected_seconds(model, replace(config, head_width=0), plan)
+    small = expected_seconds(model, config, plan)
+    assert own - small == pytest.approx(OWN_REST_COST[False], rel=1e-6)
 
 
 def test_more_work_is_expected_to_take_longer(model: Model) -> None:

@@ -13,6 +13,7 @@ from player.asset.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import _Bake, bake
+from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.presets import PRESETS
@@ -103,3 +104,19 @@ def test_an_asset_that_has_lost_what_is_aimed_at_gives_up_less(models: dict[str,
         return work._allowed(0.04, SimpleNamespace(loss=Loss(lost, 0.1)))  # type: ignore[arg-type]
 
     assert [allowed(lost) for lost in (-1.0, aimed - 0.05, aimed - 0.03, 5.0)] == [0.04, 0.04, 0.01, 0.01]
+
+
+def test_the_fewest_channels_that_lose_little_are_found_by_halving(models: dict[str, Model]) -> None:
+    """Each number that is tried takes the model's own head on all that is held out."""
+    work = _Bake(models["matte"], BakeConfig(check_views=1), quiet)
+    teacher = render_teacher(work.model, work.model.model_cameras(), 2000, 0, quiet)
+    for fewest in (1, 6, 15, 99):
+        asked = []
+
+        def channel_loss(kept: np.ndarray, fewest: int = fewest, asked: list = asked) -> Loss:
+            asked.append(round(float(np.trace(kept))))  # the rank of a projection
+            return Loss(0.5 if asked[-1] < fewest else 0.1, 0.0)
+
+        work.held_out.channel_loss = channel_loss  # type: ignore[method-assign]
+        assert len(work._projection(teacher).matrix) == min(fewest, work.choice.n_channels)
+        assert len(asked) <= 4
