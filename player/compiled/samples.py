@@ -50,7 +50,8 @@ def sample_rays(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Pla
     n_rays, room = len(rays_o), max(MOST_AT_ONCE, most_samples * LANES)
     samples, sums = scratch((3, most_samples, LANES), F32), scratch((SUMS, LANES), F32)
     tau, counts = scratch(n_rays, F32, 0), scratch(n_rays, np.int32, 0)
-    met = _Met(scratch(room, np.int64), *(scratch(room, F32) for _ in range(3)), scratch((room, 3), F32))
+    s, weights, ways = (scratch(room, F32) for _ in range(3))
+    met = _Met(scratch(room, np.int64), s, weights, ways, scratch((room, 3), F32))
     work = samples, sums, scratch((3, LANES), F32), scratch(LANES, F32), scratch(LANES, np.int64)
     parts, number = [], 0
     while number < len(packets):

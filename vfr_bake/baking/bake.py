@@ -288,7 +288,7 @@ class _Bake:
             some = every.first(n)
             return self.held_out.channel_loss(some.back @ some.matrix).most <= self.choice.channel_loss_db
 
-        # What is lost falls with each channel, and measuring it takes the model's own head: five times, not 24.
+        # What is lost falls with each channel, and measuring it takes the model's own head.
         return every.first(1 + bisect_left(range(1, most), True, key=enough))
 
     def _spend(

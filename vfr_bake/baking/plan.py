@@ -49,8 +49,8 @@ RAY_BYTES = {False: 300, True: 1_900}
 up to 32 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all
 rays of an unbounded scene do, at 33, and where they have more, fewer rays are taken."""
 HIT_BYTES, SAMPLE_BYTES = 210, 32
-"""The same of a ray that meets something, and of each of its samples: 20 bytes, and 12 more while they are put
-together."""
+"""The same of a ray that meets something, and of each of its samples: 20 bytes, and 12 more while they are
+put together."""
 CHANNEL_BYTES = 6
 """Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
 the code that is played."""
@@ -69,8 +69,8 @@ fast as the millions of a bake."""
 STEP_COST, HEAD_COST = {False: 2.0, True: 1.2}, {False: 1.3, True: 0.45}
 """Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
 unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
-and the following count what one thread waits for on two cores (docs/notes/2026-11-24-bakes-of-weak-models.md).
-"""
+and the following count what one thread waits for on two cores
+(docs/notes/2026-11-24-bakes-of-weak-models.md)."""
 VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 """Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
 OWN_HEAD = 4
