@@ -1,5 +1,5 @@
-// The head of 2 x 2 pixels: what the march has found for them becomes their colours, four bytes each. HEAD_CODE and
-// N_FEATURES are written by head.js and program.js.
+// The head of 2 x 2 pixels: what the march has found for them becomes their colours, four bytes each. What is in
+// capitals, but for the constants here, is written by head.js and program.js.
 
 FOUND_INPUTS
 uniform highp usampler2D uOpacity;
@@ -7,7 +7,13 @@ uniform highp sampler2D uWeights;
 
 layout(location = 0) out uvec4 colours;
 
-vec3 rgb[4];
+// Of each layer: texels of inputs and outputs, and where they are in the memory; the first texel of its weights, what
+// becomes of its outputs, 1 / scale and zero where they are rounded; whether they are added to what is there.
+uniform vec4 uLayers[3 * N_LAYERS];
+
+const float GELU = 1.0, ROUNDED = 2.0;
+
+mat4 memory[MEMORY]; // a column for each pixel
 
 vec4 weight(int k) {
   return texelFetch(uWeights, ivec2(k & 1023, int(float(k) * (1.0 / 1024.0))), 0);
@@ -28,38 +34,62 @@ vec4 rounded(vec4 x, float perStep, float zero) {
   return clamp(roundEven(x * perStep) + zero, 0.0, 255.0) - zero;
 }
 
+vec4 activated(vec4 x, vec4 after) {
+  if (after.y < GELU) return x;
+  x = gelu(x);
+  return after.y < ROUNDED ? x : rounded(x, after.z, after.w);
+}
+
+mat4 weights(int k) {
+  return mat4(weight(k), weight(k + 1), weight(k + 2), weight(k + 3));
+}
+
 vec4 unpackedPair(uint low, uint high) {
   return vec4(unpackSnorm2x16(low), unpackSnorm2x16(high)) * 128.0;
 }
 
-void headOf(vec3 direction[4], vec4 f0[N_FEATURES], vec4 f1[N_FEATURES], vec4 f2[N_FEATURES], vec4 f3[N_FEATURES]) {
-HEAD_CODE
-}
-
-void readFeatures(ivec2 at, out vec4 f[N_FEATURES]) {
-READ_FEATURES
+void runLayer(vec4 sizes, vec4 after, bool add) {
+  int k = int(after.x), x = int(sizes.z), end = x + int(sizes.x), y = int(sizes.w), last = y + int(sizes.y);
+  for (; y < last; y += 2) {
+    vec4 bias = weight(k), nextBias = weight(k + 1), scale = weight(k + 2), nextScale = weight(k + 3);
+    mat4 sum = add ? memory[y] : mat4(bias, bias, bias, bias), nextSum = add ? memory[y + 1] : mat4(nextBias, nextBias, nextBias, nextBias);
+    k += 4;
+    for (int i = x; i < end; i++) {
+      mat4 inputs = memory[i];
+      sum += weights(k) * inputs;
+      nextSum += weights(k + 4) * inputs;
+      k += 8;
+    }
+    for (int p = 0; p < 4; p++) {
+      memory[y][p] = activated(sum[p] * scale, after);
+      memory[y + 1][p] = activated(nextSum[p] * nextScale, after);
+    }
+  }
 }
 
 void main() {
   ivec2 first = ivec2(gl_FragCoord.xy) * 2;
   colours = uvec4(0);
-  vec3 direction[4];
   bool some = false;
+  for (int p = 0; p < 4; p++) some = some || texelFetch(uOpacity, first + ivec2(p & 1, p >> 1), 0).y != 0u;
+  if (!some) return;
   for (int p = 0; p < 4; p++) {
     ivec2 at = first + ivec2(p & 1, p >> 1);
-    direction[p] = directionOf(vec2(at) + 0.5).xyz;
-    some = some || texelFetch(uOpacity, at, 0).y != 0u;
+    vec3 direction = directionOf(vec2(at) + 0.5);
+    READ_FEATURES
+    WRITE_MONOMIALS
   }
-  if (!some) return;
-  vec4 f0[N_FEATURES], f1[N_FEATURES], f2[N_FEATURES], f3[N_FEATURES];
-  readFeatures(first, f0);
-  readFeatures(first + ivec2(1, 0), f1);
-  readFeatures(first + ivec2(0, 1), f2);
-  readFeatures(first + ivec2(1, 1), f3);
-  headOf(direction, f0, f1, f2, f3);
+  for (int layer = 0; layer < N_LAYERS; layer++) {
+    runLayer(uLayers[3 * layer], uLayers[3 * layer + 1], uLayers[3 * layer + 2].x > 0.0);
+    if (layer != HARMONICS_LAYER) continue;
+    for (int p = 0; p < 4; p++) {
+      MULTIPLY_BY_HARMONICS
+    }
+  }
   uvec4 found;
   for (int p = 0; p < 4; p++) {
-    uvec3 levels = uvec3(clamp(rgb[p], 0.0, 1.0) * 1023.0 + 0.5);
+    vec3 rgb = 1.0 / (1.0 + exp(-memory[COLOURS_AT][p].xyz));
+    uvec3 levels = uvec3(clamp(rgb, 0.0, 1.0) * 1023.0 + 0.5);
     found[p] = levels.x | (levels.y << 10) | (levels.z << 20);
   }
   colours = found;

@@ -1,10 +1,12 @@
-// The head as a shader: its layers as loops over a texture of weights, for four pixels at a time, so that each weight is
-// fetched for all of them. The twin of player/head/graph.py, which has the equations; the rounding to 8 bits is that of
-// player/head/activations.py.
+// The head as a shader: a loop over its layers, whose weights are texels of a texture, for four pixels at a time, so that
+// each weight is fetched for all of them. A layer's code stands there once: drivers take long to compile much of it. The twin
+// of player/head/graph.py, which has the equations; the rounding to 8 bits is that of player/head/activations.py.
 
-export const HEAD_PIXELS = 4;
+const AT_ONCE = 2; // texels of a layer's outputs that head.glsl finds at a time, so that each input is read for all of them
+const AS_IT_IS = 0, GELU = 1, ROUNDED = 2; // what becomes of outputs: see head.glsl
 const XYZW = "xyzw";
 const fours = (n) => Math.ceil(n / 4);
+const outputTexels = (n) => AT_ONCE * Math.ceil(fours(n) / AT_ONCE);
 
 // Multiply-adds of a pixel: those of the layers, and of the spherical harmonics.
 export function multiplyAdds(head) {
@@ -28,95 +30,88 @@ function distinctColumns({ n_in, n_out, weight, bias }) {
   return { columns, which };
 }
 
-class Writer {
+// The layers as numbers. Vectors lie one behind the other in a memory of texels, each from its place on.
+class Layers {
   constructor() {
-    Object.assign(this, { weights: [], declared: [], code: [], count: 0 });
+    Object.assign(this, { weights: [], table: [], size: 0 });
   }
 
-  // A vector of n numbers for each pixel; its name, to which the pixel's number is added.
-  vector(n) {
-    const name = `v${this.count++}_`;
-    for (let p = 0; p < HEAD_PIXELS; p++) this.declared.push(`vec4 ${name}${p}[${fours(n)}];`);
-    return name;
+  // The place of a vector of up to n numbers.
+  place(n) {
+    this.size += outputTexels(n);
+    return this.size - outputTexels(n);
   }
 
-  // A line for each pixel, p.
-  lines(line) {
-    for (let p = 0; p < HEAD_PIXELS; p++) this.code.push(line(p));
-  }
-
-  // y = after((x W + bias) * scale), y[o] being `sums` beforehand; with `add`, y = after(y + x W).
-  dense(y, x, layer, { after = (sum) => sum, add = false } = {}) {
-    const { n_in: nIn, n_out: nOut, weight, bias, scale } = layer;
-    const base = this.weights.length / 4, part = (some, o) => [0, 1, 2, 3].map((c) => (some && 4 * o + c < nOut ? some[4 * o + c] : 0));
-    for (let o = 0; o < fours(nOut); o++) {
-      for (let i = 0; i < 4 * fours(nIn); i++) {
-        for (let c = 0; c < 4; c++) this.weights.push(i < nIn && 4 * o + c < nOut ? weight[i * nOut + 4 * o + c] : 0);
+  // y = after((x W + bias) * scale), where x and y are places; with `add`, y = after(y + x W).
+  dense(y, x, { n_in: nIn, n_out: nOut, weight, bias, scale }, { after = [AS_IT_IS, 0, 0], add = false } = {}) {
+    const texel = (o, at) => {
+      for (let c = 4 * o; c < 4 * o + 4; c++) this.weights.push(c < nOut ? at(c) : 0);
+    };
+    this.table.push(fours(nIn), outputTexels(nOut), x, y, this.weights.length / 4, ...after, Number(add), 0, 0, 0);
+    for (let first = 0; first < outputTexels(nOut); first += AT_ONCE) {
+      const some = Array.from({ length: AT_ONCE }, (_, i) => first + i);
+      for (const o of some) texel(o, (c) => bias?.[c] ?? 0);
+      for (const o of some) texel(o, (c) => scale?.[c] ?? 1);
+      for (let i = 0; i < 4 * fours(nIn); i += 4) {
+        for (const o of some) for (let row = i; row < i + 4; row++) texel(o, (c) => (row < nIn ? weight[row * nOut + c] : 0));
       }
-      this.weights.push(...part(bias, o), ...(scale ? part(scale, o) : []));
     }
-    const rows = 4 * fours(nIn), stride = rows + (scale ? 2 : 1);
-    this.code.push(`for (int o = 0; o < ${fours(nOut)}; o++) {`, `int k = ${base} + o * ${stride};`, `vec4 b = weight(k + ${rows});`);
-    this.lines((p) => `vec4 s${p} = ${add ? `${y}${p}[o]` : "b"};`);
-    this.code.push(`for (int i = 0; i < ${fours(nIn)}; i++) {`, "vec4 w0 = weight(k), w1 = weight(k + 1), w2 = weight(k + 2), w3 = weight(k + 3);");
-    this.lines((p) => `{ vec4 x = ${x}${p}[i]; s${p} += w0 * x.x + w1 * x.y + w2 * x.z + w3 * x.w; }`);
-    this.code.push("k += 4;", "}");
-    if (scale) this.code.push("b = weight(k + 1);");
-    this.lines((p) => `${y}${p}[o] = ${after(scale ? `s${p} * b` : `s${p}`)};`);
-    this.code.push("}");
   }
 }
 
-const number = (x) => (Number.isInteger(x) ? `${x}.0` : x.toPrecision(9));
-
-// { code, weights }: the body of head.glsl's function, and the texels [4 n] that it reads.
+// { texts, weights, table }: what stands for names in head.glsl, its texels [4 n] of weights, and its uLayers.
 export function headCode(head) {
-  const writer = new Writer(), roundings = [...head.roundings];
+  const layers = new Layers(), roundings = [...head.roundings], { columns, which } = distinctColumns(head.harmonics);
   // What is done to the outputs of a layer; those of the last layer before a rounded one are rounded.
   const activated = () => {
-    if (!head.in_8_bits || !roundings.length) return (sum) => `gelu(${sum})`;
+    if (!head.in_8_bits || !roundings.length) return [GELU, 0, 0];
     const { scale, zero } = roundings.shift();
-    return (sum) => `rounded(gelu(${sum}), ${number(Math.fround(1 / scale))}, ${number(zero)})`;
+    return [ROUNDED, 1 / scale, zero];
   };
-  const plain = (sum) => `gelu(${sum})`;
-  let h = "f";
+  const widest = Math.max(head.n_channels, ...[...head.spatial, head.bottleneck, ...head.directional].map((layer) => layer.n_out));
+  let here = layers.place(widest), there = layers.place(widest); // of what was found last, and of what is next
+  const places = { FEATURES_AT: here, MONOMIALS_AT: layers.place(head.harmonics.n_in), ENCODED_AT: layers.place(head.to_sh.n_out) };
+  places.HARMONICS_AT = layers.place(columns.length);
+  const swap = () => ([here, there] = [there, here]);
   head.spatial.forEach((layer, i) => {
-    const y = writer.vector(layer.n_out);
-    writer.dense(y, h, layer, { after: i + 1 < head.spatial.length ? plain : activated() });
-    h = y;
+    layers.dense(there, here, layer, { after: i + 1 < head.spatial.length ? [GELU, 0, 0] : activated() });
+    swap();
   });
-  const encoded = writer.vector(head.to_sh.n_out);
-  writer.dense(encoded, h, head.to_sh);
-  multiplyByHarmonics(writer, head, encoded);
-  let z = writer.vector(head.bottleneck.n_out);
-  writer.dense(z, h, head.bottleneck);
-  writer.dense(z, encoded, head.from_sh, { add: true, after: activated() });
+  layers.dense(places.ENCODED_AT, here, head.to_sh);
+  layers.dense(places.HARMONICS_AT, places.MONOMIALS_AT, columnsLayer(head.harmonics.n_in, columns));
+  layers.dense(there, here, head.bottleneck);
+  layers.dense(there, places.ENCODED_AT, head.from_sh, { add: true, after: activated() });
+  swap();
   for (const layer of head.directional) {
-    const y = writer.vector(layer.n_out);
-    writer.dense(y, z, layer, { after: activated() });
-    z = y;
+    layers.dense(there, here, layer, { after: activated() });
+    swap();
   }
-  const rgb = writer.vector(3);
-  writer.dense(rgb, z, head.output);
-  writer.lines((p) => `rgb[${p}] = 1.0 / (1.0 + exp(-${rgb}${p}[0].xyz));`);
-  return { code: [...writer.declared, ...writer.code].join("\n"), weights: new Float32Array(writer.weights) };
+  layers.dense(there, here, head.output);
+  const texts = {
+    ...places, COLOURS_AT: there, MEMORY: layers.size, N_LAYERS: layers.table.length / 12, HARMONICS_LAYER: head.spatial.length + 1,
+    WRITE_MONOMIALS: monomialsCode(head.monomials), MULTIPLY_BY_HARMONICS: multiplyCode(which),
+  };
+  return { texts, weights: new Float32Array(layers.weights), table: layers.table };
 }
 
-function multiplyByHarmonics(writer, head, encoded) {
-  const { columns, which } = distinctColumns(head.harmonics);
-  const nIn = head.harmonics.n_in, nOut = columns.length;
-  const monomials = writer.vector(Math.max(nIn, 1)), harmonics = writer.vector(nOut);
-  const component = (name, p, i) => `${name}${p}[${i >> 2}].${XYZW[i & 3]}`;
-  writer.lines((p) => `${monomials}${p}[${Math.max(fours(nIn), 1) - 1}] = vec4(0);`);
-  head.monomials.forEach(([parent, axis], i) => {
-    const factor = (p) => (parent < 0 ? "" : `${component(monomials, p, parent)} * `);
-    writer.lines((p) => `${component(monomials, p, i)} = ${factor(p)}direction[${p}].${XYZW[axis]};`);
-  });
-  const weight = new Float32Array(nIn * nOut);
+// A layer that finds the distinct harmonics.
+function columnsLayer(nIn, columns) {
+  const nOut = columns.length, weight = new Float32Array(nIn * nOut);
   columns.forEach((column, o) => column.slice(1).forEach((w, i) => (weight[i * nOut + o] = w)));
-  writer.dense(harmonics, monomials, { n_in: nIn, n_out: nOut, weight, bias: columns.map((column) => column[0]), scale: null });
-  for (let o = 0; o < fours(which.length); o++) {
-    const some = [0, 1, 2, 3].map((c) => which[Math.min(4 * o + c, which.length - 1)]);
-    writer.lines((p) => `${encoded}${p}[${o}] *= vec4(${some.map((i) => component(harmonics, p, i)).join(", ")});`);
-  }
+  return { n_in: nIn, n_out: nOut, weight, bias: columns.map((column) => column[0]), scale: null };
+}
+
+// Texels of numbers that have names, the rest 0.
+const texelsOf = (names) => Array.from({ length: fours(names.length) }, (_, o) => (
+  `vec4(${[0, 1, 2, 3].map((c) => names[4 * o + c] ?? "0.0").join(", ")})`));
+
+function monomialsCode(monomials) {
+  const found = monomials.map(([parent, axis], i) => `float m${i} = ${parent < 0 ? "" : `m${parent} * `}direction.${XYZW[axis]};\n`);
+  const texels = texelsOf(monomials.map((_, i) => `m${i}`)).map((texel, o) => `memory[MONOMIALS_AT + ${o}][p] = ${texel};\n`);
+  return [...found, ...texels].join("");
+}
+
+function multiplyCode(which) {
+  const read = (i) => `memory[HARMONICS_AT + ${i >> 2}][p].${XYZW[i & 3]}`;
+  return texelsOf(which.map(read)).map((texel, o) => `memory[ENCODED_AT + ${o}][p] *= ${texel};\n`).join("");
 }

@@ -26,10 +26,9 @@ function featureTexts(nChannels) {
     FOUND_OUTPUTS: `${outputs.join("")}layout(location = ${nOut}) out uvec4 foundOpacity;`,
     WRITE_FOUND: write.join("\n"),
     FOUND_INPUTS: Array.from({ length: nOut }, (_, i) => `uniform highp usampler2D uFound${i};`).join("\n"),
-    N_FEATURES: n,
     READ_FEATURES: Array.from({ length: nOut }, (_, i) => {
-      const lines = [`uvec4 u${i} = texelFetch(uFound${i}, at, 0);`, `f[${2 * i}] = unpackedPair(u${i}.x, u${i}.y);`];
-      return [...lines, ...(2 * i + 1 < n ? [`f[${2 * i + 1}] = unpackedPair(u${i}.z, u${i}.w);`] : [])].join("\n");
+      const put = (j, pair) => (j < n ? [`memory[FEATURES_AT + ${j}][p] = unpackedPair(${pair});`] : []);
+      return [`uvec4 u${i} = texelFetch(uFound${i}, at, 0);`, ...put(2 * i, `u${i}.x, u${i}.y`), ...put(2 * i + 1, `u${i}.z, u${i}.w`)].join("\n");
     }).join("\n"),
   };
 }
@@ -59,11 +58,11 @@ export function marchSource(scene, { layer, counting, mostSteps }) {
   return BEGIN + lines.join("") + PRECISION + filled(text, featureTexts(nChannels));
 }
 
-// The fragment shader of the head: { source, weights }.
+// The fragment shader of the head, and the numbers that it reads: { source, weights, table }.
 export function headSource(scene) {
-  const { code, weights } = headCode(scene.head);
-  const text = filled(shaders["head.glsl"], { ...featureTexts(scene.manifest.n_channels), HEAD_CODE: code });
-  return { source: BEGIN + PRECISION + shaders["rays.glsl"] + text, weights };
+  const { texts, weights, table } = headCode(scene.head);
+  const text = filled(filled(shaders["head.glsl"], { ...featureTexts(scene.manifest.n_channels), ...texts }), texts);
+  return { source: BEGIN + PRECISION + shaders["rays.glsl"] + text, weights, table };
 }
 
 export const compositeSource = () => BEGIN + PRECISION + shaders["composite.glsl"];

@@ -73,14 +73,14 @@ export class Renderer {
     this.nSummed = 0;
     this.programs = new Map(); // by their sources
     this.layers = new Map(); // programs by what they draw
-    const { manifest } = this.scene, { source, weights } = headSource(this.scene);
+    const { manifest } = this.scene, { source, weights, table } = headSource(this.scene);
     const diagonal = Math.hypot(...manifest.aabb[0].map((x, i) => manifest.aabb[1][i] - x));
     this.mostSteps = Math.floor((manifest.contracted ? Math.PI : diagonal) / manifest.step) + 3;
     this.program("colour");
     this.head = this.programOf(source);
     this.composite = this.programOf(compositeSource());
     this.mean = this.programOf(MEAN);
-    this.tables = { uWeights: uploadFloats(gl, weights), ...(manifest.contracted && { uLattice: uploadLattice(gl, manifest.step) }) };
+    this.tables = { uWeights: uploadFloats(gl, weights), uLayers: table, ...(manifest.contracted && { uLattice: uploadLattice(gl, manifest.step) }) };
     this.makeTile(manifest.n_channels);
     this.show(this.scene);
   }
@@ -293,7 +293,7 @@ export class Renderer {
     const { gl } = this;
     for (const [name, listener] of Object.entries(this.listeners)) this.canvas.removeEventListener(name, listener);
     this.forget();
-    for (const { texture } of Object.values(this.tables)) gl.deleteTexture(texture);
+    for (const { texture } of Object.values(this.tables)) if (texture) gl.deleteTexture(texture);
     for (const program of this.programs.values()) program.dispose();
     for (const target of [this.found, this.colours, this.sum, this.target]) if (target) deleteFramebuffer(gl, target);
   }
