@@ -100,7 +100,7 @@ export class Decoder {
   static async open(bytes, neighbours, nChannels, nClasses, where) {
     const n = neighbours[0].length;
     const decoder = new Decoder();
-    Object.assign(decoder, { where, neighbours, nChannels, nClasses, n, channelsDone: 0 });
+    Object.assign(decoder, { where, nChannels, nClasses, n, channelsDone: 0 });
     decoder.isEmpty = n * nChannels === 0;
     if (decoder.isEmpty) {
       if (bytes.length) throw new Error(`${where}: expected no bytes for no symbols, got ${bytes.length}`);
@@ -129,8 +129,8 @@ export class Decoder {
       throw new Error(`${where}: symbols: expected magnitudes up to ${MAX_SYMBOL}`);
     }
     decoder.beyondTaken = 0;
-    decoder.near = new Int16Array(n + 1);
-    decoder.ofStep = new Uint8Array(nLanes);
+    decoder.beside = inOrder(neighbours, nLanes);
+    decoder.symbols = new Uint8Array(n + 1).fill(SYMBOL_OF_ZERO); // of the last channel + 63, and 0 for what is not there
     return decoder;
   }
 
@@ -138,17 +138,16 @@ export class Decoder {
   // many of `beyond` are those of earlier channels. Throws an Error.
   channel(classes, found) {
     if (this.isEmpty) return 0;
-    const { n, tables, states, words, neighbours, near, ofStep } = this;
-    near.fill(0);
+    const { n, tables, states, words, beside, symbols } = this;
     const ofContext = tables.ofContext.slice(
       this.channelsDone * this.nClasses * N_CONTEXTS,
       (this.channelsDone + 1) * this.nClasses * N_CONTEXTS,
     );
     this.wordsTaken = decodeChannel(
-      words, this.wordsTaken, states, tables.symbols, tables.entries, ofContext, classes,
-      neighbours[0], neighbours[1], neighbours[2], near, ofStep, found,
+      words, this.wordsTaken, states, tables.symbols, tables.entries, ofContext, classes, beside, symbols,
     );
     if (this.wordsTaken < 0) throw new Error(`${this.where}: words: expected more than ${this.nWords}`);
+    found.set(symbols.subarray(0, n));
     this.channelsDone++;
     const before = this.beyondTaken;
     if (tables.hasEnds) {
@@ -173,20 +172,45 @@ export class Decoder {
   }
 }
 
-// The symbols + 63 of a channel into `found`; returns how many words are taken then, -1 if there are too few.
-function decodeChannel(
-  words, at, states, symbolOf, entries, ofContext, classes, alongZ, alongY, alongX, near, ofStep, found,
-) {
+// Where the neighbours' symbols are that each row is decoded with, three a row, in the order of decoding; n for those that
+// are not decoded at an earlier step.
+function inOrder([alongZ, alongY, alongX], nLanes) {
+  const n = alongZ.length;
+  const nSteps = Math.floor(n / nLanes);
+  const nLonger = n % nLanes;
+  const steps = new Int32Array(n + 1);
+  steps[n] = n;
+  const beside = new Int32Array(3 * n);
+  for (let lane = 0, row = 0; lane < nLanes; lane++) {
+    const first = row;
+    const end = first + (lane < nLonger ? nSteps + 1 : nSteps);
+    for (let to = 3 * lane; row < end; row++, to += 3 * nLanes) {
+      const step = row - first;
+      steps[row] = step;
+      const z = alongZ[row], y = alongY[row], x = alongX[row];
+      beside[to] = z >= first || steps[z] < step ? z : n; // neighbours come before their row
+      beside[to + 1] = y >= first || steps[y] < step ? y : n;
+      beside[to + 2] = x >= first || steps[x] < step ? x : n;
+    }
+  }
+  return beside;
+}
+
+// The symbols + 63 of a channel into `found` [n + 1], whose last stays what it is; returns how many words are taken then,
+// -1 if there are too few.
+function decodeChannel(words, at, states, symbolOf, entries, ofContext, classes, beside, found) {
   const n = classes.length;
   const nLanes = states.length;
   const nWords = words.length - nLanes;
   const nSteps = Math.floor(n / nLanes);
   const nLonger = n % nLanes;
+  let from = 0;
   for (let step = 0; step <= nSteps; step++) {
     const nActive = step < nSteps ? nLanes : nLonger;
     let row = step;
     for (let lane = 0; lane < nActive; lane++) {
-      const total = near[alongZ[row]] + near[alongY[row]] + near[alongX[row]] + HALF;
+      const total = MIXED[found[beside[from]]] + MIXED[found[beside[from + 1]]] + MIXED[found[beside[from + 2]]] + HALF;
+      from += 3;
       const table = ofContext[classes[row] * N_CONTEXTS + CONTEXT_OF_SUM[total]];
       let x = states[lane];
       const place = x & (TOTAL - 1);
@@ -195,13 +219,7 @@ function decodeChannel(
       x = (Math.imul(entry >> BITS, x >>> BITS) + place - (entry & (TOTAL - 1))) | 0;
       if (x >>> 16 === 0) x = (x << 16) | words[at++];
       states[lane] = x;
-      ofStep[lane] = symbol;
       found[row] = symbol;
-      row += lane < nLonger ? nSteps + 1 : nSteps;
-    }
-    row = step;
-    for (let lane = 0; lane < nActive; lane++) { // only now: what is coded at the same step is not known
-      near[row] = MIXED[ofStep[lane]];
       row += lane < nLonger ? nSteps + 1 : nSteps;
     }
     if (at > nWords) return -1;
