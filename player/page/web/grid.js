@@ -12,7 +12,7 @@
 //   behind the brick's first, -1 for one that is not stored;
 // - features [Int8]: rows of codes, four a texel, ROWS_A_LINE a line. Each brick has its own rows, those behind its last
 //   vertices too, in the order of x, y and z.
-import { coordOf, popcount } from "./bricks.js";
+import { coordOf, keyOf, popcount } from "./bricks.js";
 
 const MOST_DISTANCE = 31;
 export const MANY = 32;
@@ -125,64 +125,73 @@ function someLive(cells, level, i, j, k) {
   return false;
 }
 
-// Distances in the largest coordinate, in two sweeps over a padded grid, from the neighbours before and behind.
+// Distances in the largest coordinate, in two sweeps over a padded grid, from the neighbours before and behind: four lines of
+// these beside a line of places, and the place before each.
 function addDistances(table, n) {
-  const m = n + 2, distances = new Uint8Array(m ** 3).fill(MOST_DISTANCE);
-  const padded = (x, y, z) => ((x + 1) * m + y + 1) * m + z + 1;
+  const m = n + 2, distances = new Uint8Array(m ** 3).fill(MOST_DISTANCE), least = new Uint8Array(m);
+  const padded = (x, y) => ((x + 1) * m + y + 1) * m + 1; // where the line of z = 0... begins
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let z = 0; z < n; z++, at++) if (table[at]) distances[padded(x, y, z)] = 0;
+      for (let to = padded(x, y), end = to + n; to < end; at++, to++) if (table[at] !== 0) distances[to] = 0;
     }
   }
-  const before = [];
-  for (let o = 0; o < 13; o++) before.push((Math.floor(o / 9) - 1) * m * m + ((Math.floor(o / 3) % 3) - 1) * m + (o % 3) - 1);
-  const sweep = (at, sign) => {
-    let least = distances[at];
-    for (let o = 0; o < 13 && least > 0; o++) least = Math.min(least, distances[at + sign * before[o]] + 1);
-    distances[at] = least;
+  // `sign`: 1 where the lines before are looked at, -1 for those behind; the z before a place then is z - sign.
+  const sweepLine = (first, sign) => {
+    const a = first - sign * (m * m + m) - 1, b = a + sign * m, c = b + sign * m, d = first - sign * m - 1;
+    for (let i = 0; i < m; i++) least[i] = Math.min(distances[a + i], distances[b + i], distances[c + i], distances[d + i]);
+    let z = sign > 0 ? 0 : n - 1, before = distances[first + z - sign];
+    for (let left = n; left > 0; left--, z += sign) {
+      before = Math.min(distances[first + z], Math.min(before, least[z], least[z + 1], least[z + 2]) + 1);
+      distances[first + z] = before;
+    }
   };
-  for (let x = 0; x < n; x++) {
-    for (let y = 0; y < n; y++) for (let z = 0; z < n; z++) sweep(padded(x, y, z), 1);
-  }
-  for (let x = n - 1; x >= 0; x--) {
-    for (let y = n - 1; y >= 0; y--) for (let z = n - 1; z >= 0; z--) sweep(padded(x, y, z), -1);
-  }
+  for (let x = 0; x < n; x++) for (let y = 0; y < n; y++) sweepLine(padded(x, y), 1);
+  for (let x = n - 1; x >= 0; x--) for (let y = n - 1; y >= 0; y--) sweepLine(padded(x, y), -1);
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let z = 0; z < n; z++, at++) if (!table[at]) table[at] = distances[padded(x, y, z)] << 24;
+      for (let from = padded(x, y), end = from + n; from < end; at++, from++) if (table[at] === 0) table[at] = distances[from] << 24;
     }
   }
 }
 
 function densityTexels({ vertices, values, firstRows }, { levels, count }) {
   const block = blockOf(count, DENSITY_BRICK), [width, height, depth] = block.size;
-  const texels = new Uint32Array(width * height * depth), codes = new Uint8Array(9 * 81);
-  for (const { level, first, bricks, numbers } of levels) {
+  const texels = new Uint32Array(width * height * depth), codes = new Uint8Array(AROUND);
+  for (const { level, first, bricks: { keys, masks }, numbers } of levels) {
     const read = new ColumnReader(vertices[level], firstRows[level]);
     for (let i = 0; i < numbers.length; i++) {
-      read.moveTo(...coordOf(bricks.keys[numbers[i]]));
-      for (let x = 0, at = 0; x < 9; x++) {
-        for (let y = 0; y < 9; y++) {
+      read.moveTo(keys[numbers[i]]);
+      for (let y = 0; y < 9; y++) {
+        for (let x = 0; x < 9; x++) {
           read.column(x, y);
-          let row = read.row, mask = read.mask;
-          for (let z = 0; z < 8; z++, mask >>= 1) codes[at++] = mask & 1 ? values[row++] : 0;
-          codes[at++] = mask & 1 ? values[read.row8] : 0;
+          let at = 9 * y + x, row = read.row, mask = read.mask;
+          for (let z = 0; z < 8; z++, mask >>= 1, at += 81) codes[at] = mask & 1 ? values[row++] : 0;
+          codes[at] = mask & 1 ? values[read.row8] : 0;
         }
       }
       const [bx, by, bz] = placeOf(first + i, block), word = 16 * numbers[i];
-      for (let x = 0; x < 8; x++) {
+      for (let z = 0, from = 0; z < 9; z++, from += 9) {
         for (let y = 0; y < 8; y++) {
-          let from = 81 * x + 9 * y, to = (10 * bz * height + 8 * by + y) * width + 8 * bx + x;
-          for (let z = 0; z < 9; z++, from++, to += width * height) {
-            texels[to] = codes[from] | (codes[from + 9] << 8) | (codes[from + 81] << 16) | (codes[from + 90] << 24);
+          let to = ((10 * bz + z) * height + 8 * by + y) * width + 8 * bx;
+          let pair = codes[from] | (codes[from + 9] << 8);
+          from++;
+          for (let end = to + 8; to < end; to++, from++) {
+            const next = codes[from] | (codes[from + 9] << 8);
+            texels[to] = pair | (next << 16);
+            pair = next;
           }
-          texels[to] = (bricks.masks[word + 2 * x + (y >> 2)] >>> (8 * (y & 3))) & 255;
         }
+      }
+      for (let y = 0; y < 8; y++) {
+        const to = ((10 * bz + 9) * height + 8 * by + y) * width + 8 * bx;
+        for (let x = 0; x < 8; x++) texels[to + x] = (masks[word + 2 * x + (y >> 2)] >>> (8 * (y & 3))) & 255;
       }
     }
   }
   return new Uint8Array(texels.buffer);
 }
+
+const AROUND = 9 ** 3; // vertices of a brick with its apron
 
 // Reads the columns along z of one brick with its apron: `mask` has a bit for each stored vertex z = 0..8, `row` is
 // the row of the first of z = 0..7, `row8` that of z = 8.
@@ -191,7 +200,8 @@ class ColumnReader {
     Object.assign(this, { vertices: bricks, firstRows: ranks.first, firstRow, bricks: new Int32Array(8), mask: 0, row: 0, row8: 0 });
   }
 
-  moveTo(x, y, z) {
+  moveTo(key) {
+    const x = key >> 18, y = (key >> 9) & 511, z = key & 511;
     for (let o = 0; o < 8; o++) this.bricks[o] = this.vertices.find(x + (o >> 2), y + ((o >> 1) & 1), z + (o & 1));
   }
 
@@ -223,14 +233,14 @@ function heldBricks({ levels, vertices, firstRows }, resolution) {
   let count = 0;
   for (let level = levels.length - 1; level >= 0; level--) {
     const { bricks, numbers } = shown[level];
-    const hold = (coords, code) => {
-      for (const coord of coords) {
+    const hold = (keys, code) => {
+      for (const key of keys) {
         const entry = code((count++ << 3) | level);
-        eachPlace(n, level, coord, (place) => (owners[place] = entry));
+        eachPlace(n, level, coordOf(key), (place) => (owners[place] = entry));
       }
-      held.push({ vertices: vertices[level], coords, firstRow: firstRows[level] });
+      held.push({ vertices: vertices[level], keys, firstRow: firstRows[level] });
     };
-    hold(Array.from(numbers, (number) => coordOf(bricks.keys[number])), (entry) => entry);
+    hold(Array.from(numbers, (number) => bricks.keys[number]), (entry) => entry);
     const isFree = (x, y, z) => owners[((x << level) * n + (y << level)) * n + (z << level)] < 0;
     hold(withCorners(vertices[level].bricks, bricksAlong(Math.ceil(resolution / 2 ** level)), isFree), (entry) => -2 - entry);
   }
@@ -238,7 +248,7 @@ function heldBricks({ levels, vertices, firstRows }, resolution) {
   return { n, owners, held, count };
 }
 
-// Coordinates, sorted, of the bricks in which a cell has a stored corner, there or in the next brick, where `wanted`.
+// Keys, sorted, of the bricks in which a cell has a stored corner, there or in the next brick, where `wanted`.
 function withCorners({ keys, masks }, n, wanted) {
   const marked = new Uint8Array(n ** 3), found = [];
   keys.forEach((key, i) => {
@@ -253,74 +263,82 @@ function withCorners({ keys, masks }, n, wanted) {
       if (some && wanted(x, y, z)) marked[(x * n + y) * n + z] = 1;
     }
   });
-  marked.forEach((mark, i) => mark && found.push([Math.floor(i / (n * n)), Math.floor(i / n) % n, i % n]));
+  marked.forEach((mark, i) => mark && found.push(keyOf(Math.floor(i / (n * n)), Math.floor(i / n) % n, i % n)));
   return found;
 }
 
 // { nRows, owners, indices, features }.
 function featureTexels({ n, owners: numbers, held, count }, { values, stride }) {
   const block = blockOf(count, INDEX_BRICK), [width, height, depth] = block.size;
-  const indices = new Int16Array(4 * width * height * depth), firstRows = new Uint32Array(count + 1);
-  const rows = new RowWriter(values, stride / 4), around = new Int16Array(9 * 81);
-  let number = 0;
-  for (const { vertices, coords, firstRow } of held) {
+  const indices = new Int32Array(2 * width * height * depth), firstRows = new Uint32Array(count + 1);
+  const nWords = stride / 4, words = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
+  const rows = new Int32Array(nWords * rowsAround(held)), around = new Int16Array(AROUND);
+  let number = 0, nRows = 0;
+  // Copies rows behind those that are there.
+  const add = (row, nSome) => {
+    for (let from = row * nWords, to = nRows * nWords, end = from + nSome * nWords; from < end;) rows[to++] = words[from++];
+    nRows += nSome;
+  };
+  for (const { vertices, keys, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
-    for (const coord of coords) {
-      read.moveTo(...coord);
-      const first = (firstRows[number] = rows.n);
-      for (let x = 0, at = 0; x < 9; x++) {
+    for (const key of keys) {
+      read.moveTo(key);
+      const first = (firstRows[number] = nRows);
+      for (let x = 0; x < 9; x++) {
         for (let y = 0; y < 9; y++) {
           read.column(x, y);
-          let row = read.row, mask = read.mask;
-          for (let z = 0; z < 8; z++, mask >>= 1) around[at++] = mask & 1 ? rows.add(row++) - first : -1;
-          around[at++] = mask & 1 ? rows.add(read.row8) - first : -1;
+          let at = 9 * y + x, mask = read.mask, index = nRows - first;
+          for (let z = 0; z < 9; z++, mask >>= 1, at += 81) around[at] = mask & 1 ? index++ : -1;
+          add(read.row, popcount(read.mask & 255));
+          if (read.mask >> 8) add(read.row8, 1);
         }
       }
       const [bx, by, bz] = placeOf(number++, block);
-      for (let x = 0; x < 8; x++) {
+      for (let z = 0, from = 0; z < 9; z++, from += 9) {
         for (let y = 0; y < 8; y++) {
-          let from = 81 * x + 9 * y, to = 4 * ((9 * bz * height + 8 * by + y) * width + 8 * bx + x);
-          for (let z = 0; z < 9; z++, from++, to += 4 * width * height) {
-            indices[to] = around[from];
-            indices[to + 1] = around[from + 9];
-            indices[to + 2] = around[from + 81];
-            indices[to + 3] = around[from + 90];
+          let to = 2 * (((9 * bz + z) * height + 8 * by + y) * width + 8 * bx);
+          let pair = (around[from] & 0xffff) | (around[from + 9] << 16);
+          from++;
+          for (let end = to + 16; to < end; from++) {
+            const next = (around[from] & 0xffff) | (around[from + 9] << 16);
+            indices[to++] = pair;
+            indices[to++] = next;
+            pair = next;
           }
         }
       }
     }
   }
   const owners = new Uint16Array(4 * n ** 3);
-  numbers.forEach((owner, i) => {
+  for (let i = 0, to = 0; i < numbers.length; i++, to += 4) {
+    const owner = numbers[i];
+    if (owner < 0) {
+      owners[to + 1] = NO_OWNER;
+      continue;
+    }
     const [x, y, z] = placeOf(owner >> 3, block), first = firstRows[owner >> 3];
-    if (owner < 0) owners[4 * i + 1] = NO_OWNER;
-    else owners.set([x | (y << 8), z | ((owner & 7) << 8), first & 0xffff, first >>> 16], 4 * i);
-  });
-  return { nRows: rows.n, owners, indices, features: rows.whole() };
+    owners[to] = x | (y << 8);
+    owners[to + 1] = z | ((owner & 7) << 8);
+    owners[to + 2] = first & 0xffff;
+    owners[to + 3] = first >>> 16;
+  }
+  return { nRows, owners, indices: new Int16Array(indices.buffer), features: new Int8Array(rows.buffer) };
 }
 
-// Gathers rows of features, of so many words, one behind the other.
-class RowWriter {
-  constructor(values, nWords) {
-    this.values = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
-    Object.assign(this, { n: 0, nWords, rows: new Int32Array(nWords << 16) });
-  }
-
-  // Adds a row of the values; its number.
-  add(row) {
-    const { nWords, values } = this;
-    let to = this.n * nWords;
-    if (to + nWords > this.rows.length) {
-      const longer = new Int32Array(2 * this.rows.length);
-      longer.set(this.rows);
-      this.rows = longer;
+// Rows of all bricks with their aprons.
+function rowsAround(held) {
+  let n = 0;
+  for (const { vertices, keys, firstRow } of held) {
+    const read = new ColumnReader(vertices, firstRow);
+    for (const key of keys) {
+      read.moveTo(key);
+      for (let x = 0; x < 9; x++) {
+        for (let y = 0; y < 9; y++) {
+          read.column(x, y);
+          n += popcount(read.mask);
+        }
+      }
     }
-    const { rows } = this;
-    for (let from = row * nWords, end = from + nWords; from < end;) rows[to++] = values[from++];
-    return this.n++;
   }
-
-  whole() {
-    return new Int8Array(this.rows.slice(0, this.n * this.nWords).buffer);
-  }
+  return n;
 }
