@@ -17,6 +17,7 @@ export class Bricks {
   constructor(keys, masks) {
     this.keys = keys;
     this.masks = masks;
+    this.bytes = new Uint8Array(masks.buffer, masks.byteOffset, 4 * masks.length); // 8 x + y of a brick: its bits along z
     this.n = keys.length;
     const size = 1 << Math.max(2, 32 - Math.clz32(2 * this.n));
     this.slots = new Int32Array(size).fill(-1);
@@ -53,7 +54,9 @@ export class Bricks {
   withoutEmpty() {
     const kept = [];
     for (let i = 0; i < this.n; i++) {
-      if (this.masks.subarray(16 * i, 16 * i + 16).some((word) => word !== 0)) kept.push(i);
+      let some = 0;
+      for (let word = 16 * i; word < 16 * i + 16; word++) some |= this.masks[word];
+      if (some) kept.push(i);
     }
     if (kept.length === this.n) return this;
     const masks = new Uint32Array(16 * kept.length);

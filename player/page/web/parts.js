@@ -1,6 +1,6 @@
 // Decodes the parts of a scene, one after another. The twin of player/asset/parts.py.
 
-import { Decoder } from "./coder.js";
+import { Decoder, SYMBOL_OF_ZERO } from "./coder.js";
 import { Pyramid, putValues } from "./pyramid.js";
 import { decodeStructure } from "./structure.js";
 
@@ -8,7 +8,7 @@ import { decodeStructure } from "./structure.js";
 const MOST_BYTES = 3 * 2 ** 30;
 
 // One of the two pyramids, as far as its sections have been read: values of levels that are not known are not there,
-// symbols that are not known are 0.
+// symbols that are not known are 0. Values follow from symbols when they are asked for, all channels of a level at once.
 class PyramidReader {
   // `structures`: the structure sections that the parts will bring.
   constructor(grid, manifest, structures) {
@@ -19,6 +19,9 @@ class PyramidReader {
     [this.low, this.high] = isFeatures ? [-127, 127] : [0, 255];
     this.pyramid = new Pyramid(isFeatures ? manifest.feature_resolution : manifest.resolution, this.steps.length);
     this.nKnown = this.steps.map(() => 0); // channels of each level whose symbols are read
+    this.nPut = this.steps.map(() => 0); // channels of each level whose values follow from symbols that are read
+    this.symbols = this.steps.map(() => null); // those of the channels from nPut on, channel by channel, + 63
+    this.beyond = this.steps.map(() => []); // and for each of these channels that is read { bytes, first }: see putValues
     this.rows = null; // of the level whose symbols were read last
     this.rowsLevel = -1;
     // Rows of all levels, the finest first; a level that is not known yet has none in what is handed out.
@@ -52,37 +55,42 @@ class PyramidReader {
     }
     const { rows } = this;
     const decoder = await Decoder.open(data, rows.neighbours, n, 4, where);
-    const symbols = new Uint8Array(n * rows.n);
-    const beyondFirst = [];
+    const symbols = (this.symbols[level] ??= this.noSymbols(level));
     for (let channel = 0; channel < n; channel++) {
-      const found = symbols.subarray(channel * rows.n, (channel + 1) * rows.n);
-      beyondFirst.push(decoder.channel(rows.classes, found));
+      const begin = (first - this.nPut[level] + channel) * rows.n;
+      const before = decoder.channel(rows.classes, symbols.subarray(begin, begin + rows.n));
+      this.beyond[level].push({ bytes: decoder.beyond, first: before });
       await pause();
     }
     decoder.finish();
-    this.put(level, first, n, { symbols, beyond: decoder.beyond ?? null, beyondFirst });
     this.nKnown[level] = first + n;
   }
 
-  put(level, first, n, { symbols, beyond, beyondFirst }) {
-    const isCoarsest = level + 1 === this.steps.length;
+  noSymbols(level) {
+    return new Uint8Array((this.nChannels - this.nPut[level]) * this.pyramid.vertices[level].nStored).fill(SYMBOL_OF_ZERO);
+  }
+
+  put(level) {
+    const isCoarsest = level + 1 === this.steps.length, first = this.nPut[level];
+    if (first === this.nChannels) return;
     putValues({
       here: this.pyramid.vertices[level],
       coarser: isCoarsest ? null : this.pyramid.vertices[level + 1],
       values: this.valuesOf(level),
       coarserValues: isCoarsest ? null : this.valuesOf(level + 1),
-      stride: this.stride, first, n, symbols, beyond, beyondFirst,
+      stride: this.stride, first, n: this.nChannels - first,
+      symbols: this.symbols[level] ?? this.noSymbols(level), beyond: this.beyond[level],
       step: this.steps[level], low: this.low, high: this.high,
     });
+    this.nPut[level] = this.nKnown[level];
+    this.symbols[level] = null;
+    this.beyond[level] = [];
   }
 
   // What is known so far. `isLast`: the arrays are handed out themselves, and this is at its end.
   values(isLast) {
     const { pyramid, nChannels, stride } = this;
-    for (let level = this.steps.length - 1; level >= 0; level--) {
-      const n = nChannels - this.nKnown[level];
-      if (n > 0) this.put(level, this.nKnown[level], n, { symbols: null });
-    }
+    for (let level = this.steps.length - 1; level >= 0; level--) this.put(level);
     const finest = Math.max(0, pyramid.levels.findIndex((bricks) => bricks.n > 0));
     const first = this.firstRows[finest];
     const known = this.all.subarray(first * stride);

@@ -1,7 +1,7 @@
 // A pyramid: the vertices of its levels, and the values that follow from symbols (docs/format.md, "Pyramids"). The twin
 // of player/asset/pyramid.py and player/asset/symbols.py.
 
-import { Bricks, coordOf, keyOf, NO_BRICKS, Ranks } from "./bricks.js";
+import { Bricks, coordOf, keyOf, NO_BRICKS, popcount, Ranks } from "./bricks.js";
 
 // The bricks of each level, the finest first, and their vertices.
 export class Pyramid {
@@ -27,9 +27,9 @@ export class Pyramid {
     if (level + 1 < this.levels.length) {
       const last = Math.ceil(this.cellsPerAxis(level) / 8);
       const beside = neighbourhood(bricks, -1, 1, last).filter((key) => bricks.find(...coordOf(key)) < 0);
-      const shown = new Uint32Array(16 * beside.length);
-      beside.forEach((key, i) => this.putShown(level + 1, key, shown, 16 * i));
-      const coarser = cornersOf(new Bricks(beside, shown).withoutEmpty());
+      const shown = new Bricks(beside, new Uint32Array(16 * beside.length));
+      beside.forEach((key, i) => this.putShown(level + 1, key, shown.bytes, 64 * i));
+      const coarser = cornersOf(shown.withoutEmpty());
       for (let i = 0; i < corners.n; i++) {
         const other = coarser.find(...coordOf(corners.keys[i]));
         if (other < 0) continue;
@@ -41,30 +41,32 @@ export class Pyramid {
     return new Vertices(corners, border);
   }
 
-  // Into `out` from `at` on: which cells, in the place `key` of a brick of the next finer level, are read from live
-  // cells of `level` or coarser ones.
+  // Into `out` from `at` on, a byte a line of cells along z: which cells, in the place `key` of a brick of the next finer
+  // level, are read from live cells of `level` or coarser ones.
   putShown(level, key, out, at) {
     let [x, y, z] = coordOf(key);
     let shift = 0; // how many levels coarser than the place
     let brick = -1;
     const [firstX, firstY, firstZ] = [8 * x, 8 * y, 8 * z];
-    for (; level < this.levels.length && brick < 0; level++) {
+    for (; brick < 0; level++, shift++) {
+      if (level === this.levels.length) return;
       [x, y, z] = [x >> 1, y >> 1, z >> 1];
-      shift++;
       brick = this.levels[level].find(x, y, z);
-      if (brick >= 0) break;
     }
-    if (brick < 0) return;
-    const { masks } = this.levels[level];
-    for (let b = 0; b < 512; b++) {
-      const cellX = (firstX + (b >> 6)) >> shift;
-      const cellY = (firstY + ((b >> 3) & 7)) >> shift;
-      const cellZ = (firstZ + (b & 7)) >> shift;
-      const bit = ((cellX & 7) << 6) | ((cellY & 7) << 3) | (cellZ & 7);
-      out[at + (b >> 5)] |= ((masks[16 * brick + (bit >> 5)] >>> (bit & 31)) & 1) << (b & 31);
+    const { bytes } = this.levels[level - 1];
+    const bits = (1 << (8 >> shift || 1)) - 1; // of a line along z of cells: so many become 8
+    for (let line = 0; line < 64; line++) {
+      const cellX = ((firstX + (line >> 3)) >> shift) & 7;
+      const cellY = ((firstY + (line & 7)) >> shift) & 7;
+      let found = (bytes[64 * brick + 8 * cellX + cellY] >> ((firstZ >> shift) & 7)) & bits;
+      for (let halves = bits; halves < 255; halves = DOUBLED[halves]) found = DOUBLED[found];
+      out[at + line] = found;
     }
   }
 }
+
+// Four bits, each twice.
+const DOUBLED = Uint8Array.from({ length: 16 }, (_, bits) => [3, 12, 48, 192].reduce((all, pair, i) => all | (bits & (1 << i) ? pair : 0), 0));
 
 // The keys of all places with components from `low` to `high` beside those of bricks and from 0 to `end` - 1, sorted.
 function neighbourhood(bricks, low, high, end) {
@@ -89,7 +91,7 @@ function neighbourhood(bricks, low, high, end) {
 function cornersOf(cells) {
   const keys = neighbourhood(cells, 0, 1, 512);
   const masks = new Uint32Array(16 * keys.length);
-  const bytes = new Uint8Array(cells.masks.buffer, cells.masks.byteOffset, 4 * cells.masks.length); // 8 x + y of a brick
+  const { bytes } = cells;
   const found = new Uint8Array(masks.buffer);
   const around = new Uint16Array(81); // cells at 9 x + y from -1 to 7, bit z + 1
   for (let i = 0; i < keys.length; i++) {
@@ -125,6 +127,7 @@ export class Vertices {
     this.border = border;
     this.ranks = new Ranks(bricks, bricks.masks);
     this.n = this.ranks.n;
+    this.nStored = this.n - border.reduce((sum, word) => sum + popcount(word), 0); // vertices that have symbols
   }
 
   // What is known about the vertices that are not on the border before their symbols are: `neighbours` [alongZ, alongY,
@@ -176,36 +179,36 @@ for (let b = 0; b < 512; b++) {
 // - here, coarser: the vertices of the level, and of the next coarser one (null for the coarsest);
 // - values, coarserValues: typed arrays, rows of `stride`;
 // - n: how many channels;
-// - symbols: Uint8Array [n * nRows], channel by channel, symbols + 63; null where all are 0;
-// - beyond, beyondFirst: for symbols of -63 and 63 how much further they are, and where each channel's begin;
+// - symbols: Uint8Array [n * nStored], channel by channel, symbols + 63;
+// - beyond: for channels, `first` the first, { bytes, first }: how much further symbols of -63 and 63 are, from first on;
 // - step, low, high: of the level, and of values.
-export function putValues({ here, coarser, values, coarserValues, stride, first, n, symbols, beyond, beyondFirst,
-  step, low, high }) {
-  const { bricks, border } = here;
-  const nRows = symbols ? symbols.length / n : 0;
-  const beyondAt = Int32Array.from(beyondFirst ?? []);
+export function putValues({ here, coarser, values, coarserValues, stride, first, n, symbols, beyond, step, low, high }) {
+  const { bricks: { keys, masks }, border, nStored } = here;
+  const beyondAt = Int32Array.from(beyond, (channel) => channel.first);
   const near = new Int16Array(125 * n);
-  const sums = new Int32Array(n);
-  let row = 0;
+  const predicted = new Int16Array(n);
   let symbolRow = 0;
-  for (let i = 0; i < bricks.n; i++) {
-    if (coarser) gather(coarser, bricks.keys[i], coarserValues, stride, first, n, near);
+  let into = first;
+  for (let i = 0; i < keys.length; i++) {
+    if (coarser) gather(coarser, keys[i], coarserValues, stride, first, n, near);
     for (let word = 0; word < 16; word++) {
-      const notStored = symbols === null ? -1 : border[16 * i + word];
-      for (let left = bricks.masks[16 * i + word] | 0; left !== 0; left &= left - 1) {
+      const notStored = border[16 * i + word];
+      for (let left = masks[16 * i + word] | 0; left !== 0; left &= left - 1, into += stride) {
         const bit = left & -left;
-        if (coarser) addAround(near, 32 * word + 31 - Math.clz32(bit), n, sums);
-        const into = row * stride + first;
-        row++;
+        if (coarser) predict(near, 32 * word + 31 - Math.clz32(bit), n, predicted);
         if (notStored & bit) {
-          for (let k = 0; k < n; k++) values[into + k] = (sums[k] + 4) >> 3;
+          for (let k = 0; k < n; k++) values[into + k] = predicted[k];
           continue;
         }
-        for (let k = 0; k < n; k++) {
-          let symbol = symbols[k * nRows + symbolRow] - 63;
-          if (symbol === 63) symbol += beyond[beyondAt[k]++];
-          else if (symbol === -63) symbol -= beyond[beyondAt[k]++];
-          const value = ((sums[k] + 4) >> 3) + step * symbol;
+        for (let k = 0, at = symbolRow; k < n; k++, at += nStored) {
+          let symbol = symbols[at] - 63;
+          if (symbol === 0) {
+            values[into + k] = predicted[k];
+            continue;
+          }
+          if (symbol === 63) symbol += beyond[k].bytes[beyondAt[k]++];
+          else if (symbol === -63) symbol -= beyond[k].bytes[beyondAt[k]++];
+          const value = predicted[k] + step * symbol;
           values[into + k] = value < low ? low : value > high ? high : value;
         }
         symbolRow++;
@@ -240,8 +243,8 @@ function gather(coarser, key, values, stride, first, n, near) {
   }
 }
 
-// Sums over eight of `near`.
-function addAround(near, b, n, sums) {
+// The mean of eight of `near`, rounded.
+function predict(near, b, n, predicted) {
   const at = 8 * b;
   const nOdd = (b & 1) + ((b >> 3) & 1) + ((b >> 6) & 1);
   const p0 = AROUND[at] * n;
@@ -249,19 +252,19 @@ function addAround(near, b, n, sums) {
   const p2 = AROUND[at + 2] * n;
   const p3 = AROUND[at + 3] * n;
   if (nOdd === 0) {
-    for (let k = 0; k < n; k++) sums[k] = 8 * near[p0 + k];
+    for (let k = 0; k < n; k++) predicted[k] = near[p0 + k];
   } else if (nOdd === 1) {
-    for (let k = 0; k < n; k++) sums[k] = 4 * (near[p0 + k] + near[p1 + k]);
+    for (let k = 0; k < n; k++) predicted[k] = (near[p0 + k] + near[p1 + k] + 1) >> 1;
   } else if (nOdd === 2) {
-    for (let k = 0; k < n; k++) sums[k] = 2 * (near[p0 + k] + near[p1 + k] + near[p2 + k] + near[p3 + k]);
+    for (let k = 0; k < n; k++) predicted[k] = (near[p0 + k] + near[p1 + k] + near[p2 + k] + near[p3 + k] + 2) >> 2;
   } else {
     const p4 = AROUND[at + 4] * n;
     const p5 = AROUND[at + 5] * n;
     const p6 = AROUND[at + 6] * n;
     const p7 = AROUND[at + 7] * n;
     for (let k = 0; k < n; k++) {
-      sums[k] = near[p0 + k] + near[p1 + k] + near[p2 + k] + near[p3 + k] +
-        near[p4 + k] + near[p5 + k] + near[p6 + k] + near[p7 + k];
+      predicted[k] = (near[p0 + k] + near[p1 + k] + near[p2 + k] + near[p3 + k] +
+        near[p4 + k] + near[p5 + k] + near[p6 + k] + near[p7 + k] + 4) >> 3;
     }
   }
 }
