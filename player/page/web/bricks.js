@@ -28,17 +28,6 @@ export class Bricks {
     }
   }
 
-  // The coordinates as Uint16Array [3 n].
-  coords() {
-    const found = new Uint16Array(3 * this.n);
-    for (let i = 0; i < this.n; i++) {
-      found[3 * i] = this.keys[i] >> 18;
-      found[3 * i + 1] = (this.keys[i] >> 9) & 511;
-      found[3 * i + 2] = this.keys[i] & 511;
-    }
-    return found;
-  }
-
   // Which brick has the coordinate, -1 if none.
   find(x, y, z) {
     if ((x | y | z) < 0) return -1;

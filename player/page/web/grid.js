@@ -21,6 +21,8 @@ export const DENSITY_BRICK = [8, 8, 10]; // texels
 export const INDEX_BRICK = [8, 8, 9];
 export const LINES_A_LAYER = 256;
 
+const AROUND = 9 ** 3; // vertices of a brick with its apron
+
 const bricksAlong = (cells) => Math.ceil(cells / 8);
 
 // Texels that a row of features takes, and how many rows lie beside each other: a power of two, no more than 2048 texels.
@@ -154,6 +156,12 @@ function addDistances(table, n) {
   }
 }
 
+// Where the texels of a brick begin.
+function firstTexel(n, block, [nx, ny, nz]) {
+  const [x, y, z] = placeOf(n, block), [width, height] = block.size;
+  return (nz * z * height + ny * y) * width + nx * x;
+}
+
 function densityTexels({ vertices, values, firstRows }, { levels, count }) {
   const block = blockOf(count, DENSITY_BRICK), [width, height, depth] = block.size;
   const texels = new Uint32Array(width * height * depth), codes = new Uint8Array(AROUND);
@@ -161,37 +169,47 @@ function densityTexels({ vertices, values, firstRows }, { levels, count }) {
     const read = new ColumnReader(vertices[level], firstRows[level]);
     for (let i = 0; i < numbers.length; i++) {
       read.moveTo(keys[numbers[i]]);
-      for (let y = 0; y < 9; y++) {
-        for (let x = 0; x < 9; x++) {
-          read.column(x, y);
-          let at = 9 * y + x, row = read.row, mask = read.mask;
-          for (let z = 0; z < 8; z++, mask >>= 1, at += 81) codes[at] = mask & 1 ? values[row++] : 0;
-          codes[at] = mask & 1 ? values[read.row8] : 0;
-        }
-      }
-      const [bx, by, bz] = placeOf(first + i, block), word = 16 * numbers[i];
-      for (let z = 0, from = 0; z < 9; z++, from += 9) {
-        for (let y = 0; y < 8; y++) {
-          let to = ((10 * bz + z) * height + 8 * by + y) * width + 8 * bx;
-          let pair = codes[from] | (codes[from + 9] << 8);
-          from++;
-          for (let end = to + 8; to < end; to++, from++) {
-            const next = codes[from] | (codes[from + 9] << 8);
-            texels[to] = pair | (next << 16);
-            pair = next;
-          }
-        }
-      }
-      for (let y = 0; y < 8; y++) {
-        const to = ((10 * bz + 9) * height + 8 * by + y) * width + 8 * bx;
-        for (let x = 0; x < 8; x++) texels[to + x] = (masks[word + 2 * x + (y >> 2)] >>> (8 * (y & 3))) & 255;
-      }
+      gatherCodes(read, values, codes);
+      const begin = firstTexel(first + i, block, DENSITY_BRICK);
+      putCodes(codes, texels, begin, width, height);
+      putLive(masks, 16 * numbers[i], texels, begin + 9 * width * height, width);
     }
   }
   return new Uint8Array(texels.buffer);
 }
 
-const AROUND = 9 ** 3; // vertices of a brick with its apron
+// The codes of a brick with its apron, 0 where a vertex is not stored.
+function gatherCodes(read, values, codes) {
+  for (let x = 0; x < 9; x++) {
+    for (let y = 0; y < 9; y++) {
+      read.column(x, y);
+      let at = 9 * y + x, row = read.row, mask = read.mask;
+      for (let z = 0; z < 8; z++, mask >>= 1, at += 81) codes[at] = mask & 1 ? values[row++] : 0;
+      codes[at] = mask & 1 ? values[read.row8] : 0;
+    }
+  }
+}
+
+function putCodes(codes, texels, begin, width, height) {
+  for (let z = 0, from = 0; z < 9; z++, from += 9) {
+    for (let y = 0; y < 8; y++) {
+      let to = begin + (z * height + y) * width;
+      let pair = codes[from] | (codes[from + 9] << 8);
+      from++;
+      for (let end = to + 8; to < end; to++, from++) {
+        const next = codes[from] | (codes[from + 9] << 8);
+        texels[to] = pair | (next << 16);
+        pair = next;
+      }
+    }
+  }
+}
+
+function putLive(masks, word, texels, begin, width) {
+  for (let y = 0, to = begin; y < 8; y++, to += width) {
+    for (let x = 0; x < 8; x++) texels[to + x] = (masks[word + 2 * x + (y >> 2)] >>> (8 * (y & 3))) & 255;
+  }
+}
 
 // Reads the columns along z of one brick with its apron: `mask` has a bit for each stored vertex z = 0..8, `row` is
 // the row of the first of z = 0..7, `row8` that of z = 8.
@@ -221,6 +239,18 @@ class ColumnReader {
       this.mask |= ((bits >>> shift) & 1) << 8;
       this.row8 = this.firstRow + firstRows[16 * next + word] + popcount(bits & ((1 << shift) - 1));
     }
+  }
+
+  // How many vertices of the brick with its apron are stored.
+  count() {
+    let n = 0;
+    for (let x = 0; x < 9; x++) {
+      for (let y = 0; y < 9; y++) {
+        this.column(x, y);
+        n += popcount(this.mask);
+      }
+    }
+    return n;
   }
 }
 
@@ -268,77 +298,95 @@ function withCorners({ keys, masks }, n, wanted) {
 }
 
 // { nRows, owners, indices, features }.
-function featureTexels({ n, owners: numbers, held, count }, { values, stride }) {
+function featureTexels({ n, owners, held, count }, { values, stride }) {
   const block = blockOf(count, INDEX_BRICK), [width, height, depth] = block.size;
   const indices = new Int32Array(2 * width * height * depth), firstRows = new Uint32Array(count + 1);
-  const nWords = stride / 4, words = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
-  const rows = new Int32Array(nWords * rowsAround(held)), around = new Int16Array(AROUND);
-  let number = 0, nRows = 0;
-  // Copies rows behind those that are there.
-  const add = (row, nSome) => {
-    for (let from = row * nWords, to = nRows * nWords, end = from + nSome * nWords; from < end;) rows[to++] = words[from++];
-    nRows += nSome;
-  };
+  const rows = new RowWriter(values, stride / 4, rowsAround(held)), around = new Int16Array(AROUND);
+  let number = 0;
   for (const { vertices, keys, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
     for (const key of keys) {
       read.moveTo(key);
-      const first = (firstRows[number] = nRows);
-      for (let x = 0; x < 9; x++) {
-        for (let y = 0; y < 9; y++) {
-          read.column(x, y);
-          let at = 9 * y + x, mask = read.mask, index = nRows - first;
-          for (let z = 0; z < 9; z++, mask >>= 1, at += 81) around[at] = mask & 1 ? index++ : -1;
-          add(read.row, popcount(read.mask & 255));
-          if (read.mask >> 8) add(read.row8, 1);
-        }
-      }
-      const [bx, by, bz] = placeOf(number++, block);
-      for (let z = 0, from = 0; z < 9; z++, from += 9) {
-        for (let y = 0; y < 8; y++) {
-          let to = 2 * (((9 * bz + z) * height + 8 * by + y) * width + 8 * bx);
-          let pair = (around[from] & 0xffff) | (around[from + 9] << 16);
-          from++;
-          for (let end = to + 16; to < end; from++) {
-            const next = (around[from] & 0xffff) | (around[from + 9] << 16);
-            indices[to++] = pair;
-            indices[to++] = next;
-            pair = next;
-          }
-        }
+      firstRows[number] = rows.n;
+      gatherRows(read, rows, around);
+      putIndices(around, indices, firstTexel(number++, block, INDEX_BRICK), width, height);
+    }
+  }
+  const features = new Int8Array(rows.rows.buffer);
+  return { nRows: rows.n, owners: ownerTexels(owners, n, block, firstRows), indices: new Int16Array(indices.buffer), features };
+}
+
+// Adds the rows of a brick with its apron; their numbers from its first one on, -1 where a vertex is not stored.
+function gatherRows(read, rows, around) {
+  const first = rows.n;
+  for (let x = 0; x < 9; x++) {
+    for (let y = 0; y < 9; y++) {
+      read.column(x, y);
+      let at = 9 * y + x, mask = read.mask, index = rows.n - first;
+      for (let z = 0; z < 9; z++, mask >>= 1, at += 81) around[at] = mask & 1 ? index++ : -1;
+      rows.add(read.row, popcount(read.mask & 255));
+      rows.add(read.row8, read.mask >> 8);
+    }
+  }
+}
+
+function putIndices(around, indices, begin, width, height) {
+  for (let z = 0, from = 0; z < 9; z++, from += 9) {
+    for (let y = 0; y < 8; y++) {
+      let to = 2 * (begin + (z * height + y) * width);
+      let pair = (around[from] & 0xffff) | (around[from + 9] << 16);
+      from++;
+      for (let end = to + 16; to < end; from++) {
+        const next = (around[from] & 0xffff) | (around[from + 9] << 16);
+        indices[to++] = pair;
+        indices[to++] = next;
+        pair = next;
       }
     }
   }
-  const owners = new Uint16Array(4 * n ** 3);
-  for (let i = 0, to = 0; i < numbers.length; i++, to += 4) {
-    const owner = numbers[i];
+}
+
+function ownerTexels(owners, n, block, firstRows) {
+  const texels = new Uint16Array(4 * n ** 3);
+  for (let i = 0, to = 0; i < owners.length; i++, to += 4) {
+    const owner = owners[i];
     if (owner < 0) {
-      owners[to + 1] = NO_OWNER;
+      texels[to + 1] = NO_OWNER;
       continue;
     }
     const [x, y, z] = placeOf(owner >> 3, block), first = firstRows[owner >> 3];
-    owners[to] = x | (y << 8);
-    owners[to + 1] = z | ((owner & 7) << 8);
-    owners[to + 2] = first & 0xffff;
-    owners[to + 3] = first >>> 16;
+    texels[to] = x | (y << 8);
+    texels[to + 1] = z | ((owner & 7) << 8);
+    texels[to + 2] = first & 0xffff;
+    texels[to + 3] = first >>> 16;
   }
-  return { nRows, owners, indices: new Int16Array(indices.buffer), features: new Int8Array(rows.buffer) };
+  return texels;
 }
 
-// Rows of all bricks with their aprons.
+// How many rows all bricks with their aprons have.
 function rowsAround(held) {
   let n = 0;
   for (const { vertices, keys, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
     for (const key of keys) {
       read.moveTo(key);
-      for (let x = 0; x < 9; x++) {
-        for (let y = 0; y < 9; y++) {
-          read.column(x, y);
-          n += popcount(read.mask);
-        }
-      }
+      n += read.count();
     }
   }
   return n;
+}
+
+// Copies rows of features, of so many words, one behind the other.
+class RowWriter {
+  constructor(values, nWords, nRows) {
+    this.values = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
+    Object.assign(this, { n: 0, nWords, rows: new Int32Array(nRows * nWords) });
+  }
+
+  // Adds some rows of the values, from `row` on.
+  add(row, nSome) {
+    const { values, rows, nWords } = this;
+    for (let from = row * nWords, to = this.n * nWords, end = from + nSome * nWords; from < end;) rows[to++] = values[from++];
+    this.n += nSome;
+  }
 }

@@ -1,7 +1,7 @@
 // Decodes which bricks a level has and which of their cells are live: an octree, from the coarse to the fine
 // (docs/format.md, "What is coded"). The twin of player/asset/structure.py.
 
-import { Bricks, keyOf } from "./bricks.js";
+import { Bricks, coordOf, keyOf } from "./bricks.js";
 import { Decoder, SYMBOL_OF_ZERO } from "./coder.js";
 
 const N_CHILDREN = 8;
@@ -58,13 +58,14 @@ function piecesOf(data, n, where) {
   return pieces;
 }
 
-function checkInside(bricks, cellsPerAxis, where) {
-  const coords = bricks.coords();
-  for (let i = 0; i < bricks.n; i++) {
-    const [nx, ny, nz] = [0, 1, 2].map((axis) => Math.min(8, cellsPerAxis - 8 * coords[3 * i + axis]));
-    if (nx === 8 && ny === 8 && nz === 8) continue;
+function checkInside({ keys, masks }, cellsPerAxis, where) {
+  const nWhole = cellsPerAxis >> 3; // bricks along an axis that are all inside
+  for (let i = 0; i < keys.length; i++) {
+    const [x, y, z] = coordOf(keys[i]);
+    if (x < nWhole && y < nWhole && z < nWhole) continue;
+    const [nx, ny, nz] = [cellsPerAxis - 8 * x, cellsPerAxis - 8 * y, cellsPerAxis - 8 * z];
     for (let b = 0; b < 512; b++) {
-      const isLive = (bricks.masks[16 * i + (b >> 5)] >>> (b & 31)) & 1;
+      const isLive = (masks[16 * i + (b >> 5)] >>> (b & 31)) & 1;
       if (isLive && (b >> 6 >= nx || ((b >> 3) & 7) >= ny || (b & 7) >= nz)) {
         throw new Error(`${where}: expected cells below ${cellsPerAxis} along each axis, got one behind`);
       }
@@ -135,38 +136,52 @@ function asBits(found, where) {
 // [n]: its number; `beside` [axis][before or after] Int32Array [n]: the rows beside each; n for a cell that is
 // not live, n + 1 for one in an octant that is not refined.
 function parentsOf(octants, refined) {
-  const { named, live } = octants;
+  const { named } = octants;
+  const { rows, n } = rowsOfCells(octants, refined);
+  const octant = new Int32Array(n);
+  const local = new Uint8Array(n);
+  placesOfRows(rows, octant, local);
+  const beside = [16, 4, 1].map((stride, axis) => [-1, 1].map((side) => (
+    rowsBeside(rows, octant, local, octantsBeside(named, axis, side), stride, side))));
+  return { octant, local, beside, n };
+}
+
+// The row of each cell of each octant, and of one more octant that is not there: -1 for a cell that is not live, -2 for one in
+// an octant that is not refined; and how many rows there are.
+function rowsOfCells({ named, live }, refined) {
+  const rows = new Int32Array(64 * (named.n + 1)).fill(-1, 64 * named.n);
   let n = 0;
-  const row = new Int32Array(64 * (named.n + 1));
   for (let i = 0; i < named.n; i++) {
     for (let local = 0; local < 64; local++) {
       const isLive = (live[4 * i + (local >> 4)] >> (local & 15)) & 1;
-      row[64 * i + local] = !isLive ? -1 : refined[i] ? n++ : -2;
+      rows[64 * i + local] = !isLive ? -1 : refined[i] ? n++ : -2;
     }
   }
-  row.fill(-1, 64 * named.n);
-  const octant = new Int32Array(n);
-  const local = new Uint8Array(n);
-  for (let at = 0; at < 64 * named.n; at++) {
-    if (row[at] >= 0) {
-      octant[row[at]] = at >> 6;
-      local[row[at]] = at & 63;
-    }
+  return { rows, n };
+}
+
+function placesOfRows(rows, octant, local) {
+  for (let at = 0; at < rows.length; at++) {
+    const row = rows[at];
+    if (row < 0) continue;
+    octant[row] = at >> 6;
+    local[row] = at & 63;
   }
-  const beside = [16, 4, 1].map((stride, axis) => [-1, 1].map((side) => {
-    const others = octantsBeside(named, axis, side);
-    const found = new Int32Array(n);
-    const edge = side < 0 ? 0 : 3 * stride;
-    for (let i = 0; i < n; i++) {
-      const isInside = (local[i] & (3 * stride)) !== edge;
-      const place = isInside ? 64 * octant[i] + local[i] + side * stride
-        : 64 * others[octant[i]] + local[i] - 3 * side * stride;
-      const other = row[place];
-      found[i] = other >= 0 ? other : other === -1 ? n : n + 1;
-    }
-    return found;
-  }));
-  return { octant, local, beside, n };
+}
+
+// The rows beside each: `others` are the octants beside each octant, `stride` is that of the axis.
+function rowsBeside(rows, octant, local, others, stride, side) {
+  const n = octant.length;
+  const found = new Int32Array(n);
+  const edge = side < 0 ? 0 : 3 * stride;
+  for (let i = 0; i < n; i++) {
+    const isInside = (local[i] & (3 * stride)) !== edge;
+    const place = isInside ? 64 * octant[i] + local[i] + side * stride
+      : 64 * others[octant[i]] + local[i] - 3 * side * stride;
+    const other = rows[place];
+    found[i] = other >= 0 ? other : other === -1 ? n : n + 1;
+  }
+  return found;
 }
 
 async function decodeChildren(data, octants, refined, where) {
@@ -185,13 +200,10 @@ async function decodeChildren(data, octants, refined, where) {
   for (let child = 0; child < N_CHILDREN; child++) {
     classes.fill(0);
     [4, 2, 1].forEach((bit, axis) => addClasses(classes, known[child ^ bit], beside[axis][child & bit ? 1 : 0]));
-    if (child === N_CHILDREN - 1) {
-      for (let i = 0; i < n; i++) if (!hasLive[i]) classes[i] = MUST;
-    }
+    if (child === N_CHILDREN - 1) setMust(classes, hasLive);
     const found = known[child].subarray(0, n);
     decoder.channel(classes, found);
-    asBits(found, `${where}: cells`);
-    for (let i = 0; i < n; i++) hasLive[i] |= found[i];
+    addBits(hasLive, asBits(found, `${where}: cells`));
   }
   decoder.finish();
   if (hasLive.includes(0)) throw new Error(`${where}: cells: expected a live child of each live cell`);
@@ -200,6 +212,14 @@ async function decodeChildren(data, octants, refined, where) {
 
 function addClasses(classes, known, beside) {
   for (let i = 0; i < classes.length; i++) classes[i] += COUNT[known[i]] + COUNT[known[beside[i]]];
+}
+
+function setMust(classes, hasLive) {
+  for (let i = 0; i < classes.length; i++) if (!hasLive[i]) classes[i] = MUST;
+}
+
+function addBits(bits, more) {
+  for (let i = 0; i < bits.length; i++) bits[i] |= more[i];
 }
 
 // The refined octants as bricks of the finer level.

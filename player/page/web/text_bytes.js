@@ -14,27 +14,30 @@ export function bytesOf(text, length) {
   const nGroups = Math.ceil(length / N_BYTES);
   if (text.length !== nGroups * N_CHARACTERS) return null;
   const bytes = new Uint8Array(nGroups * N_BYTES);
-  let wrong = 0; // negative where a character is none of the alphabet
-  let from = 0;
-  let to = 0;
-  const digit = () => {
-    const code = text.charCodeAt(from++);
-    const found = code < 128 ? DIGIT[code] : -1;
-    wrong |= found;
-    return found;
-  };
   for (let group = 0; group < nGroups; group++) {
-    const low = digit() + 116 * (digit() + 116 * (digit() + 116 * digit()));
-    const high = digit() + 116 * (digit() + 116 * digit());
-    const number = low + HALF * high; // below 2^48, exact
-    const lowest = number >>> 0;
-    const highest = (number - lowest) / 4294967296;
-    bytes[to++] = lowest;
-    bytes[to++] = lowest >>> 8;
-    bytes[to++] = lowest >>> 16;
-    bytes[to++] = lowest >>> 24;
-    bytes[to++] = highest;
-    bytes[to++] = highest >>> 8;
+    if (!putGroup(text, N_CHARACTERS * group, bytes, N_BYTES * group)) return null;
   }
-  return wrong < 0 ? null : bytes.subarray(0, length);
+  return bytes.subarray(0, length);
+}
+
+// The digit of a character; negative if it is none of the alphabet.
+function digitAt(text, at) {
+  const code = text.charCodeAt(at);
+  return code < 128 ? DIGIT[code] : -1;
+}
+
+// Six bytes out of seven characters; whether these are of the alphabet.
+function putGroup(text, from, bytes, to) {
+  const a = digitAt(text, from), b = digitAt(text, from + 1), c = digitAt(text, from + 2), d = digitAt(text, from + 3);
+  const e = digitAt(text, from + 4), f = digitAt(text, from + 5), g = digitAt(text, from + 6);
+  const number = a + 116 * (b + 116 * (c + 116 * d)) + HALF * (e + 116 * (f + 116 * g)); // below 2^48, exact
+  const lowest = number >>> 0;
+  const highest = (number - lowest) / 4294967296;
+  bytes[to] = lowest;
+  bytes[to + 1] = lowest >>> 8;
+  bytes[to + 2] = lowest >>> 16;
+  bytes[to + 3] = lowest >>> 24;
+  bytes[to + 4] = highest;
+  bytes[to + 5] = highest >>> 8;
+  return (a | b | c | d | e | f | g) >= 0;
 }

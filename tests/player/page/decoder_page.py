@@ -49,9 +49,11 @@ globalThis.found = (async () => {
 """
 
 ARRANGED = """
+const coordOf = (key) => [key >> 18, (key >> 9) & 511, key & 511];
+const coordsOf = (keys) => Uint16Array.from([...keys].flatMap(coordOf));
 const plain = ({ levels, n_channels, stride, values, firstRows }) => ({
   n_channels, values: values.filter((_, i) => i % stride < n_channels), firstRows,
-  levels: levels.map((bricks) => ({ coords: bricks.coords(), cells: bricks.masks })),
+  levels: levels.map((bricks) => ({ coords: coordsOf(bricks.keys), cells: bricks.masks })),
 });
 export const arrangeDensities = (manifest, densities) => ({ densities: plain(densities) });
 export const arrangeFeatures = (manifest, features) => ({ features: plain(features) });
