@@ -20,7 +20,6 @@ Activation = Literal["gelu", "relu"]
 ViewEncoding = Literal["sh-features", "sh"]
 Device = Literal["auto", "cpu", "cuda"]
 Effort = Literal["draft", "good", "best"]
-Sampling = Literal["auto", "grid", "proposals"]
 CHOICES = {
     "compositing": get_args(Compositing),
     "activation": get_args(Activation),
@@ -189,10 +188,6 @@ EFFORT_MINUTES = {"draft": (2.0, 2.0), "good": (10.0, 12.0), "best": (60.0, 60.0
 """Minutes of training on a CPU at most, of an object and of an unbounded scene, by the effort."""
 
 
-GRID_MINUTES = 3.0
-"""Training time up to which a scene on a CPU is sampled by a grid of its density."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Settings of `vfr-train`. What is None follows from the device: the defaults of a CPU are made for two
@@ -242,10 +237,6 @@ class TrainConfig:
     a batch: lego after 1,500 steps had 22.4 dB with 1.4 cells, 23.0 with 2 and 23.4 with 3."""
     occupancy_resolution: int = 128
     """Objects: cells per axis of the occupancy grid."""
-    sampling: Sampling = "auto"
-    """Scenes: what finds the samples of a ray: a grid that keeps the density of contracted space, on a CPU
-    alone, which is ahead in the first minutes, or the paper's two rounds of proposals, which end up sharper.
-    Auto: the grid on a CPU for at most 3 minutes, else proposals."""
     distortion: float = 0.01
     """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
     near_gradients: float = 2.0
@@ -273,7 +264,6 @@ class TrainConfig:
         check(self, "pilot_steps", self.pilot_steps >= 0, "at least 0")
         check(self, "step_cells", 0.1 <= self.step_cells <= 16, "0.1 to 16")
         check(self, "occupancy_resolution", 8 <= self.occupancy_resolution <= 512, "8 to 512")
-        check(self, "sampling", self.sampling in get_args(Sampling), f"one of {get_args(Sampling)}")
         check(self, "distortion", 0 <= self.distortion < 1e3, "0 to 1000")
         check(self, "near_gradients", 0 <= self.near_gradients < 1e3, "0 to 1000")
         check(self, "eval_views", self.eval_views is None or self.eval_views >= 0, "at least 0")
@@ -291,21 +281,6 @@ class TrainConfig:
         if device == "cuda" and self.effort != "draft":
             return math.inf
         return EFFORT_MINUTES[self.effort][unbounded]
-
-    def sampling_for(self, device: str) -> Sampling:
-        """What finds the samples of an unbounded scene on `device` ("cpu" or "cuda"): "grid" or "proposals".
-
-        Raises ConfigError: the grid is asked for on a GPU.
-
-        >>> TrainConfig(effort="draft").sampling_for("cpu"), TrainConfig().sampling_for("cpu")
-        ('grid', 'proposals')
-        """
-        if self.sampling == "grid" and device == "cuda":
-            raise ConfigError("sampling: on a GPU: expected auto or proposals, got grid")
-        if self.sampling != "auto":
-            return self.sampling
-        short = device == "cpu" and self.minutes_for(device, True) <= GRID_MINUTES
-        return "grid" if short else "proposals"
 
     def for_device(self, device: str, unbounded: bool) -> DeviceSettings:
         """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.

@@ -26,7 +26,6 @@ from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
 from vfr_bake.kernels.visibility import mark_visible_cells, mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
-from vfr_bake.rendering.space_grid import SpaceGrid, steps_around
 from vfr_bake.training.model_file import Model
 
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
@@ -383,10 +382,7 @@ def _mark(model: Model, rays_o: np.ndarray, rays_d: np.ndarray, floor: float, vi
     samples = model.sampler.sample_all(model.field, rays_o, rays_d)
     sigmas = model.field.density(samples.features)
     _, _, weights = composite(sigmas, samples.features, samples.deltas, samples.starts, samples.counts)
-    lengths = samples.deltas.numpy()
-    if isinstance(model.sampler, SpaceGrid):
-        lengths = steps_around(samples, rays_o, rays_d)
     mark_weighty_cells(
-        rays_o, rays_d, samples.t_mid.numpy(), lengths, weights.numpy(),
+        rays_o, rays_d, samples.t_mid.numpy(), samples.deltas.numpy(), weights.numpy(),
         samples.starts.numpy(), samples.counts.numpy(), np.float32(floor), visible,
     )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,15 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vfr_bake.field.field import VfrField
 from vfr_bake.field.networks import DensityNetwork
 from vfr_bake.kernels import compositing as kernels
 from vfr_bake.kernels.activations import relu_backward
 from vfr_bake.kernels.density import LARGEST_LOGIT
 from vfr_bake.torch_kernels.compositing import Composite
-
-RAY_CHUNK = 4096
-"""Rays of scenes whose samples are held at once when pictures are rendered: 35 MB of features at most."""
 
 
 class RayFeatures(NamedTuple):
@@ -57,27 +52,6 @@ class RaySamples:
 
 
 @torch.no_grad()
-def composited_features(
-    sample_all: Callable[[VfrField, np.ndarray, np.ndarray], RaySamples],
-    field: VfrField,
-    rays_o: np.ndarray,
-    rays_d: np.ndarray,
-) -> RayFeatures:
-    """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample that
-    `sample_all` has of them, in the order of the rays and with its density."""
-    features = np.empty((len(rays_o), field.config.n_channels), np.float32)
-    opacity, depth = np.empty((2, len(rays_o)), np.float32)
-    for start in range(0, len(rays_o), RAY_CHUNK):
-        rows = slice(start, start + RAY_CHUNK)
-        samples = sample_all(field, rays_o[rows], rays_d[rows])
-        assert samples.sigmas is not None
-        values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
-        out, alpha, _ = composite(samples.sigmas, values, samples.deltas, samples.starts, samples.counts)
-        features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
-        depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
-    return RayFeatures(features, opacity, depth)
-
-
 def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
     """Composite packed samples.
 

@@ -19,7 +19,7 @@ from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.proposals import Round
-from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composited_features
+from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
 
 N_PROPOSED = 64
 """Intervals of each of the two rounds."""
@@ -34,6 +34,8 @@ FIRST_LAYOUTS = ((10, 128), (10, 512))
 """Those of the model files that do not say."""
 BASE_RESOLUTION = 16
 LOG2_TABLE_SIZE = 17
+RAY_CHUNK = 4096
+"""Rays whose samples are held at once when pictures are rendered: 35 MB of features at most."""
 
 
 class ProposalGrid(nn.Module):
@@ -64,7 +66,17 @@ class ProposalSampler(nn.Module):
 
     def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
         """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
-        return composited_features(self.sample_all, field, rays_o, rays_d)
+        features = np.empty((len(rays_o), field.config.n_channels), np.float32)
+        opacity, depth = np.empty((2, len(rays_o)), np.float32)
+        for start in range(0, len(rays_o), RAY_CHUNK):
+            rows = slice(start, start + RAY_CHUNK)
+            samples = self.sample_all(field, rays_o[rows], rays_d[rows])
+            assert samples.sigmas is not None
+            values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
+            out, alpha, _ = composite(samples.sigmas, values, samples.deltas, samples.starts, samples.counts)
+            features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
+            depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
+        return RayFeatures(features, opacity, depth)
 
     def sample_rounds(
         self,

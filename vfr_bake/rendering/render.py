@@ -13,7 +13,6 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
-from vfr_bake.rendering.space_grid import SpaceGrid
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
@@ -23,8 +22,8 @@ RAY_CHUNK = 1024
 """Rays whose samples are held at once where colours are composited, with a head at each sample."""
 
 
-Sampler: TypeAlias = OccupancyGrid | SpaceGrid | ProposalSampler
-"""What says where to look a field up along rays: an object's occupancy grid, a scene's grid or proposals."""
+Sampler: TypeAlias = OccupancyGrid | ProposalSampler
+"""What says where to look a field up along rays: an object's occupancy grid, or a scene's proposals."""
 
 
 @torch.no_grad()

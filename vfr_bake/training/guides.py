@@ -1,5 +1,5 @@
-"""What finds the geometry while a field is trained: an occupancy grid for objects, a grid of contracted space
-or proposals for scenes.
+"""What finds the geometry while a field is trained: an occupancy grid for objects, proposals for
+scenes.
 
 All give the trainer the samples of rays, learn from what came of them, and are at last the sampler that the
 trained field is rendered with. Those of a GPU are in `vfr_bake.training.device_guides`.
@@ -7,7 +7,6 @@ trained field is rendered with. Those of a GPU are in `vfr_bake.training.device_
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,8 +24,7 @@ from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
-from vfr_bake.rendering.space_grid import FINER, SpaceGrid
-from vfr_bake.training.optimiser import MILESTONES, GridAdam, TableAdam
+from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
@@ -55,8 +53,8 @@ class Guide(ABC):
         """Rays to draw for the next batch, over all processes."""
 
     @abstractmethod
-    def prepare(self, step: int, progress: float, field: VfrField) -> None:
-        """Before a step, with a share `progress` of the training done: look at what the field has become."""
+    def prepare(self, step: int, field: VfrField) -> None:
+        """Before a step: look at what the field has become."""
 
     @abstractmethod
     def sample(
@@ -106,7 +104,7 @@ class BoxGuide(Guide):
         # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
         return self._settings.batch_samples // 2 if pilot else self._settings.batch_samples
 
-    def prepare(self, step: int, progress: float, field: VfrField) -> None:
+    def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             self._grid.update(field)
 
@@ -138,11 +136,11 @@ class OccupancyGuide(BoxGuide):
     def sampler(self) -> OccupancyGrid:
         return self._grid
 
-    def prepare(self, step: int, progress: float, field: VfrField) -> None:
+    def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
             # Every process has seen its own rays.
             self._processes.take_largest(torch.from_numpy(self._grid.densities))
-        super().prepare(step, progress, field)
+        super().prepare(step, field)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
@@ -155,55 +153,6 @@ class OccupancyGuide(BoxGuide):
         if grid.n_updates > 0:
             grid.observe(samples.points.numpy(), sigmas)
         return samples
-
-
-class SpaceGridGuide(Guide):
-    """Marches an unbounded scene on a CPU and keeps its grid of contracted space."""
-
-    def __init__(
-        self, config: TrainConfig, settings: DeviceSettings, near: float, processes: Processes
-    ) -> None:
-        self._config, self._settings, self._processes = config, settings, processes
-        self._grid = SpaceGrid(near, config.seed)
-        self._finer = 1
-
-    @property
-    def sampler(self) -> SpaceGrid:
-        return self._grid
-
-    def n_rays(self, pilot: bool) -> int:
-        return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
-
-    def prepare(self, step: int, progress: float, field: VfrField) -> None:
-        if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
-            # Every process has seen its own rays.
-            self._processes.add_up([torch.from_numpy(self._grid.gathered)])
-            self._grid.update(field)
-        # While the learning rate is high, few samples on many rays teach more; later their noise is what is
-        # left of the error.
-        self._finer = FINER if progress >= MILESTONES[0] else 1
-
-    def sample(
-        self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
-    ) -> RaySamples:
-        first = jitter[:, 0].contiguous()
-        samples, sigmas, intervals = self._grid.march(field, rays_o, rays_d, first, self._finer)
-        self._grid.observe(samples.points.numpy(), sigmas)
-        return replace(samples, trail=tuple(intervals))
-
-    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        if self._config.distortion == 0:
-            return None
-        # In angles, from 0 to 1 over the longest ray.
-        mids, widths = (part / math.pi for part in samples.trail)
-        losses = distortion(weights, mids, widths, samples.starts, samples.counts)
-        return self._config.distortion * losses.sum()
-
-    def state(self) -> dict[str, Any]:
-        return {"grid": self._grid.state()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._grid.restore(state["grid"])
 
 
 class SpaceGuide(Guide):
@@ -234,7 +183,7 @@ class SpaceGuide(Guide):
     def n_rays(self, pilot: bool) -> int:
         return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
 
-    def prepare(self, step: int, progress: float, field: VfrField) -> None:
+    def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step % min(STEPS_PER_PROPOSAL_UPDATE, 1 + step // STEADY_STEPS) == 0

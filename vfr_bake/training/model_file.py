@@ -9,8 +9,7 @@ files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colou
 all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
 occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
 tensors) and, since version 2.4, layouts (levels and finest resolution of each round's grid; 10 and 128, 10
-and 512 in older files), or, since version 2.3, its grid of contracted space: near, threshold (optical depth),
-densities [128, 128, 128] float32.
+and 512 in older files).
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from vfr_bake.field.hash_grid import GridLayout
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import BASE_RESOLUTION, FAR, FIRST_LAYOUTS, ProposalSampler
 from vfr_bake.rendering.render import Sampler, mean_colour, render_rays
-from vfr_bake.rendering.space_grid import RESOLUTION, THRESHOLD, SpaceGrid
 from vfr_bake.training.captures.exposure import Correction
 from vfr_bake.training.captures.picture_colours import (
     GAINS,
@@ -248,9 +246,6 @@ def _sampler_content(sampler: Sampler) -> dict[str, Any]:
     if isinstance(sampler, ProposalSampler):
         layouts = torch.tensor(sampler.layouts)
         return {"near": sampler.near, "layouts": layouts, "state": sampler.state_dict()}
-    if isinstance(sampler, SpaceGrid):
-        densities = torch.from_numpy(sampler.densities)
-        return {"near": sampler.near, "threshold": sampler.threshold, "densities": densities}
     bits = torch.from_numpy(np.packbits(sampler.occupied.reshape(-1)))
     return {"step": sampler.step, "occupied": bits, "resolution": sampler.resolution}
 
@@ -288,11 +283,10 @@ def _restore_occupancy(content: dict[str, Any], where: str) -> OccupancyGrid:
     return occupancy
 
 
-def _restore_space(content: dict[str, Any], where: str) -> SpaceGrid | ProposalSampler:
-    if "densities" in content:
-        return _restore_grid(content, where)
+def _restore_space(content: dict[str, Any], where: str) -> ProposalSampler:
     check_kinds(content, {"near": float, "state": dict}, where)
-    _check_near(content["near"], where)
+    if not 0 <= content["near"] < FAR:
+        raise FormatError(f"{where}: near: expected 0 to {FAR}, got {content['near']}")
     sampler = ProposalSampler(content["near"], _layouts(content, where))
     _restore(sampler, content["state"], where)
     return sampler
@@ -314,30 +308,6 @@ def _layouts(content: dict[str, Any], where: str) -> list[tuple[int, int]]:
                 f"{n_levels} of {resolution}"
             )
     return [(n_levels, resolution) for n_levels, resolution in layouts.tolist()]
-
-
-def _restore_grid(content: dict[str, Any], where: str) -> SpaceGrid:
-    check_kinds(content, {"near": float, "threshold": float, "densities": torch.Tensor}, where)
-    _check_near(content["near"], where)
-    threshold, densities = content["threshold"], content["densities"]
-    if not 0 <= threshold <= THRESHOLD:
-        raise FormatError(f"{where}: threshold: expected 0 to {THRESHOLD}, got {threshold}")
-    check_plain(densities, densities.dtype == torch.float32, "32-bit floats", f"{where}: densities")
-    if list(densities.shape) != [RESOLUTION] * 3:
-        raise FormatError(
-            f"{where}: densities: expected {[RESOLUTION] * 3}, got {brief(list(densities.shape))}"
-        )
-    if not (densities.isfinite() & (densities >= 0)).all():
-        raise FormatError(f"{where}: densities: expected finite numbers of at least 0")
-    grid = SpaceGrid(content["near"], seed=0)
-    grid.densities[:] = densities.numpy()
-    grid.threshold = threshold
-    return grid
-
-
-def _check_near(near: float, where: str) -> None:
-    if not 0 <= near < FAR:
-        raise FormatError(f"{where}: near: expected 0 to {FAR}, got {near}")
 
 
 def _restore(module: nn.Module, state: dict[str, Any], where: str) -> None:

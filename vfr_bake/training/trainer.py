@@ -30,7 +30,7 @@ from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.captures.unmasked import unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.gradients import chosen_rays, scale_near_gradients
-from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide, SpaceGridGuide
+from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.length.duration import Duration
 from vfr_bake.training.length.witness_errors import WitnessErrors
 from vfr_bake.training.length.witness_loss import WitnessLoss
@@ -127,7 +127,6 @@ class Trainer:
         """How long the training takes."""
         # Steps that are asked for are taken, and a GPU is done with its own in minutes.
         self._looks = self._backend == "numba" and config.steps is None and len(self.witnesses.pixels) > 0
-        self._sampling = config.sampling_for("cuda" if self._backend == "torch" else "cpu")
         self._guide: Guide
         self._grid_adam: TableAdam
         if self._backend == "torch":
@@ -144,9 +143,7 @@ class Trainer:
 
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
-        if scene.unbounded and self._sampling == "grid":
-            self._guide = SpaceGridGuide(self.config, self.pace, scene.near, self.processes)
-        elif scene.unbounded:
+        if scene.unbounded:
             self._guide = ProposalGuide(self.config, self.pace, scene.near)
         else:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
@@ -190,8 +187,7 @@ class Trainer:
     @property
     def settings(self) -> dict[str, Any]:
         """The settings of this training, with what followed from the device filled in; plain values."""
-        chosen = {"device": self.device.type, "sampling": self._sampling}
-        return asdict(self.config) | asdict(self.pace) | chosen
+        return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
 
     @property
     def sampler(self) -> Sampler:
@@ -240,13 +236,13 @@ class Trainer:
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
         pilot = self._is_pilot(step)
-        batch, samples = self._next or self._sampled(step, progress)
+        batch, samples = self._next or self._sampled(step)
         learned = self.effects.learned(batch.pictures, batch.places)
         n_learned = len(samples.rays) if learned is None else int(learned[samples.rays].sum())
         totals = self.processes.total(len(samples.rays), len(samples.t_mid), n_learned)
         n_rays, n_samples, n_learned = (int(total) for total in totals)
         self._guide.observe(n_rays, n_samples)
-        with self._sampling_next(step, progress, pilot):
+        with self._sampling_next(step, pilot):
             squares, weights, seen = self._error(batch, samples, learned, pilot)
             regulariser = self._guide.regulariser(samples, weights)
             value = self.processes.total(float(squares.detach().sum()))[0] / (3 * max(n_learned, 1))
@@ -273,9 +269,9 @@ class Trainer:
         """Whether the pilot gives the colours; where they are composited anyway the head needs none."""
         return step < self.config.pilot_steps and self._field.config.compositing == "features"
 
-    def _sampled(self, step: int, progress: float) -> Sampled:
+    def _sampled(self, step: int) -> Sampled:
         """A new batch for a step, with its samples in the field as it is."""
-        self._guide.prepare(step, progress, self._field)
+        self._guide.prepare(step, self._field)
         pilot = self._is_pilot(step)
         batch = self._draw(self._guide.n_rays(pilot))
         samples = self._guide.sample(
@@ -284,18 +280,18 @@ class Trainer:
         return Sampled(batch, samples)
 
     @contextmanager
-    def _sampling_next(self, step: int, progress: float, pilot: bool) -> Iterator[None]:
+    def _sampling_next(self, step: int, pilot: bool) -> Iterator[None]:
         """Within it the samples of the next step are taken, on a second thread where there is one, in the
         field as it is at the beginning; before it changes wait for the second thread."""
         self._next = None
         if not self._skips(pilot):
             yield
         elif self._second.is_there and self.processes.size == 1:
-            with self._second.meanwhile(lambda: self._sampled(step + 1, progress)) as result:
+            with self._second.meanwhile(lambda: self._sampled(step + 1)) as result:
                 yield
             self._next = result.result()
         else:  # several processes, too, meet in a fixed order
-            following = self._sampled(step + 1, progress)
+            following = self._sampled(step + 1)
             yield
             self._next = following
 

@@ -111,7 +111,7 @@ def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) 
     jitter = torch.rand(40, 3)
     expected, guide = guides(device)
     for each in (expected, guide):
-        each.prepare(step, 0.0, field)
+        each.prepare(step, field)
     found = expected.sample(field, *rays, jitter, pilot=False, share=1.0)
     rounds = [Round(*(tensor.numpy() for tensor in each)) for each in found.trail["rounds"]]
     edges = found.trail["edges"]
@@ -153,12 +153,12 @@ def test_proposals_learn_ever_more_rarely_and_samples_get_half_as_many(device: t
     for guide in guides(device):
         learnt = []
         for step in range(2000):
-            guide.prepare(step, 0.0, field)
+            guide.prepare(step, field)
             learnt.append(guide._learns)
         assert all(learnt[:200]) and learnt[200:400] == [True, False] * 100
         assert [sum(learnt[n : n + 60]) for n in (400, 600, 840, 1500)] == [20, 15, 12, 12]
         for step, n in ((0, N_FINAL), (511, N_FINAL), (512, N_FINAL // 2), (10**6, N_FINAL // 2)):
-            guide.prepare(step, 0.0, field)
+            guide.prepare(step, field)
             if isinstance(guide, ProposalGuide):
                 samples = guide.sample(field, *rays, jitter, pilot=False, share=1.0)
                 assert samples.trail["edges"].shape == (40, n + 1)
@@ -180,7 +180,7 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
         if isinstance(guide, DeviceProposalGuide):
             field = field.to(place)
             field.grid.backend = "torch"
-        guide.prepare(step, 0.0, field)
+        guide.prepare(step, field)
         rays = (a.to(place) for a in (rays_o, rays_d, jitter))
         samples = guide.sample(field, *rays, pilot=False, share=1.0)
         weights = noise[: len(samples.t_mid)].to(place)

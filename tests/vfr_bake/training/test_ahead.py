@@ -10,18 +10,14 @@ import numba
 import pytest
 import torch
 
-from vfr_bake.config import FieldOptions, Sampling, SceneKind, TrainConfig
+from vfr_bake.config import FieldOptions, SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
 from vfr_bake.training.ahead import SecondThread
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
-KINDS: dict[str, tuple[SceneKind, Sampling]] = {
-    "object": ("object", "auto"),
-    "proposals": ("unbounded", "proposals"),
-    "grid": ("unbounded", "grid"),
-}
+KINDS: tuple[SceneKind, ...] = ("object", "unbounded")
 
 
 @pytest.fixture
@@ -36,14 +32,13 @@ def two_threads() -> Iterator[None]:
     numba.set_num_threads(n_numba)
 
 
-def trainer(kind: str, pilot_steps: int) -> Trainer:
-    """A trainer of the built-in object, or of a scene that is sampled by `kind`."""
-    scene_kind, sampling = KINDS[kind]
+def trainer(kind: SceneKind, pilot_steps: int) -> Trainer:
+    """A trainer of the built-in object, or of a scene without end."""
     config = TrainConfig(
         device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048, batch_rays=64,
-        occupancy_resolution=32, field=FIELD, sampling=sampling,
+        occupancy_resolution=32, field=FIELD,
     )  # fmt: skip
-    scene = build_scene(demo_capture(size=32, n_train=12, n_test=2), scene_kind)
+    scene = build_scene(demo_capture(size=32, n_train=12, n_test=2), kind)
     return Trainer(replace(scene, has_alpha=True, masked=False), config)
 
 

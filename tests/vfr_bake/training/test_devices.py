@@ -93,11 +93,6 @@ def tensors(content: object) -> list[torch.Tensor]:
     return [tensor for part in parts for tensor in tensors(part)]
 
 
-def test_the_grid_of_a_scene_is_for_cpus() -> None:
-    with pytest.raises(ConfigError, match=r"sampling: on a GPU: expected auto or proposals, got grid"):
-        Trainer(small_scene("unbounded"), config(sampling="grid"), backend="torch")
-
-
 def test_a_checkpoint_of_another_device_or_backend_is_refused(tmp_path: Path) -> None:
     scene = small_scene("object")
     trainer = Trainer(scene, config(steps=1))

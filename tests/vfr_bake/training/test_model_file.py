@@ -18,7 +18,6 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FIRST_LAYOUTS, ProposalSampler
 from vfr_bake.rendering.render import render_image
-from vfr_bake.rendering.space_grid import RESOLUTION, SpaceGrid
 from vfr_bake.training.model_file import Model, load_model, save_model
 from vfr_bake.training.witness_tensors import witness_content
 
@@ -208,51 +207,24 @@ def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:
         load_model(saved)
 
 
-def scenes_grid(**values: object) -> dict[str, object]:
-    return {"near": 0.1, "threshold": 0.01, "densities": torch.zeros((RESOLUTION,) * 3)} | values
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"near": -1.0}, "near: expected 0 to"),
-        ({"near": float("nan")}, "near: expected 0 to"),
-        ({"threshold": 0.5}, "threshold: expected 0 to"),
-        ({"threshold": float("nan")}, "threshold: expected 0 to"),
-        ({"threshold": None}, "threshold: expected float"),
-        ({"densities": [1.0]}, "densities: expected Tensor"),
-        ({"densities": torch.zeros(8, 8, 8)}, r"densities: expected \[128, 128, 128\], got \[8, 8, 8\]"),
-        (
-            {"densities": torch.zeros((128,) * 3, dtype=torch.float64)},
-            "densities: expected a plain tensor",
-        ),
-        ({"densities": torch.full((128,) * 3, -1.0)}, "densities: expected finite numbers of at least 0"),
-        ({"densities": torch.full((128,) * 3, torch.inf)}, "densities: expected finite numbers"),
-        ({"densities": torch.full((128,) * 3, torch.nan)}, "densities: expected finite numbers"),
-    ],
-)
-def test_a_broken_grid_of_a_scene_is_named(
-    saved: Path, model: Model, values: dict[str, object], message: str
-) -> None:
-    field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
-    save_model(saved, replace(model, field=field, sampler=SpaceGrid(0.1, seed=0)))
-    change(saved, sampler=scenes_grid(**values))
-    with pytest.raises(FormatError, match=message):
+@pytest.mark.parametrize("near", [-1.0, float("nan")])
+def test_where_a_scene_begins_is_checked(saved: Path, model: Model, near: float) -> None:
+    field, sampler = VfrField(replace(CONFIG, unbounded=True, density_width=0)), ProposalSampler(0.1)
+    save_model(saved, replace(model, field=field, sampler=sampler))
+    change(saved, sampler={"near": near, "state": sampler.state_dict()})
+    with pytest.raises(FormatError, match="near: expected 0 to"):
         load_model(saved)
 
 
 def test_samplers_of_scenes_come_back(saved: Path, model: Model) -> None:
-    """The grid, and proposals with the levels of today and of before version 2.4."""
+    """Proposals with the levels of today and of before version 2.4."""
     field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
     torch.nn.init.uniform_(field.grid.table, -1, 1)
-    grid = SpaceGrid(0.1, seed=0)
-    grid.densities[:] = np.random.default_rng(0).random((RESOLUTION,) * 3)
-    grid.threshold = 0.005
     rays_o, rays_d = np.zeros((3, 3), np.float32), np.eye(3, dtype=np.float32)
     first = ProposalSampler(0.1, FIRST_LAYOUTS)
     for table in first.parameters():
         torch.nn.init.uniform_(table, -1, 1)
-    for sampler in (grid, ProposalSampler(0.1), first):
+    for sampler in (ProposalSampler(0.1), first):
         save_model(saved, replace(model, field=field, sampler=sampler))
         if sampler is first:
             content = torch.load(saved, weights_only=True)["sampler"]

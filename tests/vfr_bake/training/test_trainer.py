@@ -149,18 +149,16 @@ def on_disk(scene: Scene, path: Path) -> Scene:
     return replace(scene, train=PosedImages(scene.train.cameras, map_pictures(path, layout, 4, frozenset())))
 
 
-@pytest.mark.parametrize("kind", ["object", "proposals", "grid", "on disk"])
+@pytest.mark.parametrize("kind", ["object", "unbounded", "on disk"])
 def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bit by bit: everything that the next step depends on is in the checkpoint."""
     monkeypatch.setattr(stored, "PIXELS_OF_A_PIECE", 100)
-    scenes = ("proposals", "grid")
-    scene = unbounded() if kind in scenes else demo_scene(size=32, n_train=12, n_test=2)
+    scene = unbounded() if kind == "unbounded" else demo_scene(size=32, n_train=12, n_test=2)
     if kind == "on disk":
         scene = on_disk(scene, tmp_path / "pixels.bin")
     settings = {"steps": 40, "pilot_steps": 10, "batch_rays": 64, "batch_samples": 2048}
-    settings |= {"sampling": kind} if kind in scenes else {}
     whole = Trainer(scene, config(**settings))
     losses = [report.loss for report in whole.run()]
     broken = Trainer(scene, config(**settings))
@@ -259,10 +257,9 @@ def test_colours_can_be_composited_instead(scene: Scene) -> None:
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.pilot.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("sampling", ["proposals", "grid"])
-def test_an_unbounded_scene_is_learnt(sampling: str) -> None:
+def test_an_unbounded_scene_is_learnt() -> None:
     scene = unbounded(48)
-    trainer = Trainer(scene, config(steps=300, pilot_steps=60, batch_rays=128, sampling=sampling))
+    trainer = Trainer(scene, config(steps=300, pilot_steps=60, batch_rays=128))
     before = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
     reports = list(trainer.run())
     after = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
