@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from vfr_bake.kernels import activations
-from vfr_bake.kernels.bfloat16 import as_array
+from vfr_bake.kernels.head import activations
+from vfr_bake.kernels.head.bfloat16 import as_array
 
 SPATIAL = 2
 """Layers before the directions come in; the second has no activation."""

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from vfr_bake.field.networks import DensityNetwork
 from vfr_bake.kernels import compositing as kernels
-from vfr_bake.kernels.activations import relu_backward
 from vfr_bake.kernels.density import LARGEST_LOGIT
+from vfr_bake.kernels.head.activations import relu_backward
 from vfr_bake.torch_kernels.compositing import Composite
 
 

@@ -20,7 +20,7 @@ from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
-from vfr_bake.kernels.bfloat16 import fast_products
+from vfr_bake.kernels.head.bfloat16 import fast_products
 from vfr_bake.rendering.compositing import RaySamples, composite, composite_field
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile

@@ -10,15 +10,16 @@ import torch
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels import bfloat16, njit
-from vfr_bake.kernels.activations import (
+from vfr_bake.kernels import njit
+from vfr_bake.kernels.head import bfloat16
+from vfr_bake.kernels.head.activations import (
     gelu,
     gelu_backward,
     relu_backward,
     times_basis,
     times_basis_backward,
 )
-from vfr_bake.kernels.bfloat16 import as_array, fast_products, get, put
+from vfr_bake.kernels.head.bfloat16 import as_array, fast_products, get, put
 
 HARD = np.array([0.0, -0.0, 1e-42, -1e-42, 1.0, -1.0, 7.9, -7.9, 8.1, -8.1, 90.0, -90.0, 1e18, -1e18])
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from vfr_bake.kernels import njit
-from vfr_bake.kernels.bfloat16 import float_of_bits, get, put
 from vfr_bake.kernels.hash_grid import FLAGS
+from vfr_bake.kernels.head.bfloat16 import float_of_bits, get, put
 
 PER_LOG = np.float32(1.4426950408889634)
 HIGH, LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
