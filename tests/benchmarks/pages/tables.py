@@ -23,7 +23,7 @@ from tests.benchmarks.pages.cells import (
     titled,
     where,
 )
-from tests.benchmarks.suite.parts import LIMITS_MB, MINUTES, PRESETS, REFINED_AT, SEEDS
+from tests.benchmarks.suite.parts import LIMITS_MB, MINUTES, PAGES, PRESETS, REFINED_AT, SEEDS, plays
 from tests.benchmarks.suite.played import LOOKUPS
 from tests.benchmarks.suite.results import Results
 from tests.benchmarks.suite.scenes import SCENES
@@ -237,30 +237,30 @@ def _lookup_rows(name: str, found: dict[str, Any], ks: list[str]) -> list[list[s
 
 
 def page(results: Results) -> list[str]:
-    there, lacking = present(results, ["page"])
+    there, lacking = present(results, PAGES)
     rows = []
     for name in there:
-        for asset, found in results[name]["figures"].items():
-            counts, times = found["counts"], found["times"]["fast"]
-            exact = counts["exact"]
-            cost = f"{exact['fetches']:.0f} + {exact['weights']:.0f}, {exact['multiply_adds']:,.0f}"
-            merf, smerf = (
-                f"{some['fetches']:.0f}, {some['multiply_adds']:.0f}"
-                for some in (counts["MERF"], counts["SMERF"])
-            )
-            row = [asset_name(asset), where(results, name), f"{found['n_bytes'] / 1e6:.1f} MB"]
-            row += [
+        found = results[name]["figures"]
+        counts, times = found["counts"], found["times"]["fast"]
+        exact = counts["exact"]
+        merf, smerf = (
+            f"{some['fetches']:.0f}, {some['multiply_adds']:.0f}"
+            for some in (counts["MERF"], counts["SMERF"])
+        )
+        more = times["processor"] / times["player_processor"]
+        rows.append(
+            [
+                asset_name(name),
+                where(results, name),
+                f"{found['n_bytes'] / 1e6:.1f} MB",
                 f"{counts['gpu_bytes'] / 1e6:.0f} MB",
-                cost,
+                f"{exact['fetches']:.0f} + {exact['weights']:.0f}, {exact['multiply_adds']:,.0f}",
                 f"{merf}; {smerf}",
                 f"{found['first_picture_s']:.1f} s",
-            ]
-            more = times["processor"] / times["player_processor"]
-            row += [
                 f"{times['processor']:.0f} ms",
                 f"{times['player_processor']:.0f} ms: {more:.1f} times less",
             ]
-            rows.append(row)
+        )
     titles = ["asset", "machine, commit", "page", "graphics memory", "fetches, multiply-adds a pixel"]
     titles += ["MERF; SMERF", "first picture", "a picture, `fast`", "`vfr-play`, exact, with numba"]
     return titled(titles, rows, lacking)
@@ -268,21 +268,21 @@ def page(results: Results) -> list[str]:
 
 def playing(results: Results) -> list[str]:
     """Frames a second by march and quality."""
-    there, lacking = present(results, ["play_lego", "play_fox"])
+    there, lacking = present(results, [*plays(SCENES["lego"]), *plays(SCENES["fox"])])
     rows = []
     for name in there:
-        for asset, found in results[name]["figures"].items():
-            size = "x".join(map(str, found["size"]))
-            for march in ("numba", "numpy"):
-                some = {row["quality"]: row for row in found["rows"] if row["march"] == march}
-                rates = [rate(some[q]["ms"], some[q]["uncertainty"]) for q in QUALITIES]
-                memory = gigabytes(max(row["peak_mb"] for row in some.values()))
-                lost = [
-                    f"{number(found['losses'][q]['loss_db'], 2)}, {number(found['losses'][q]['worst_db'], 2)}"
-                    for q in QUALITIES[1:]
-                ]
-                row = [f"{asset_name(asset)}, {size}", march, where(results, name), *rates, memory]
-                rows.append([*row, *(lost if march == "numba" else ["", ""])])
+        found = results[name]["figures"]
+        size = "x".join(map(str, found["size"]))
+        for march in ("numba", "numpy"):
+            some = {row["quality"]: row for row in found["rows"] if row["march"] == march}
+            rates = [rate(some[q]["ms"], some[q]["uncertainty"]) for q in QUALITIES]
+            memory = gigabytes(max(row["peak_mb"] for row in some.values()))
+            lost = [
+                f"{number(found['losses'][q]['loss_db'], 2)}, {number(found['losses'][q]['worst_db'], 2)}"
+                for q in QUALITIES[1:]
+            ]
+            row = [f"{asset_name(name)}, {size}", march, where(results, name), *rates, memory]
+            rows.append([*row, *(lost if march == "numba" else ["", ""])])
     titles = ["asset, size", "march", "machine, commit", *QUALITIES, "memory"]
     return titled([*titles, "`high` loses, dB", "`fast` loses, dB"], rows, lacking)
 
@@ -335,59 +335,35 @@ def specks(results: Results) -> list[str]:
 
 
 def expect(results: Results) -> list[str]:
-    """The README's table."""
-    needed = [
-        "train_lego",
-        "eval_lego",
-        "bake_lego_balanced",
-        "bake_lego_fast",
-        "page",
-        "trade_lego",
-        "play_lego",
-    ]
-    _, lacking = present(results, needed)
-    if lacking:
+    """The README's table: lego trained, and of two presets what they take, lose and play."""
+    rows, lacking = [], present(results, ["train_lego", "eval_lego"])[1]
+    if not lacking:
+        trained, score = results["train_lego"]["figures"], results["eval_lego"]["figures"]
+        took = f"{trained['seconds'] / 60:.1f} minutes"
+        found = f"{score['psnr']:.2f} dB mean PSNR on all {score['n_views']} test views"
+        rows.append(["`vfr-train --minutes 9.25`", f"{took}, {found}"])
+    for preset in ("balanced", "fast"):
+        names = [f"{what}_lego_{preset}" for what in ("bake", "play", "page")]
+        there, missed = present(results, names)
+        lacking += missed
+        figures = {name.partition("_")[0]: results[name]["figures"] for name in there}
+        if baked := figures.get("bake"):
+            size = f"{baked['seconds'] / 60:.1f} minutes, {megabytes(baked['n_bytes'])} MB"
+            if "page" in figures:
+                size += f"; as a page {figures['page']['n_bytes'] / 1e6:.1f} MB"
+            lost = give_or_take(baked["loss_db"], baked["loss_db_spread"], 2)
+            rows.append([f"`vfr-bake --preset {preset}`", f"{size}; loses {lost} dB against photographs"])
+        if played := figures.get("play"):
+            ms = {row["quality"]: row["ms"] for row in played["rows"] if row["march"] == "numba"}
+            rates = ", ".join(f"{quality} {number(1000 / ms[quality], 1)}" for quality in QUALITIES)
+            size = "x".join(map(str, played["size"]))
+            rows.append([f"`vfr-play` of it at {size}, frames a second by `--quality`", rates])
+    if not rows:
         return missing(lacking)[1:]
-    trained, score = results["train_lego"]["figures"], results["eval_lego"]["figures"]
-    balanced, fast = (results[f"bake_lego_{preset}"]["figures"] for preset in ("balanced", "fast"))
-    pages, machine = results["page"]["figures"], results["train_lego"]["machine"]
-    lost = {preset: own_setting(results, f"bake_lego_{preset}") for preset in ("balanced", "fast")}
-    losses = {preset: number(row and row["scores"]["loss_db"], 2, " dB") for preset, row in lost.items()}
-    played = results["play_lego"]["figures"]
-    rates = {
-        f"{preset}{'' if q == 'exact' else f', `--quality {q}`'}": next(
-            1000 / row["ms"]
-            for row in played[f"bake_lego_{preset}"]["rows"]
-            if row["march"] == "numba" and row["quality"] == q
-        )
-        for preset, q in (
-            ("balanced", "exact"),
-            ("balanced", "fast"),
-            ("fidelity", "exact"),
-            ("fast", "exact"),
-        )
-    }
-    told = ", ".join(f"{name} {number(value, 0 if value >= 10 else 1)}" for name, value in rates.items())
-    page_mb = pages["bake_lego_balanced"]["n_bytes"] / 1e6
-    rows = [
-        [
-            "`vfr-train --minutes 9.25`",
-            f"{trained['seconds'] / 60:.1f} minutes, {score['psnr']:.2f} dB mean PSNR on all "
-            f"{score['n_views']} test views",
-        ],
-        [
-            "`vfr-bake`, preset balanced",
-            f"{balanced['seconds'] / 60:.1f} minutes, {megabytes(balanced['n_bytes'])} MB; as a page "
-            f"{page_mb:.1f} MB",
-        ],
-        [
-            "lost by baking, against the photographs",
-            f"balanced {losses['balanced']}; fast, in {megabytes(fast['n_bytes'])} MB, {losses['fast']}",
-        ],
-        ["`vfr-play` at 800x800, frames a second", told],
-    ]
+    machine = next(iter(results.values()))["machine"]
     on = f"{machine['cores']} cores ({machine['processor']})"
-    return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {on}:", "", *titled(["what", "figure"], rows, [])]
+    table_lines = titled(["what", "figure"], rows, lacking)
+    return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {on}:", "", *table_lines]
 
 
 BLOCKS: dict[str, Block] = {

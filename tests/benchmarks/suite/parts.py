@@ -37,7 +37,7 @@ REFINED_AT = {"every": "0", "k3": "3", "k5": "5", "k8": "8"}
 
 
 COMPILING = ("train_lego", "train_fox", "eval_lego", "eval_fox", "bake_lego_balanced", "bake_lego_fidelity",
-             "bake_fox_balanced", "bake_fox_phone", "play_fox")  # fmt: skip
+             "bake_fox_balanced", "bake_fox_phone", "play_fox_phone")  # fmt: skip
 """Parts that make use of all code that is compiled."""
 
 
@@ -55,6 +55,15 @@ def compiled(work: Work) -> dict[str, Any]:
 def bakes(scene: Scene) -> tuple[str, ...]:
     """The parts that bake the presets of a scene."""
     return tuple(f"bake_{scene.name}_{preset}" for preset in PRESETS[scene.name])
+
+
+def plays(scene: Scene) -> tuple[str, ...]:
+    """The parts that play what `bakes` has."""
+    return tuple(f"play_{scene.name}_{preset}" for preset in PRESETS[scene.name])
+
+
+PAGES = {name.replace("bake_", "page_"): name for name in (*bakes(LEGO)[1:], "bake_fox_phone")}
+"""The parts that measure a page, and the assets that these are of."""
 
 
 def _training(scene: Scene, minutes: float) -> Part:
@@ -110,7 +119,7 @@ def _core() -> list[Part]:
         for name, some in PRESETS.items()
         for preset, minutes in some.items()
     ]
-    balanced, pages = "bake_lego_balanced", (*bakes(LEGO)[1:], "bake_fox_phone")
+    balanced = "bake_lego_balanced"
     return [
         Part("compiled", compiled, 3.0),
         *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 13.5), (CAN, 13.5), (DEMO, 10.0))),
@@ -122,17 +131,12 @@ def _core() -> list[Part]:
         _trade("trade_can", CAN, bakes(CAN), 6.0),
         _trade("trade_demo", DEMO, bakes(DEMO), 2.0),
         *(
-            Part(
-                f"play_{scene.name}",
-                partial(played.qualities, scene=scene, bakes=bakes(scene)),
-                3.0,
-                bakes(scene),
-                scene.data,
-            )
+            Part(name, partial(played.qualities, scene=scene, asset_of=of), 1.0, (of,), scene.data)
             for scene in (LEGO, FOX)
+            for name, of in zip(plays(scene), bakes(scene), strict=True)
         ),
         Part("export_lego", partial(played.exports, asset_of=balanced), 4.0, (balanced,)),
-        Part("page", partial(played.page, bakes=pages), 4.0, pages),
+        *(Part(name, partial(played.page, asset_of=of), 1.0, (of,)) for name, of in PAGES.items()),
         Part("cameras_lego", partial(played.cameras, data="lego_800_train"), 4.0, data="lego_800_train"),
     ]
 

@@ -54,17 +54,13 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
     return {"settings": rows, "conditions": conditions, "size": own if work.quick else scene.size}
 
 
-def qualities(work: Work, scene: Scene, bakes: tuple[str, ...]) -> dict[str, Any]:
+def qualities(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
     """Both marches with every quality, frame by frame in turns."""
-    found = {}
-    for name in bakes:
-        report = work.folder / f"{name}.json"
-        size = work.little(scene.size, "24x24")
-        frames = ("--frames", work.little(20, 2), "--numpy-frames", work.little(5, 2))
-        words = ("--data", data_of(work, scene), "--views", str(scene.views), "--size", size, *frames)
-        work.command("bench_qualities", work.file(name, "asset"), *words, "--json", report)
-        found[name] = work.read(report.name)
-    return found
+    size = work.little(scene.size, "24x24")
+    frames = ("--frames", work.little(20, 2), "--numpy-frames", work.little(5, 2))
+    words = ("--data", data_of(work, scene), "--views", str(scene.views), "--size", size, *frames)
+    work.command("bench_qualities", work.file(asset_of, "asset"), *words, "--json", work.folder / "play.json")
+    return work.read("play.json")
 
 
 def exports(work: Work, asset_of: str) -> dict[str, Any]:
@@ -89,15 +85,11 @@ def exports(work: Work, asset_of: str) -> dict[str, Any]:
     }
 
 
-def page(work: Work, bakes: tuple[str, ...]) -> dict[str, Any]:
-    """The pages of some assets, in a browser that draws with the processor."""
-    found = {}
-    for name in bakes:
-        report = work.folder / f"{name}.json"
-        little = ("--size", work.little(400, 32), "--views", work.little(3, 1), "--rounds", work.little(3, 1))
-        work.command("bench_page", work.file(name, "asset"), *little, "--json", report)
-        found[name] = work.read(report.name)
-    return found
+def page(work: Work, asset_of: str) -> dict[str, Any]:
+    """The page of an asset, in a browser that draws with the processor."""
+    little = ("--size", work.little(400, 32), "--views", work.little(3, 1), "--rounds", work.little(3, 1))
+    work.command("bench_page", work.file(asset_of, "asset"), *little, "--json", work.folder / "page.json")
+    return work.read("page.json")
 
 
 def cameras(work: Work, data: str) -> dict[str, Any]:
