@@ -40,13 +40,18 @@ BAKE = [
     *("--mesh-resolution", "48", "--max-memory", "1.4", "--head-width", "0", "--weight-floor", "0.01"),
 ]
 
+N_WITNESSES = 15_000
+"""A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
+
 
 @pytest.fixture(scope="module")
 def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Model, asset and one training view, played."""
     out = tmp_path_factory.mktemp("fox")
     model, asset = str(out / "model.pt"), str(out / "asset")
-    assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
+        assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
     assert bake_main([model, asset, *BAKE, "--json", str(out / "bake.json")]) == 0
     view = ["--view", "0", "--output", str(out / "view.png"), "--json", str(out / "play.json")]
     assert play([asset, *view]) == 0
