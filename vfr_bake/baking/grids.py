@@ -205,7 +205,8 @@ def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.nd
 
 def _corners(cells: np.ndarray, resolution: int) -> Vertices:
     """The corners of a grid's cells, `resolution` along each axis, that lie in `cells` [n, n, n] bool. They
-    are found slab by slab, because a fine grid as a whole takes gigabytes."""
+    are found and put in order slab by slab, because a fine grid as a whole takes gigabytes. Slabs are some
+    bricks thick, and bricks are ordered along x first."""
     parts = []
     for first in range(0, resolution + 1, SLAB):
         last = min(first + SLAB, resolution + 1)
@@ -213,10 +214,9 @@ def _corners(cells: np.ndarray, resolution: int) -> Vertices:
         corners = corners_of(subdivided(cells, resolution, slice(before, last)))
         index = np.argwhere(corners[first - before : last - before]).astype(np.int16)
         index[:, 0] += first
-        parts.append(index)
-    index = np.concatenate(parts)
-    coords, masks, order = pack_vertices(index)
-    return Vertices(coords, masks, index[order], resolution)
+        coords, masks, order = pack_vertices(index)
+        parts.append((coords, masks, index[order]))
+    return Vertices(*(np.concatenate(column) for column in zip(*parts, strict=True)), resolution)
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
