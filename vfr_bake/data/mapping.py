@@ -24,10 +24,6 @@ from vfr_bake.data.threads import Progress, in_threads, n_threads
 
 MIN_MATCHES = 15
 MIN_FOR_PRINCIPAL_POINT = 20
-FIRST_ANGLE = 16.0
-"""COLMAP's own: the wider, the better is the distance to the points known."""
-FIRST_ANGLE_OF_NEIGHBOURS = 4.0
-"""Two neighbouring pictures have it. They share more points, and a third picture finds its place by those."""
 SECONDS_BETWEEN_LOOKS = 0.1
 
 
@@ -41,6 +37,20 @@ class Sensor:
     """Maker, model and focal length as EXIF has them; empty where it has not."""
     focal: float | None
     """Focal length in pixels, from EXIF."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How the two pictures that a model begins with are drawn."""
+
+    first_angle: float
+    """Degrees between the rays to most of the points that they share, at least. COLMAP's own 16 give better
+    distances; neighbouring pictures have 4, and share more points, by which a third one finds its place."""
+    seed: int
+
+
+FIRST_ATTEMPT = Attempt(16.0, 0)
+FURTHER_ATTEMPTS = (Attempt(4.0, 0), Attempt(16.0, 1), Attempt(4.0, 1))
 
 
 @dataclass(frozen=True)
@@ -164,21 +174,20 @@ def map_pictures(
     work: Path,
     n_pictures: int,
     progress: Progress,
-    first_angle: float = FIRST_ANGLE,
+    attempt: Attempt = FIRST_ATTEMPT,
 ) -> list[Any]:
     """The `pycolmap.Reconstruction`s that the database's matches allow, that of the most pictures first.
 
-    `work`: a folder for COLMAP's own output. `first_angle`: degrees between the rays to most points from the
-    two pictures that a model begins with, at least. COLMAP runs in a thread of its own, so that an
-    interruption reaches it through its token, between one picture and the next.
+    `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption
+    reaches it through its token, between one picture and the next.
     """
     pycolmap = pycolmap_module()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = n_threads()
-    options.random_seed = 0
+    options.random_seed = attempt.seed
     options.min_model_size = 3
     options.extract_colors = False
-    options.mapper.init_min_tri_angle = first_angle
+    options.mapper.init_min_tri_angle = attempt.first_angle
     token = pycolmap.CancellationToken()
     n_placed = 0
 

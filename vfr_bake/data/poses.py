@@ -26,8 +26,9 @@ from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches, stamp
 from vfr_bake.data.mapping import (
-    FIRST_ANGLE,
-    FIRST_ANGLE_OF_NEIGHBOURS,
+    FIRST_ATTEMPT,
+    FURTHER_ATTEMPTS,
+    Attempt,
     Pair,
     Sensor,
     map_pictures,
@@ -48,6 +49,9 @@ MIN_SHARE = 0.6
 side only, or in two models of which one is lost: a field trained on the rest has holes."""
 MIN_REGISTERED = 8
 """If there are fewer pictures, all must be registered: a handful can agree on a wrong model."""
+HANDFUL = 24
+"""Whether so few pictures find their places depends on which two of them come first, and these are drawn by
+chance: more attempts are made."""
 MIN_FEATURES = 50
 """Fewer than these, and a picture is blank, out of focus, or all blur."""
 
@@ -130,8 +134,9 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     `photos`: a folder with pictures in `images/` or in itself, or in folders within these, or a video, whose
     frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and
     left as it is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a
-    video, then `features`, `matches`, `cameras`; where those are too few `neighbours first`, where they are
-    folded `walk`, `turns`, `cameras again`), how much of it is done and how much there is.
+    video, then `features`, `matches`, `cameras`; where those of a handful are too few `cameras, attempt 2`
+    and so on, where they are folded `walk`, `turns`, `cameras again`), how much of it is done and how much
+    there is.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -252,12 +257,12 @@ def _placed(
     """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, with those
     joined into it that fit; if that is folded, others that are not."""
 
-    def built(some: Sequence[Pair], stage: str, first_angle: float = FIRST_ANGLE) -> list[Any]:
+    def built(some: Sequence[Pair], stage: str, attempt: Attempt = FIRST_ATTEMPT) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
             write_database(database, names, sensors, features, some)
             found = map_pictures(
-                database, place, Path(name), len(names), lambda *n: progress(stage, *n), first_angle
+                database, place, Path(name), len(names), lambda *n: progress(stage, *n), attempt
             )
             found = joined(found, database, place)
         if found:
@@ -271,10 +276,12 @@ def _placed(
         return bool(models) and models[0].num_reg_images() >= _n_needed(len(names))
 
     models = built(pairs, "cameras")
-    if pairs and not enough(models):
-        # A handful of pictures depends on which two come first, and these are drawn by chance.
-        again = built(pairs, "neighbours first", FIRST_ANGLE_OF_NEIGHBOURS)
-        models = max(models, again, key=lambda found: found[0].num_reg_images() if found else 0)
+    if pairs and len(names) <= HANDFUL:
+        for number, attempt in enumerate(FURTHER_ATTEMPTS, start=2):
+            if enough(models):
+                break
+            again = built(pairs, f"cameras, attempt {number}", attempt)
+            models = max(models, again, key=lambda found: found[0].num_reg_images() if found else 0)
     if not models or not n_torn(models):
         return models
     walk = built(near_pairs(pairs), "walk")

@@ -271,22 +271,21 @@ def test_three_pictures_must_all_find_their_place(can, tmp_path: Path):
     assert "of at least 3 of 3 pictures, got 0" in text
 
 
-def test_where_a_wide_pair_leads_nowhere_neighbours_come_first(
-    can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    wide = []
+def test_a_handful_is_placed_by_another_attempt(can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three attempts find nothing, and the fourth finds all."""
+    attempts = []
 
     def map_pictures(*arguments):
-        if arguments[-1] == mapping.FIRST_ANGLE:
-            wide.append(arguments)
-            return []
-        return mapping.map_pictures(*arguments)
+        attempts.append(arguments[-1])
+        return [pycolmap.Reconstruction(can[0] / "sparse" / "0")] if len(attempts) == 4 else []
 
     monkeypatch.setattr(poses, "map_pictures", map_pictures)
     stages: list[str] = []
-    report = estimate_cameras(first_pictures(can, tmp_path, 4), lambda stage, *_: stages.append(stage))
-    assert report.n_registered == 4 and len(wide) == 1
-    assert stages[-1] == "neighbours first"
+    pictures = first_pictures(can, tmp_path, N_CAN)
+    monkeypatch.setattr(poses, "refine_principal_points", lambda model: stages.append("refined"))
+    report = estimate_cameras(pictures, lambda stage, *_: stages.append(stage))
+    assert report.n_registered == N_CAN and stages.count("refined") == 1
+    assert attempts == [mapping.FIRST_ATTEMPT, *mapping.FURTHER_ATTEMPTS]
 
 
 def test_the_same_picture_again_and_again(tmp_path: Path):
