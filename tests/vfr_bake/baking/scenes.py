@@ -7,6 +7,7 @@ the built-in scene, so that its cameras fit.
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from player.cameras.camera import Camera
 from vfr_bake.config import TrainConfig
@@ -91,6 +92,7 @@ def analytic_scene(kind: str, size: int, n_train: int) -> Scene:
 def trained(scene: Scene, config: TrainConfig) -> Model:
     """What `vfr-train` would have written, without a file in between."""
     trainer = Trainer(scene, config)
+    trainer.field.head.products = torch.float32  # the same model on any machine
     for _ in trainer.run():
         pass
     return trained_model(trainer, scene, {})

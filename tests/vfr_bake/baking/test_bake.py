@@ -331,7 +331,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
     assert page.count("data:image/png;base64,") == 2 and "<svg" in page
     assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
     k = Asset.open(tmp_path / "asset", verify=True).manifest.n_fetches
-    assert list(said["lookups"])[-1] == str(k) and k <= PRESETS["fast"].n_fetches
+    assert max(map(int, said["lookups"])) == k <= PRESETS["fast"].n_fetches
 
 
 def test_a_budget_that_is_missed_is_an_error_and_writes_nothing(model: Model, tmp_path: Path) -> None:
