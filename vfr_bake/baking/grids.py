@@ -216,7 +216,8 @@ def _corners(cells: np.ndarray, resolution: int) -> Vertices:
         index[:, 0] += first
         coords, masks, order = pack_vertices(index)
         parts.append((coords, masks, index[order]))
-    return Vertices(*(np.concatenate(column) for column in zip(*parts, strict=True)), resolution)
+    coords, masks, index = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Vertices(coords, masks, index, resolution)
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
