@@ -51,7 +51,6 @@ class RaySamples:
     """What the guide of a training keeps of them, in tensors and plain values."""
 
 
-@torch.no_grad()
 def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
     """Composite packed samples.
 

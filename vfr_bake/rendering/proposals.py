@@ -64,6 +64,7 @@ class ProposalSampler(nn.Module):
         middle = torch.full((len(rays_o), 3), 0.5)
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
 
+    @torch.no_grad()
     def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
         """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
         features = np.empty((len(rays_o), field.config.n_channels), np.float32)

@@ -212,7 +212,7 @@ def test_no_ray_at_all(device: torch.device) -> None:
     field = make()[0].to(device)
     field.grid.backend = "torch"
     _, guide = guides(device)
-    guide.prepare(0, 0.0, field)
+    guide.prepare(0, field)
     none = torch.zeros(0, 3, device=device)
     samples = guide.sample(field, none, none, none, pilot=False, share=1.0)
     assert len(samples.t_mid) == len(samples.counts) == 0
