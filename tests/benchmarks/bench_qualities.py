@@ -48,7 +48,7 @@ def frame_times(
         taken: dict[tuple[str, str], list[list[float]]] = {key: [] for key in players}
         for turn, camera in enumerate(cameras):
             for key, player in players.items():
-                # Of the slow march fewer frames are rendered, spread over the same views.
+                # The slow march renders fewer frames, spread over the same views.
                 every = max(len(cameras) // n_frames[key[0]], 1)
                 if turn % every == 0:
                     taken[key].append(player.frame(camera)[0])
