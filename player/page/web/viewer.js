@@ -156,7 +156,7 @@ export class Viewer {
     }
     if (moves || this.stale) this.draw(this.pace.moving(...this.size()), { quality: "fast", moving: moves });
     else if (!this.covered && now - this.movedAt >= STILL_SECONDS * 1000) this.sharpen();
-    if (this.fence || this.n_still <= N_WHOLE || this.turning || this.again) this.wake();
+    if (this.fence || this.flight || this.n_still <= N_WHOLE || this.turning || this.again) this.wake();
   }
 
   // Bring the pose nearer to its goal; whether it moved.
@@ -167,7 +167,8 @@ export class Viewer {
     if (this.turning && this.canvas.dataset.shown) this.goal = orbited(this.goal, TURN_SPEED * seconds, 0);
     const before = this.pose;
     if (this.flight) {
-      const share = Math.min((now - this.flight.begin) / 1000 / FLIGHT_SECONDS, 1);
+      // A frame's time may lie before the click that began the flight.
+      const share = Math.min(Math.max((now - this.flight.begin) / 1000 / FLIGHT_SECONDS, 0), 1);
       this.pose = between(this.flight.from, this.goal, share * share * (3 - 2 * share));
       if (share >= 1) this.flight = null;
     } else {

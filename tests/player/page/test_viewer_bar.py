@@ -42,6 +42,23 @@ def distance_between(one: dict[str, Any], two: dict[str, Any]) -> float:
     return float(np.abs(c2w(one) - c2w(two)).max())
 
 
+def test_a_flight_does_not_begin_backwards(chromium: Browser) -> None:
+    """The time of a frame may lie before the click that it answers."""
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        page.evaluate(
+            """() => {
+              const real = requestAnimationFrame;
+              globalThis.requestAnimationFrame = (draw) => real((now) => draw(now - 100));
+            }"""
+        )
+        n = page.evaluate("() => drawn.length")
+        page.locator("#views").select_option(index=4)
+        wait_for(page, lambda: matches(page.evaluate("() => drawn.at(-1)"), VIEWS[3]))
+        way = [distance_between(before, view) for view in page.evaluate("n => drawn.slice(n)", n)]
+        assert np.diff(way).min() > -1e-6
+
+
 def test_the_picture_as_a_file(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off", device_scale_factor=2) as (page, *_):
         still(page)

@@ -164,7 +164,8 @@ def still(page: Page) -> dict[str, Any]:
         """() => {
           const before = globalThis.before ?? 0, now = performance.now();
           if (globalThis.n !== drawn.length) [globalThis.n, globalThis.before] = [drawn.length, now];
-          return now - globalThis.before > 300 && drawn.at(-1).quality !== "fast";
+          const done = document.getElementById("canvas").dataset.done !== undefined;
+          return done && now - globalThis.before > 300 && drawn.at(-1).quality !== "fast";
         }"""
     )
     return page.evaluate("() => drawn.at(-1)")
