@@ -17,7 +17,7 @@ from tests.benchmarks.suite.conditions import REPOSITORY
 from tests.benchmarks.suite.results import Results
 
 BLOCKS = tables.BLOCKS | trade.BLOCKS
-DOCUMENTS = ("README.md", "docs/benchmarks.md", "docs/trade.md")
+DOCUMENTS = ("README.md", "docs/bake.md", "docs/benchmarks.md", "docs/trade.md")
 BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)", re.DOTALL)
 
 

@@ -171,6 +171,30 @@ def baking(results: Results) -> list[str]:
     return titled([*titles, "lost on test views, dB"], rows, lacking)
 
 
+def presets(results: Results) -> list[str]:
+    """What each preset takes, loses and plays, for those who choose one."""
+    names = [
+        (f"bake_{scene}_{preset}", scene, preset) for scene in ("lego", "fox") for preset in PRESETS[scene]
+    ]
+    _, lacking = present(results, [name for name, *_ in names])
+    rows = []
+    for name, scene, preset in names:
+        if name not in results:
+            continue
+        found, rates = results[name]["figures"], ["", ""]
+        if played := results.get(f"play_{scene}_{preset}"):
+            ms = {row["quality"]: row["ms"] for row in played["figures"]["rows"] if row["march"] == "numba"}
+            rates = [number(1000 / ms[quality], 1) for quality in ("exact", "fast")]
+        lost = give_or_take(found["loss_db"], found["loss_db_spread"], 2)
+        rows.append(
+            [f"{scene}, `{preset}`", megabytes(found["n_bytes"]), duration(found["seconds"]), lost, *rates]
+        )
+    sizes = " and ".join(f"{SCENES[scene].size} ({scene})" for scene in ("lego", "fox"))
+    titles = ["scene, preset", "MB", "time", "lost, dB", "frames a second, `exact`", "`fast`"]
+    lines = titled(titles, rows, lacking)
+    return [*lines, "", f"Frames of {sizes}."] if rows else lines
+
+
 def curve(results: Results) -> list[str]:
     names = [*(f"bytes_lego_{mb}" for mb in LIMITS_MB), "bake_lego_balanced"]
     there, lacking = present(results, names)
@@ -374,6 +398,7 @@ BLOCKS: dict[str, Block] = {
     "step": step,
     "cameras": cameras,
     "baking": baking,
+    "presets": presets,
     "bytes": curve,
     "ours": ours,
     "expected-lookups": expected_lookups,
