@@ -102,10 +102,10 @@ def enter_box(
         t_in = np.where(parallel, t_in, np.maximum(t_in, np.minimum(a, b)))
         t_out = np.where(parallel, t_out, np.minimum(t_out, np.maximum(a, b)))
         t_out[outside] = -np.inf
-    with np.errstate(over="ignore", invalid="ignore"):  # of rays that miss; nobody asks where
+    with np.errstate(over="ignore", invalid="ignore"):  # rays that miss; nobody asks where, or by how much
         point = np.clip(point + t_in * direction, np.float32(0), size)
+        length = np.minimum(t_out - t_in, np.float32(grid.most_samples - 1) * grid.step)
     first = np.zeros(len(rays_o), np.int32)
-    length = np.minimum(t_out - t_in, np.float32(grid.most_samples - 1) * grid.step)
     if bounds is not None:
         near, far = bounds
         ahead = np.maximum(near - t_in, 0) / grid.step - np.float32(0.5)

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from player.asset.manifest import Manifest
@@ -94,6 +94,7 @@ component = st.one_of(st.floats(-1, 1, width=32), st.sampled_from([0.0, -0.0, 1e
 
 
 @given(st.tuples(coordinate, coordinate, coordinate), st.tuples(component, component, component))
+@example((3.0, -3.0, 0.0), (-1e-38, -1e-38, 1.0))  # from one face beyond float32 to another
 def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tuple[float, ...]) -> None:
     norm = math.sqrt(math.fsum(x * x for x in d))
     assume(norm >= 1e-3)
