@@ -24,7 +24,7 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium g
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check docs env format system-libraries other-programs clean benchmarks \
+.PHONY: help demo test check docs env format system-libraries other-programs clean benchmarks numerics \
   test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
 
 help:  ## say what there is
@@ -48,6 +48,13 @@ docs: $(VENV)/.docs  ## the manual as web pages, in build/docs
 
 benchmarks: $(VENV)/.dev other-programs  ## every figure of the README and of docs/benchmarks.md: two and a half hours
 	$(BIN)/python -m tests.benchmarks
+
+# The tests that declare rows of the page are those that import Row.
+numerics: $(VENV)/.dev other-programs  ## the worst errors that the tests meet, and docs/numerics.md: a few minutes
+	rm -f docs/numerics.json
+	$(BIN)/python -m pytest -n 2 --dist loadfile --numerics docs/numerics.json \
+	  $$(grep -rl --include='test_*.py' '^from tests.numerics.bounds import Row' tests | grep -v test_document.py)
+	$(BIN)/python -m tests.numerics.document
 
 # What takes too long for every change; CONTRIBUTING.md says how long each takes.
 test-all: test-pythons test-lowest test-wheel fuzz kill mutations processors  ## everything below: a day of one machine

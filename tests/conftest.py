@@ -1,15 +1,17 @@
-"""What all tests share: where the real pictures are."""
+"""What all tests share: where the real pictures are, and what the numbers of a run were."""
 
 from __future__ import annotations
 
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
 import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to wait)
+from tests.numerics import bounds
 
 # A deadline measures the machine, not the code.
 settings.register_profile("any_machine", deadline=None)
@@ -19,6 +21,27 @@ settings.load_profile("any_machine")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--numerics", metavar="FILE", help="write the worst errors that the tests met to this file"
+    )
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A worker of pytest-xdist hands over what its tests have met; who started it, or runs alone, writes."""
+    path, handed_over = session.config.getoption("--numerics"), getattr(session.config, "workeroutput", None)
+    if handed_over is not None:
+        handed_over["numerics"] = bounds.MET
+    elif path:
+        bounds.write(Path(path), bounds.MET)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """What a worker has met; nothing of one that was killed."""
+    bounds.MET.update(bounds.merged(bounds.MET, getattr(node, "workeroutput", {}).get("numerics", {})))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

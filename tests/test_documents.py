@@ -446,10 +446,12 @@ def test_messages_of_troubleshooting_are_those_of_the_source() -> None:
 
 
 def test_tests_that_are_named_exist() -> None:
-    sources = {path.name: path.read_text(encoding="utf-8") for path in (REPOSITORY / "tests").rglob("*.py")}
-    sources |= {path.name: "" for path in (REPOSITORY / "tests").rglob("*.json")}
+    paths = [*(REPOSITORY / "tests").rglob("*.py"), *(REPOSITORY / "tests").rglob("*.json")]
+    sources = {path.name for path in paths}
     functions = {
-        name for text in sources.values() for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE)
+        name
+        for path in paths
+        for name in re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
     }
     for document in MANUAL:
         for text in parsed(document).code:

@@ -16,6 +16,7 @@ from player.compiled import march as march_compiled
 from player.march import march
 from player.march.fetches import Samples, equal_mass_bins
 from player.march.march import MAX_TAU
+from tests.numerics.bounds import Row
 from tests.vfr_bake import twins
 from vfr_bake.field.networks import TruncatedExp
 from vfr_bake.kernels.density import LARGEST_LOGIT
@@ -28,8 +29,63 @@ COMPOSITES = [
     pytest.param(twins.composite, id="twin"),
     pytest.param(composite_torch, id="torch"),
 ]
-DTYPES = [torch.float32, torch.float64]
+DTYPES = [
+    pytest.param(dtype, id=str(dtype).removeprefix("torch.")) for dtype in (torch.float32, torch.float64)
+]
 mpmath.mp.dps = 50
+
+DEPTH = "Density and optical depth"
+PRE_ACTIVATION = Row(
+    DEPTH, "activated density (training)", "any pre-activation, clamped to ±15", 4, "ulp of it",
+    "±infinity is clamped, its gradient is that of the clamped value and never 0",
+)  # fmt: skip
+NAN_PRE_ACTIVATION = Row(
+    DEPTH, "NaN before the activation", unit="NaN",
+    at_ends="the loss shows it, and the step is skipped and counted",
+)  # fmt: skip
+WEIGHT = Row(
+    DEPTH, "weight of a sample",
+    "depths 0, subnormal, 1e-8 to 1e8, 1e6 first and last, 10,000 of 1e-7, one, none",
+    2, "u (4 + i tau) of it for the i-th sample",
+    "below the least normal number it may be lost; a first sample of depth 1e6 has all of it",
+)  # fmt: skip
+OPACITY = Row(
+    DEPTH, "opacity", "the same", 2, "u (n + 2) of it",
+    "never a product of (1 - alpha): 10,000 samples of 1e-7 are not lost",
+)  # fmt: skip
+SUM_OF_WEIGHTS = Row(DEPTH, "sum of the weights, against the opacity", "the same", 2, "ulp a sample")
+DEPTH_GRADIENT = Row(
+    DEPTH, "gradient of a depth", "the same, up to 100 samples", 60, "ulp (n + 1)", "finite at all of these"
+)
+FEATURE_GRADIENT = Row(
+    DEPTH, "gradient of a feature", "the same, up to 100 samples", 30, "ulp (n + 1)", "finite at all of these"
+)
+HALF_STEPS = Row(
+    DEPTH, "weight of two half steps, against one step", "densities exp(-20) to exp(4)", 10, "ulp tau of it"
+)
+HALF_STEPS_COMPOSED = Row(
+    DEPTH, "opacity and features of 400 half steps, against 200 steps", "the same", 400, "ulp of it"
+)
+NAN_CELL = Row(
+    DEPTH, "NaN in one cell", unit="stays in its ray", at_ends="spoils the rays that meet it, and no other"
+)
+PLAYERS_OPACITY = Row(
+    DEPTH,
+    "opacity (player)",
+    "tau 0 to 1e6, subnormal too",
+    2,
+    "u of it, and the least subnormal number",
+    "0 to 1",
+)
+FOG = Row(
+    DEPTH, "opacity of a fog (player's march)", "optical depth of a step 0 to 1e6", 1e-5, "of it",
+    "stops behind tau = 6.9; the first sample counts whole",
+)  # fmt: skip
+FOG_SAMPLES = Row(DEPTH, "samples of a ray through a fog", "the same", 1, "sample")
+MEAN_PLACE = Row(
+    "What is stored", "mean place of chosen samples", "any k", 1e-6, "of it",
+    "ties, one sample, weights below float32's resolution, k over the samples",
+)  # fmt: skip
 
 DEPTHS: dict[str, list[float]] = {
     "none": [],
@@ -72,12 +128,13 @@ def test_weights_are_those_of_50_digits(function: Composite, dtype: torch.dtype,
     expected, alpha = exact(tuple(depths.tolist()))
     unit, tiny = torch.finfo(dtype).eps, torch.finfo(dtype).tiny
     tau = np.cumsum(np.minimum(depths.double().numpy(), 1e3))
-    for i, (ours, wanted) in enumerate(zip(weights.tolist(), expected, strict=True)):
-        allowed = float(wanted) * unit * (4 + (i + 1) * min(float(tau[i]), 800.0)) + tiny
-        assert abs(mpmath.mpf(ours) - wanted) <= allowed, (i, ours, float(wanted))
+    errors = [abs(mpmath.mpf(ours) - wanted) for ours, wanted in zip(weights.tolist(), expected, strict=True)]
+    roundings = 4 + (np.arange(len(tau)) + 1) * np.minimum(tau, 800.0)
+    WEIGHT.check(errors, of=(np.array(expected, np.float64) * unit * roundings + tiny) / 2)
     total = math.fsum(weights.tolist())
-    assert abs(mpmath.mpf(opacity[0].item()) - alpha) <= unit * (2 + len(depths)) * float(alpha) + tiny
-    assert abs(total - opacity[0].item()) <= 2 * unit * max(len(depths), 1) * total + tiny, "2 ulp a sample"
+    off = abs(mpmath.mpf(opacity[0].item()) - alpha)
+    OPACITY.check(off, of=(unit * (2 + len(depths)) * float(alpha) + tiny) / 2)
+    SUM_OF_WEIGHTS.check(total, opacity[0].item(), of=unit * max(len(depths), 1) * total + tiny / 2)
 
 
 @pytest.mark.parametrize("function", COMPOSITES)
@@ -103,10 +160,11 @@ def test_gradients_are_those_of_50_digits(function: Composite, dtype: torch.dtyp
     for i in range(len(depths)):
         behind = mpmath.fsum(w[j] * inner[j] for j in range(i + 1, len(depths)))
         wanted = through[i] * inner[i] - behind + a * (1 - alpha)
-        assert abs(mpmath.mpf(depths.grad[i].item()) - wanted) <= 60 * unit * (1 + len(depths))
+        DEPTH_GRADIENT.check(abs(mpmath.mpf(depths.grad[i].item()) - wanted), of=unit * (1 + len(depths)))
         for c in range(3):
             of_feature = mpmath.mpf(features.grad[i, c].item())
-            assert abs(of_feature - w[i] * mpmath.mpf(g[c].item())) <= 30 * unit * (1 + len(depths))
+            off = abs(of_feature - w[i] * mpmath.mpf(g[c].item()))
+            FEATURE_GRADIENT.check(off, of=unit * (1 + len(depths)))
 
 
 @pytest.mark.parametrize("function", COMPOSITES)
@@ -118,11 +176,9 @@ def test_two_half_steps_are_one_step(function: Composite, dtype: torch.dtype) ->
     whole = one_ray(function, sigmas, features)
     half = one_ray(function, sigmas.repeat_interleave(2) / 2, features.repeat_interleave(2, dim=0))
     unit = torch.finfo(dtype).eps
-    torch.testing.assert_close(half[0], whole[0], rtol=400 * unit, atol=0)
-    torch.testing.assert_close(half[1], whole[1], rtol=400 * unit, atol=0)
-    torch.testing.assert_close(
-        half[2].reshape(-1, 2).sum(1), whole[2], rtol=10 * float(sigmas.sum()) * unit, atol=0
-    )
+    for i in (0, 1):
+        HALF_STEPS_COMPOSED.check(half[i], whole[i], of=unit * whole[i].abs())
+    HALF_STEPS.check(half[2].reshape(-1, 2).sum(1), whole[2], of=float(sigmas.sum()) * unit * whole[2])
 
 
 @pytest.mark.parametrize("function", COMPOSITES)
@@ -132,7 +188,7 @@ def test_a_nan_stays_in_its_ray(function: Composite) -> None:
     features = torch.ones(6, 2, requires_grad=True)
     starts, counts = torch.tensor([0, 2, 4]), torch.tensor([2, 2, 2])
     out, opacity, weights = function(sigmas, features, torch.ones(6), starts, counts)
-    assert torch.isnan(opacity[1]) and torch.isfinite(opacity[[0, 2]]).all()
+    NAN_CELL.holds(torch.isnan(opacity[1]) and torch.isfinite(opacity[[0, 2]]).all())
     assert torch.isfinite(out[[0, 2]]).all() and torch.isfinite(weights[[0, 1, 4, 5]]).all()
     (out[[0, 2]].sum() + opacity[[0, 2]].sum()).backward()
     assert torch.isfinite(sigmas.grad[[0, 1, 4, 5]]).all()
@@ -148,13 +204,13 @@ def test_an_infinite_pre_activation_is_clamped(logit: float, dtype: torch.dtype)
     y = TruncatedExp.apply(x)
     y.sum().backward()
     wanted = math.exp(min(max(float(x.item()), -LARGEST_LOGIT), LARGEST_LOGIT))
-    assert y.item() == pytest.approx(wanted, rel=4 * torch.finfo(dtype).eps)
+    PRE_ACTIVATION.check(y.item(), wanted, of=torch.finfo(dtype).eps * wanted)
     assert x.grad is not None and x.grad.item() == y.item()
 
 
 def test_a_nan_pre_activation_stays_one() -> None:
     """It is not hidden: the loss becomes NaN, and the step is skipped and counted."""
-    assert math.isnan(TruncatedExp.apply(torch.tensor([math.nan])).item())
+    NAN_PRE_ACTIVATION.holds(math.isnan(TruncatedExp.apply(torch.tensor([math.nan])).item()))
 
 
 # --- the player ---
@@ -164,7 +220,7 @@ def test_a_nan_pre_activation_stays_one() -> None:
 def test_the_players_opacity_is_that_of_50_digits(tau: float) -> None:
     ours = float(march_compiled.opacity_of(np.float32(tau)))
     wanted = -mpmath.expm1(-mpmath.mpf(float(np.float32(tau))))
-    assert abs(mpmath.mpf(ours) - wanted) <= 2**-23 * float(wanted) + 2e-45
+    PLAYERS_OPACITY.check(abs(mpmath.mpf(ours) - wanted), of=2**-24 * float(wanted) + 1e-45)
     assert 0 <= ours <= 1
 
 
@@ -184,9 +240,9 @@ def test_a_fog_of_one_density(module: object, optical: float) -> None:
     limit = float(MAX_TAU)
     inside = round(2 / float(grid.step))
     taken = inside if step_tau == 0 else min(inside, math.floor(limit / step_tau) + 1)
-    assert abs(int(result.n_density_samples[0]) - taken) <= 1
+    FOG_SAMPLES.check(result.n_density_samples[0], taken)
     wanted = -mpmath.expm1(-mpmath.mpf(step_tau) * int(result.n_density_samples[0]))
-    assert abs(mpmath.mpf(float(result.opacity[0])) - wanted) <= 1e-5 * float(wanted) + 1e-44
+    FOG.check(abs(mpmath.mpf(float(result.opacity[0])) - wanted), of=float(wanted) + 1e-39)
     if len(result.hits):  # one constant feature: the weights' sum
         total = float(result.features[0, 0]) / 100
         assert total == pytest.approx(float(result.opacity[0]), rel=2 * 2**-23 * taken + 1e-6)
@@ -203,5 +259,5 @@ def test_bins_of_ties_and_of_weights_below_resolution(weights: list[float]) -> N
     k = 2
     bins = equal_mass_bins(samples, k)
     mean = math.fsum((w.astype(np.float64) * s).tolist()) / math.fsum(w.astype(np.float64).tolist())
-    assert bins.s.mean() == pytest.approx(mean, rel=1e-6)
+    MEAN_PLACE.check(bins.s.mean(), mean, of=mean)
     assert (np.diff(bins.s) >= 0).all() and bins.s.min() >= 1 and bins.s.max() <= len(s)

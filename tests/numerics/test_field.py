@@ -13,6 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from exporters.head.spherical_harmonics import MAX_DEGREE, sh_monomials
+from tests.numerics.bounds import Row
 from tests.reference import hash_grid_feature, spherical_harmonics
 from tests.vfr_bake import twins
 from vfr_bake.config import FieldConfig
@@ -25,6 +26,38 @@ from vfr_bake.torch_kernels.proposals import contracted_unit as contracted_torch
 mpmath.mp.dps = 50
 ONE = np.float32(1)
 UNIT = 2.0**-24
+DTYPES = [
+    pytest.param(dtype, id=str(dtype).removeprefix("torch.")) for dtype in (torch.float32, torch.float64)
+]
+
+CONTRACTION = Row(
+    "Field", "contraction", "any finite point", 4, "u of the unit cube",
+    "0, `nextafter` of the unit sphere on both sides, 1e19 (whose square overflows), 1e30, 3e38;"
+    " may lie 2u outside the cube",
+)  # fmt: skip
+OUTSIDE = Row(
+    "Field", "hash grid 2u outside the cube", "levels to N = 4,096 cells", 12, "N u of an entry",
+    "indices are clamped to the last cell",
+)  # fmt: skip
+HARMONICS = Row(
+    "Field", "spherical harmonics in float32", "1 to 8 bands, at the poles and beside them", 2e-5,
+    at_ends="at the poles only m = 0 is left, exactly in float64",
+)  # fmt: skip
+ORTHONORMAL = Row("Field", "products of two harmonics over the sphere, in float32", "8 bands", 1e-4)
+HASH_GRID = Row(
+    "Field", "hash grid", "unit cube, levels to N = 4,096 cells", 24, "N u of an entry",
+    "0, 1, cell borders and the numbers beside them;"
+    " at 4,096 cells a float32 position has 12 bits left within a cell",
+)  # fmt: skip
+JUMP = Row(
+    "Field", "hash grid from one side of a cell's border to the other", "N = 4,096", 16, "N u of an entry",
+    "the places are 2 ulp apart: no jump",
+)  # fmt: skip
+TABLE_GRADIENT = Row("Field", "gradient of the hash grid's table in float64", "at borders", 1e-12)
+HASH = Row(
+    "Field", "hash", "vertices to 2^21 an axis", unit="exact",
+    at_ends="products past 2^31 and 2^53 are whole numbers below 2^63",
+)  # fmt: skip
 
 
 def exact_contraction(point: tuple[float, ...]) -> list[float]:
@@ -40,14 +73,16 @@ SIZES = [0.0, 1e-45, 1e-38, 1e-20, 0.5, *AROUND_ONE, 1.0, 2.0, 1e4, 1e15, 1e19, 
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (0.6, 0, -0.8), (-0.5, 0.5, 0.70710678)])
+@pytest.mark.parametrize(
+    "direction", [(1, 0, 0), (0, -1, 0), (0.6, 0, -0.8), (-0.5, 0.5, 0.70710678)], ids=str
+)
 def test_contraction_is_equation_10_with_50_digits(size: float, direction: tuple[float, ...]) -> None:
     point = np.float32(np.array(direction) * size)
     wanted = exact_contraction(tuple(point.tolist()))
     numba = contracted_unit(*point, ONE)
     torched = contracted_torch(torch.from_numpy(point)[None])[0].tolist()
     for ours in (numba, torched):
-        np.testing.assert_allclose(ours, wanted, rtol=0, atol=4 * UNIT)
+        CONTRACTION.check(ours, wanted, of=UNIT)
         assert all(-UNIT <= c <= 1 + 2 * UNIT for c in ours), "lookups clamp the cell, see below"
 
 
@@ -74,7 +109,7 @@ def test_harmonics_at_the_poles(degree: int) -> None:
     ours = np.prod(dirs[:, None, :] ** exponents, axis=-1) @ coefficients
     np.testing.assert_allclose(ours, spherical_harmonics(dirs, degree), rtol=0, atol=1e-7)
     single = SphericalHarmonics(degree)(torch.from_numpy(dirs).float()).double().numpy()
-    np.testing.assert_allclose(single, ours, rtol=0, atol=2e-5)
+    HARMONICS.check(single, ours)
     for row in (ours[2], ours[5]):
         others = [row[band * band + band + m] for band in range(degree) for m in range(-band, band + 1) if m]
         assert not np.any(others)
@@ -89,7 +124,7 @@ def test_harmonics_are_orthonormal_in_float32() -> None:
     dirs = np.stack([root * np.cos(phi), root * np.sin(phi), z], axis=-1)
     y = SphericalHarmonics(MAX_DEGREE)(torch.from_numpy(dirs).float()).double().numpy()
     weights = np.repeat(weight_z, 2 * MAX_DEGREE) * (np.pi / MAX_DEGREE)
-    np.testing.assert_allclose(y.T @ (weights[:, None] * y), np.eye(MAX_DEGREE**2), rtol=0, atol=1e-4)
+    ORTHONORMAL.check(y.T @ (weights[:, None] * y), np.eye(MAX_DEGREE**2))
 
 
 def small_grid(dtype: torch.dtype, resolution: int) -> HashGrid:
@@ -108,7 +143,7 @@ def hard_coordinates(resolution: int) -> list[float]:
 
 
 @pytest.mark.parametrize("resolution", [40, 512, 4096])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
     """Features are exact for the position as the type holds it, which is off by N 2^-24 cells at a resolution
     of N."""
@@ -129,7 +164,7 @@ def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
         twins.encode(grid, tensor),
         encode(tensor, grid.table, layout.levels(grid.table)),
     ):
-        np.testing.assert_allclose(ours.detach().numpy(), wanted, rtol=0, atol=12 * unit * resolution)
+        HASH_GRID.check(ours.detach(), wanted, of=unit / 2 * resolution)
 
 
 def test_hash_grid_does_not_jump_at_a_cell_border() -> None:
@@ -140,8 +175,8 @@ def test_hash_grid_does_not_jump_at_a_cell_border() -> None:
     for to in (0, 1):
         x = np.nextafter(borders.astype(np.float32), np.float32(to))
         sides.append(grid(torch.from_numpy(np.stack([x, np.full_like(x, 0.3), np.full_like(x, 0.7)], 1))))
-    jump = (sides[0] - sides[1]).detach().abs().max().item()
-    assert jump <= 2 * 4096 * 2.0**-23 * 2 * 2, "two ulps apart, entries within 1, two axes' rounding"
+    # two ulps apart, entries within 1, two axes' rounding
+    JUMP.check((sides[0] - sides[1]).detach(), of=4096 * UNIT)
 
 
 def test_points_a_rounding_outside_the_cube_are_served_from_its_last_cell() -> None:
@@ -155,8 +190,7 @@ def test_points_a_rounding_outside_the_cube_are_served_from_its_last_cell() -> N
         partial(twins.encode, grid),
         lambda x: encode(x, table, grid.layout.levels(table)),
     ):
-        off = (function(outside) - function(inside)).detach().abs().max().item()
-        assert off <= 2 * 2 * 4096 * 3 * UNIT
+        OUTSIDE.check((function(outside) - function(inside)).detach(), of=4096 * UNIT)
 
 
 def test_gradient_of_the_table_at_borders_is_autograds() -> None:
@@ -168,7 +202,7 @@ def test_gradient_of_the_table_at_borders_is_autograds() -> None:
         torch.autograd.grad(values, grid.table, upstream)[0]
         for values in (grid(points), twins.encode(grid, points))
     ]
-    torch.testing.assert_close(grads[0], grads[1], rtol=0, atol=1e-12)
+    TABLE_GRADIENT.check(grads[0], grads[1])
 
 
 def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
@@ -181,5 +215,5 @@ def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
     for x, y, z in vertices:
         wanted = (x ^ (y * 2654435761) ^ (z * 805459861)) % size
         row = twins.rows_of(grid, torch.tensor([[x, y, z]]), level) - int(grid.layout.offsets[level])
-        assert row.item() == wanted
+        HASH.holds(row.item() == wanted)
         assert max(y * 2654435761, z * 805459861) < 2**63

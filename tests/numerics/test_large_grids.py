@@ -22,6 +22,7 @@ from player.errors import FormatError
 from player.march import march
 from player.march.contracted import MAX_SPEED
 from player.march.fetches import MIN_TOTAL, stored_features
+from tests.numerics.bounds import Row
 from tests.player.march.test_contracted_march import some_rays
 from tests.player.march.test_march import random_rays
 from vfr_bake.baking.distillation import corners
@@ -36,6 +37,23 @@ LAST_IN_32_BITS = 2**31 // 729 - 1
 MOST_SLOTS = bricks_per_axis(MAX_RESOLUTION) ** 3
 """The most slots that a grid of the format may have."""
 MOST_ROWS = 2**31 - 1
+LARGE = "257^3 bricks of 729 densities and 2^31 - 1 vertices"
+FAR_SAMPLES = Row(
+    "Large grids", "samples in the last bricks", LARGE, unit="the numpy march's, exactly",
+    at_ends="addresses past 2^31 have 64 bits; dense tables have 32",
+)  # fmt: skip
+FAR_OPACITY = Row("Large grids", "opacity in the last bricks", LARGE, 5e-6)
+FAR_DEPTH = Row("Large grids", "depth in the last bricks", LARGE, 1e-5, "units")
+FAR_FEATURES = Row("Large grids", "features in the last bricks", LARGE, 5e-4, "codes")
+FAR_ROWS = Row(
+    "Large grids",
+    "kernels of the bake and the training on rows past 2^31",
+    LARGE,
+    unit="as on the same rows alone, exactly",
+)
+TOO_MANY = Row(
+    "Large grids", "asset of more than 2^31 - 1 vertices", unit="refused", at_ends="when it is opened"
+)
 
 
 class Zeros(Protocol):
@@ -115,9 +133,10 @@ def test_the_compiled_march_reaches_the_last_slot(
     assert len(expected.hits) > 20 and np.abs(expected.features).max() > 20
     np.testing.assert_array_equal(got.n_density_samples, expected.n_density_samples)
     np.testing.assert_array_equal(got.hits, expected.hits)
-    np.testing.assert_allclose(got.opacity, expected.opacity, rtol=0, atol=5e-6)
-    np.testing.assert_allclose(got.depth, expected.depth, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(got.features, expected.features, rtol=0, atol=5e-4)
+    FAR_SAMPLES.holds()
+    FAR_OPACITY.check(got.opacity, expected.opacity)
+    FAR_DEPTH.check(got.depth, expected.depth)
+    FAR_FEATURES.check(got.features, expected.features)
 
 
 @pytest.mark.parametrize("n_fetches", [2**31, 10**30])
@@ -169,6 +188,7 @@ def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
         for a, b in zip(ours, expected, strict=True):
             np.testing.assert_array_equal(a, b)
             assert b.any()
+    FAR_ROWS.holds()
 
 
 SCALES = np.array([7, 12, 30], F32)
@@ -217,6 +237,7 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
     for ours, expected in zip(found[1], found[0], strict=True):
         np.testing.assert_array_equal(ours, expected)
         assert expected.any()
+    FAR_ROWS.holds()
 
 
 def test_what_is_counted_in_32_bits_fits() -> None:
@@ -241,3 +262,4 @@ def test_more_vertices_than_rows_have_numbers_are_refused(monkeypatch: pytest.Mo
     arrays = GridArrays(*(PyramidValues(pyramid, (np.zeros((8, 1), kind),)) for kind in (np.uint8, np.int8)))
     with pytest.raises(FormatError, match="at most 7 vertices, got 8"):
         arrays.check(manifest)
+    TOO_MANY.holds()

@@ -20,6 +20,7 @@ from player.cameras.transforms import read_cameras
 from player.compiled import march as march_compiled
 from player.march import march
 from player.render import Frame, Renderer, render
+from tests.numerics.bounds import Row
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
 from tests.vertex_grids import grid_of
@@ -27,6 +28,63 @@ from vfr_bake.baking.grids import code_step, encode_features
 
 MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
+
+STORED = "What is stored"
+DENSITY_CODES = Row(
+    STORED, "density codes of the densities that a player computes", "ranges of 0.01 to 160 within ±80",
+    0, "codes", "all 256 come back",
+)  # fmt: skip
+FEATURE_CODES = Row(
+    STORED, "feature codes", "±7 to ±127, scales of 1e-300 to 1e300", 0, "codes", "all come back"
+)
+CONSTANT = Row(
+    STORED, "value of a constant channel", "0, 5, -1e30", 1e-6, "of it",
+    "a channel of zeros has the step 1; a subnormal value keeps its first digits",
+)  # fmt: skip
+CLIPPED = Row(
+    STORED, "feature codes out of range", "±1e9", unit="the last code", at_ends="clipped, never wrapped"
+)
+PACKED = Row(STORED, "packed codes (version 3 of the format)", "0 to 255, none to 300", unit="come back")
+SEAM_DENSITY = Row(
+    STORED, "density codes across brick borders", "a linear ramp along each axis", 2e-3, "codes"
+)
+SEAM_FEATURES = Row(
+    STORED, "features across brick borders", "a linear ramp along each axis", 1e-4, "codes",
+    "a shift of a voxel shows as one code",
+)  # fmt: skip
+ANY_K = Row(STORED, "opacity with any number of fetches", "k = 0, 1, 2, 5, 1000", unit="the same bytes")
+ANY_K_FEATURES = Row(STORED, "one feature with any number of fetches", "the same", 2e-5, "of it")
+LEVELS = Row(
+    "Pictures",
+    "8-bit values",
+    "0 to 1, 1e-6 beside each of the 255 joints",
+    0,
+    "levels",
+    "outside is clipped",
+)
+SRGB = Row(
+    "Pictures",
+    "sRGB to linear light and back",
+    "0 to 1",
+    1e-7,
+    at_ends="both pieces meet at the joint to 1e-6",
+)
+BEHIND = Row(
+    "Pictures", "picture over any background, against that over black and what shows through",
+    "any colour", 3e-7, "of rgb", "the opacity is the same bytes",
+)  # fmt: skip
+MOVED_COLOUR = Row(
+    "Pictures", "mean change of rgb of a scene moved with its cameras",
+    "moved by 50 units, turned by quarters, scaled by 0.01 to 100", 1e-5, at_ends="depth in proportion",
+)  # fmt: skip
+MOVED_OPACITY = Row(
+    "Pictures", "mean change of the opacity of a scene moved with its cameras", "the same", 1e-6
+)
+TURNED_OPACITY = Row(
+    "Pictures", "opacity of a grid turned by a quarter with its rays", "500 rays", 2e-5,
+    at_ends="where the same samples are taken, on more than 99 % of the rays",
+)  # fmt: skip
+TURNED_DEPTH = Row("Pictures", "depth of a grid turned by a quarter with its rays", "500 rays", 2e-4, "units")
 
 
 # --- codes ---
@@ -38,9 +96,8 @@ def test_every_density_code_comes_back(low: float, width: float) -> None:
     high = min(low + width, 80.0)
     codes = np.arange(256)
     sigmas = decode_density(codes, (low, high)).astype(np.float64)
-    # float32: the exponent is rounded to 80 * 2^-24, which is a step of the code in the narrowest ranges
-    wrong = np.abs(encode_density(np.log(sigmas), (low, high)).astype(int) - codes)
-    assert wrong.max() <= (0 if high - low > 0.01 * 255 * 80 * 2**-22 else 1)
+    # float32 rounds the exponent to 80 * 2^-24, which is less than a step of the code in the narrowest range
+    DENSITY_CODES.check(encode_density(np.log(sigmas), (low, high)), codes)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-38, 1e-30, 1.0, 1e30, 1e300])
@@ -50,7 +107,7 @@ def test_every_feature_code_comes_back(scale: float, levels: int) -> None:
     values = codes * (scale / levels)
     step = code_step(values, levels)
     assert np.isfinite(step) and step > 0
-    assert encode_features(values / step).astype(int).tolist() == codes.tolist()
+    FEATURE_CODES.check(encode_features(values / step), codes)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-320, 5.0, -1e30])
@@ -58,18 +115,20 @@ def test_a_constant_channel_keeps_its_value(value: float) -> None:
     values = np.full((9, 1), value)
     step = code_step(values, 127)
     kept = encode_features(values / step) * step
-    # a step of 1e-320 / 127 has seven bits left
-    np.testing.assert_allclose(kept, values, rtol=1e-2 if 0 < abs(value) < 1e-300 else 1e-6)
+    if 0 < abs(value) < 1e-300:  # a step of 1e-320 / 127 has seven bits left
+        np.testing.assert_allclose(kept, values, rtol=1e-2)
+    else:
+        CONSTANT.check(kept, values, of=np.abs(values))
 
 
 def test_what_is_out_of_range_is_clipped_not_wrapped() -> None:
-    assert encode_features(np.array([-1e9, -127.6, 127.6, 1e9])).tolist() == [-127, -127, 127, 127]
+    CLIPPED.holds(encode_features(np.array([-1e9, -127.6, 127.6, 1e9])) == [-127, -127, 127, 127])
 
 
 @given(st.lists(st.integers(0, 255), max_size=300), st.integers(1, 4))
 def test_packed_codes_come_back(values: list[int], n_channels: int) -> None:
     codes = np.array(values * n_channels, np.uint8).reshape(-1, n_channels)
-    assert np.array_equal(unpack_codes(pack_codes(codes), codes.shape, "u1", "codes"), codes)
+    PACKED.holds(np.array_equal(unpack_codes(pack_codes(codes), codes.shape, "u1", "codes"), codes))
 
 
 # --- bricks ---
@@ -106,14 +165,14 @@ def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
     code = (np.log(sigma) + 4) * 255 / 9
     at = rays_o[:, axis].astype(np.float64) * resolution / 2 + resolution / 2
     # float32 opacities, relative 1e-6, a code being 9 / 255 of a logarithm
-    np.testing.assert_allclose(code, at + 100, rtol=0, atol=2e-3)
+    SEAM_DENSITY.check(code, at + 100)
     hits = result.hits
     assert len(hits) > 20
     features = result.features[:, 0] / result.opacity[hits]
-    np.testing.assert_allclose(features, at[hits], rtol=0, atol=1e-4)
+    SEAM_FEATURES.check(features, at[hits])
     shifted = module.march(ramp(resolution, axis, 1), rays_o, np.tile(d, (400, 1)), 0, (near, far))
     other = shifted.features[:, 0] / shifted.opacity[shifted.hits]
-    assert np.abs(other - at[shifted.hits] - 1).max() < 1e-4, "and a shift of a voxel shows as one code"
+    SEAM_FEATURES.check(other, at[shifted.hits] + 1)
 
 
 # --- choice of samples ---
@@ -128,8 +187,8 @@ def test_k_changes_no_bit_of_the_opacity(module: ModuleType, optical: float) -> 
     rays_d = np.tile(np.float32([1, 0, 0]), (50, 1))
     results = [module.march(grid, rays_o, rays_d, k) for k in (0, 1, 2, 5, 1000)]
     for result in results[1:]:
-        assert result.opacity.tobytes() == results[0].opacity.tobytes()
-        np.testing.assert_allclose(result.features, results[0].features, rtol=2e-5, atol=0)
+        ANY_K.holds(result.opacity.tobytes() == results[0].opacity.tobytes())
+        ANY_K_FEATURES.check(result.features, results[0].features, of=np.abs(results[0].features))
 
 
 # --- pictures ---
@@ -143,7 +202,7 @@ def test_8_bit_rounding_at_every_joint() -> None:
         rgb = np.repeat(values[:, None, None], 3, axis=2)
         zeros = np.zeros((255, 1), np.float32)
         frame = Frame(rgb, zeros, zeros, zeros, (0.0, 0.0, 0.0))
-        assert (frame.to_uint8()[:, 0, 0] == levels).all()
+        LEVELS.check(frame.to_uint8()[:, 0, 0], levels)
 
 
 def test_srgb_at_its_joint() -> None:
@@ -152,7 +211,7 @@ def test_srgb_at_its_joint() -> None:
         low, at, high = curve(values)
         assert low <= at <= high + 1e-7 and high - low < 1e-6
     values = np.linspace(0, 1, 4001)
-    np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(values)), values, rtol=0, atol=1e-7)
+    SRGB.check(srgb_from_linear(linear_from_srgb(values)), values)
     assert (np.diff(linear_from_srgb(values)) > 0).all()
 
 
@@ -164,7 +223,7 @@ def test_background_and_opacity_compose(colour: tuple[float, ...], shells_asset:
     black = render(shells_asset, camera, background=(0.0, 0.0, 0.0), march="numba")
     over = render(shells_asset, camera, background=colour, march="numba")
     wanted = black.rgb + (1 - black.opacity[..., None]) * np.float32(colour)
-    np.testing.assert_allclose(over.rgb, wanted, rtol=0, atol=3e-7)
+    BEHIND.check(over.rgb, wanted)
     assert over.opacity.tobytes() == black.opacity.tobytes()
 
 
@@ -194,8 +253,9 @@ def test_scene_and_cameras_moved_together_look_the_same(
     with Renderer(shells_asset, 1, "numba") as a, Renderer(moved, 1, "numba") as b:
         one, other = a.render(camera), b.render(camera.transformed(turn))
     # rays in the model frame are the same up to float64 rounding of 50 units, seen as 1e-5 of a colour
-    assert np.abs(one.rgb - other.rgb).max() < 0.02 and np.abs(one.rgb - other.rgb).mean() < 1e-5
-    assert np.abs(one.opacity - other.opacity).mean() < 1e-6
+    assert np.abs(one.rgb - other.rgb).max() < 0.02
+    MOVED_COLOUR.check(np.abs(one.rgb - other.rgb).mean())
+    MOVED_OPACITY.check(np.abs(one.opacity - other.opacity).mean())
     np.testing.assert_allclose(other.depth, one.depth * scale, rtol=2e-3, atol=1e-5 * scale)
 
 
@@ -222,5 +282,5 @@ def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleTyp
     b = module.march(grids[1], turn(rays_o), turn(rays_d), 5)
     same = a.n_density_samples == b.n_density_samples
     assert same.mean() > 0.99, "a sample within rounding of a cell's border may fall to either side"
-    np.testing.assert_allclose(a.opacity[same], b.opacity[same], rtol=0, atol=2e-5)
-    np.testing.assert_allclose(a.depth[same], b.depth[same], rtol=0, atol=2e-4)
+    TURNED_OPACITY.check(a.opacity[same], b.opacity[same])
+    TURNED_DEPTH.check(a.depth[same], b.depth[same])

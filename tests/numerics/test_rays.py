@@ -19,6 +19,7 @@ from player.compiled import march as march_compiled
 from player.errors import FormatError
 from player.march import march
 from player.march.box import BoxPath, enter_box
+from tests.numerics.bounds import Row
 from tests.numerics.fog import fog
 from tests.player.conftest import look_at
 
@@ -26,6 +27,52 @@ MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="num
 THIN = fog(1e-6)
 DIAGONAL = 2 * 3**0.5
 HALF = 0.5**0.5
+
+NAMED_RAYS = (
+    "along an axis, -0.0, in and from a face, an edge, a corner, inside, behind, grazing, tangent, 1e5 away"
+)
+ENTRY = Row(
+    "Rays",
+    "entry into the box",
+    NAMED_RAYS,
+    8,
+    "u of the largest coordinate",
+    "as the exact fractions have it",
+)
+LENGTH = Row(
+    "Rays",
+    "length inside the box",
+    NAMED_RAYS,
+    16,
+    "u of the largest coordinate",
+    "0 for a ray that misses it",
+)
+PLACE = Row(
+    "Rays", "place of the entry, in cells", NAMED_RAYS, 128, "u of the largest coordinate",
+    "on a face or inside, never beside the box",
+)  # fmt: skip
+SAMPLES = Row(
+    "Rays", "samples that both marches take, against the length in steps", "any ray, 1e-5 beside the faces",
+    1.01, "samples", "places where the lattice ends within rounding of the exit may go either way",
+)  # fmt: skip
+MOST = Row(
+    "Rays", "samples of a ray, share of the bound",
+    "directions of 1e-45 to 1e38, NaN, infinite, origins to 1e7", 1,
+    "of the lattice places on the diagonal, and 3", "the march ends there for any ray",
+)  # fmt: skip
+NO_NUMBERS = Row(
+    "Rays", "rays that are no numbers", "NaN, infinite", unit="the other rays' pictures are the same",
+    at_ends="they end, and spoil no other",
+)  # fmt: skip
+NO_THICKNESS = Row(
+    "Rays",
+    "box without thickness",
+    unit="refused",
+    at_ends="when the manifest is read; corners beyond 1e9, too",
+)
+DIRECTIONS = Row(
+    "Rays", "length of a camera's rays", "focal lengths 1e-6 to 1e6, cameras to 1e9 away", 2, "u"
+)
 
 
 def most_samples(step: float) -> int:
@@ -76,17 +123,17 @@ def test_entry_and_exit_are_the_fractions(name: str, module: ModuleType) -> None
     scale = max(1.0, float(np.abs(o).max()))
     rounding = 8 * 2**-24 * scale  # the origin in cells, its difference to the face, the quotient
     length = 0.0 if wanted is None else float(wanted[1] - wanted[0])
-    assert max(float(entries.length[0]), 0.0) == pytest.approx(length, abs=2 * rounding)
+    LENGTH.check(max(float(entries.length[0]), 0.0), length, of=rounding / 8)
     if length > 2 * rounding:
         assert wanted is not None
-        assert float(entries.t[0]) == pytest.approx(float(wanted[0]), abs=rounding)
+        ENTRY.check(float(entries.t[0]), float(wanted[0]), of=rounding / 8)
         place = o[0].astype(np.float64) + float(wanted[0]) * d[0].astype(np.float64)
-        np.testing.assert_allclose(entries.point[:, 0], (place + 1) * 8, rtol=0, atol=16 * rounding)
+        PLACE.check(entries.point[:, 0], (place + 1) * 8, of=rounding / 8)
     assert ((entries.point >= 0) & (entries.point <= 16)).all()
     taken = int(module.march(THIN, o, d, 5).n_density_samples[0])
     # where the lattice ends within rounding of the exit one sample more or less is met
     assert abs(taken - length / float(THIN.step)) <= 1 + 2 * rounding / float(THIN.step)
-    assert taken <= most_samples(float(THIN.step))
+    MOST.check(taken, of=most_samples(float(THIN.step)))
 
 
 coordinate = st.floats(-3, 3, width=32)
@@ -106,9 +153,9 @@ def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tupl
         # a direction of 1e-30 along an axis meets its faces within rounding of 1e-6 / 1e-30: all or nothing
         clear = all(abs(abs(x) - 1) > 1e-5 for x in o)
         if clear:
-            assert abs(int(result.n_density_samples[0]) - length / float(THIN.step)) <= 1.01
+            SAMPLES.check(result.n_density_samples[0], length / float(THIN.step))
         assert np.isfinite(result.opacity).all() and np.isfinite(result.depth).all()
-        assert int(result.n_density_samples[0]) <= most_samples(float(THIN.step))
+        MOST.check(result.n_density_samples, of=most_samples(float(THIN.step)))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -119,7 +166,7 @@ def test_directions_that_are_not_unit_end_all_the_same(module: ModuleType, size:
     rays_d = (np.float32([[1, 0, 0], [1, 0, 0], [0.6, 0.8, 0]]) * np.float64(size)).astype(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         result = module.march(THIN, rays_o, rays_d, 5)
-    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
+    MOST.check(result.n_density_samples, of=most_samples(float(THIN.step)))
     assert np.isfinite(result.opacity).all()
 
 
@@ -133,8 +180,8 @@ def test_rays_that_are_no_numbers_end_and_spoil_no_other(module: ModuleType, bad
         result = module.march(THIN, rays_o, rays_d, 5)
     alone = module.march(THIN, *good, 5)
     for ray in (0, 3):
-        assert result.opacity[ray] == alone.opacity[0] and result.depth[ray] == alone.depth[0]
-    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
+        NO_NUMBERS.holds(result.opacity[ray] == alone.opacity[0] and result.depth[ray] == alone.depth[0])
+    MOST.check(result.n_density_samples, of=most_samples(float(THIN.step)))
 
 
 @pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
@@ -147,7 +194,7 @@ def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: Mod
     rays_o = (np.full((200, 3), -far * unit) + offsets).astype(np.float32)
     rays_d = np.full((200, 3), unit, np.float32)
     result = module.march(THIN, rays_o, rays_d, 5)
-    assert (result.n_density_samples <= most_samples(float(THIN.step))).all()
+    MOST.check(result.n_density_samples, of=most_samples(float(THIN.step)))
     assert np.isfinite(result.features).all()
 
 
@@ -170,7 +217,8 @@ def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pyt
     for size in (1.0, 1e-20, 1e-3):
         rounds = 0
         march.march(THIN, rays[0], (rays[1] * size).astype(np.float32), 5)
-        assert 0 < rounds <= most_samples(float(THIN.step))
+        assert rounds > 0
+        MOST.check(rounds, of=most_samples(float(THIN.step)))
 
 
 @pytest.mark.parametrize("module", MARCHES)
@@ -184,6 +232,7 @@ def test_boxes_without_thickness_are_refused(aabb: tuple) -> None:
     with pytest.raises(FormatError, match="aabb: expected"):
         Manifest(generator="t", resolution=8, feature_resolution=8, step=0.1, density_range=(-5, 5),
                  n_channels=1, view_size=(4, 3), aabb=aabb)  # fmt: skip
+    NO_THICKNESS.holds()
 
 
 @pytest.mark.parametrize("focal", [1e-6, 1.0, 1e6])
@@ -193,4 +242,4 @@ def test_rays_of_a_camera_are_unit(focal: float, place: float) -> None:
     camera = Camera("c", look_at((place, 2, 5), (1, 2, 3)), 9, 7, focal, focal, 4.5, 3.5)
     _, rays_d = camera.rays()
     lengths = np.linalg.norm(rays_d.astype(np.float64), axis=1)
-    np.testing.assert_allclose(lengths, 1, rtol=0, atol=2**-23)
+    DIRECTIONS.check(lengths, 1.0, of=2.0**-24)

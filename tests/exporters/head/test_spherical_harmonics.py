@@ -7,7 +7,11 @@ import pytest
 
 from exporters.head.spherical_harmonics import sh_monomials
 from player.errors import ConfigError
+from tests.numerics.bounds import Row
 from tests.reference import spherical_harmonics
+
+HARMONICS = Row("Field", "spherical harmonics in float64", "1 to 8 bands, any direction, the axes", 1e-12)
+ORTHONORMAL = Row("Field", "products of two harmonics over the sphere, in float64", "8 bands", 1e-12)
 
 
 def evaluate(dirs: np.ndarray, degree: int) -> np.ndarray:
@@ -26,7 +30,7 @@ def test_agrees_with_angles_and_legendre_functions(degree: int) -> None:
     # Same sign convention on both sides: Condon-Shortley. 1e-12: powers up to 7 with coefficients up to about
     # 200.
     dirs = unit_directions(200)
-    np.testing.assert_allclose(evaluate(dirs, degree), spherical_harmonics(dirs, degree), atol=1e-12)
+    HARMONICS.check(evaluate(dirs, degree), spherical_harmonics(dirs, degree))
 
 
 def test_orthonormal_on_the_sphere() -> None:
@@ -37,7 +41,7 @@ def test_orthonormal_on_the_sphere() -> None:
     root = np.sqrt(1 - z**2)
     y = evaluate(np.stack([root * np.cos(phi), root * np.sin(phi), z], axis=-1), 8)
     weights = np.repeat(weight_z, 16) * (2 * np.pi / 16)
-    np.testing.assert_allclose(y.T @ (weights[:, None] * y), np.eye(64), atol=1e-12)
+    ORTHONORMAL.check(y.T @ (weights[:, None] * y), np.eye(64))
 
 
 def test_constants_of_instant_ngp() -> None:

@@ -17,11 +17,16 @@ from player.asset.density import decode_density, encode_density
 from player.asset.grid import MAX_DISTANCE, build_grid
 from player.asset.pyramid import Pyramid
 from player.asset.single_level import VertexBricks, from_vertices
+from tests.numerics.bounds import Row
 
+DENSITY = Row(
+    "Density and optical depth", "density (player)", "exp(-80) to exp(80), 8 bits of the logarithm", 3e-5,
+    "of it, in float32", "clipped to the manifest's range; no NaN can be stored",
+)  # fmt: skip
 RANGES = [(-2.0, 6.0), (-6.0, 7.0), (-80.0, 80.0), (0.0, 1e-3)]
 
 
-@pytest.mark.parametrize("density_range", RANGES)
+@pytest.mark.parametrize("density_range", RANGES, ids=str)
 def test_every_code_survives_decoding_and_encoding(density_range: tuple[float, float]) -> None:
     codes = np.arange(256)
     low, high = density_range
@@ -30,12 +35,12 @@ def test_every_code_survives_decoding_and_encoding(density_range: tuple[float, f
     sigmas = decode_density(codes, density_range)
     assert sigmas.dtype == np.float32 and np.isfinite(sigmas).all()
     # float32: half an ulp of the exponent (up to 80 * 2^-24), a few of the sum
-    np.testing.assert_allclose(sigmas, np.exp(exact), rtol=3e-5)
+    DENSITY.check(sigmas, np.exp(exact), of=np.exp(exact))
 
 
 def test_codes_are_clipped_and_rounded_to_the_nearest() -> None:
     log_sigmas = np.array([-np.inf, -1e30, 0.49, 0.51, 254.51, 1e30, np.inf])
-    assert encode_density(log_sigmas, (0.0, 255.0)).tolist() == [0, 0, 0, 1, 255, 255, 255]
+    DENSITY.holds(encode_density(log_sigmas, (0.0, 255.0)) == [0, 0, 0, 1, 255, 255, 255])
     assert encode_density(np.zeros((0, 2)), (0.0, 1.0)).shape == (0, 2)
 
 

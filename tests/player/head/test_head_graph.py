@@ -18,9 +18,20 @@ from player.errors import FormatError
 from player.head.graph import PAIR_LIMIT, pair_sums, read_head
 from player.head.head import Head
 from tests.exporters.head.test_onnx_head import inputs, random_head
+from tests.numerics.bounds import Row
 from tests.player.head.heads import head_onnx_of_before, play_in_integers
 
 N_CHANNELS = 8
+PAIRS = Row(
+    "The exported head", "sums of two products of codes, on processors that add them in 16 bits",
+    "features as they come, and of 1e4", unit="the same picture as with wider sums, exactly",
+    at_ends="neighbouring codes of weights add up to 128 at most;"
+    " older heads are run with onnxruntime's wider products",
+)  # fmt: skip
+TOO_LARGE_SUMS = Row(
+    "The exported head", "head whose sums of products may not fit into 32 bits", unit="refused",
+    at_ends="when it is opened",
+)  # fmt: skip
 WEIGHTS = random_head(N_CHANNELS, 32)
 RANGES = list(activation_ranges(WEIGHTS, *inputs(2000, N_CHANNELS)))
 PLAIN, IN_8_BITS = head_onnx(WEIGHTS), head_onnx(WEIGHTS, RANGES)
@@ -168,6 +179,8 @@ def test_heads_in_8_bits_that_are_not_ours(change: Change, message: str, tmp_pat
     model = onnx.load_from_string(IN_8_BITS)
     change(model)
     refused(model.SerializeToString(), tmp_path, message)
+    if "sums of products" in message:
+        TOO_LARGE_SUMS.holds()
 
 
 def varint(value: int) -> bytes:
@@ -256,7 +269,7 @@ def test_a_processor_that_adds_pairs_in_16_bits_shows_the_same(width: int, size:
     head, before = (read_head(data(weights, ranges), "head") for data in (head_onnx, head_onnx_of_before))
     assert before.may_saturate and not head.may_saturate
     exact, there = (play_in_integers(head, features, dirs, kind) for kind in (False, True))
-    assert np.array_equal(exact, there)
+    PAIRS.holds(np.array_equal(exact, there))
     if size > 1:  # and the imitation shows what is avoided
         exact, there = (play_in_integers(before, features, dirs, kind) for kind in (False, True))
         assert np.abs(exact - there).max() > 0.02

@@ -18,12 +18,45 @@ from player.march.bounds import BLOCK
 from player.march.interpolation import Agreement, Quality, Stage, interpolate, stages
 from player.march.pixels import Pixels, Planes, pixels_of_blocks
 from player.render import Frame, Renderer
+from tests.numerics.bounds import Row
 from tests.player.conftest import DENSITY_RANGE, RESOLUTION, STEP, cameras_bytes, head_bytes
 from tests.vertex_grids import arrays_of
 
 QUALITIES: tuple[Quality, ...] = ("exact", "high", "fast")
 LOSSY = QUALITIES[1:]
 MARCHES = ["numpy", pytest.param("numba", marks=pytest.mark.extra)]
+
+REUSE = "Reuse within a frame"
+MEANS = Row(
+    REUSE, "pixel that is the mean of its neighbours", "colour, opacity and depth", 1e-6, "of it, in float64",
+    "empty neighbours, pictures of one pixel, transparent ones; the same pixels as in a loop",
+)  # fmt: skip
+TWINS = Row(
+    REUSE, "numpy and compiled means", "both backgrounds, box and contracted space", unit="the same bytes"
+)
+MARCHED = Row(
+    REUSE, "pixel that is marched in `high` and `fast`", "any background, k = 1 and 5",
+    unit="the bytes it has where every pixel is",
+)  # fmt: skip
+MEAN_OPACITY = Row(REUSE, "mean change of the opacity by reuse", "`high`, `fast`", 0.01)
+HIGH = Row(
+    REUSE, "rgb of `high`, root mean square against `exact`", "analytic shells", 10 ** (-34 / 20), "(34 dB)"
+)
+FAST = Row(
+    REUSE, "rgb of `fast`, root mean square against `exact`", "analytic shells", 10 ** (-28 / 20), "(28 dB)"
+)
+THREADS = Row(
+    REUSE, "tasks, threads, the same frame again", "1 to 3 threads, 1 to 1000 blocks, two frames each",
+    unit="the same bytes", at_ends="a renderer keeps nothing from one frame to the next",
+)  # fmt: skip
+LINE = Row(
+    REUSE, "pictures one pixel wide or high", "1x1, 1x9", unit="the bytes of the whole picture",
+    at_ends="no pixel has four neighbours",
+)  # fmt: skip
+WIRE = Row(
+    REUSE, "wire one pixel wide between the pixels of the lattice", "an odd row, an odd column",
+    unit="does not vanish", at_ends="8 pixels of it in a row have one of opacity over 0.5",
+)  # fmt: skip
 
 
 def random_planes(n_pixels: int, random: np.random.Generator) -> Planes:
@@ -93,10 +126,14 @@ def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality, contr
 
 
 @pytest.mark.parametrize(
-    "function", [interpolate, pytest.param(compiled.interpolate, marks=pytest.mark.extra)]
+    "function",
+    [
+        pytest.param(interpolate, id="numpy"),
+        pytest.param(compiled.interpolate, id="numba", marks=pytest.mark.extra),
+    ],
 )
-@pytest.mark.parametrize("transparent", [False, True])
-@pytest.mark.parametrize("size", [(1, 1), (2, 1), (7, 9), (33, 18)])
+@pytest.mark.parametrize("transparent", [False, True], ids=["background", "transparent"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (7, 9), (33, 18)], ids=str)
 def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int, int]) -> None:  # type: ignore[no-untyped-def]
     random = np.random.default_rng(3)
     kept = filled = 0
@@ -118,7 +155,7 @@ def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int,
                 kept += 1
             else:
                 got = [*planes.rgb[at], planes.opacity[at], planes.depth[at]]
-                np.testing.assert_allclose(got, expected, rtol=1e-6, atol=0)
+                MEANS.check(got, expected, of=np.abs(expected))
                 filled += 1
     assert kept > 0 and (filled > 20 or size[0] * size[1] < 70)
 
@@ -133,7 +170,7 @@ def test_compiled_code_gives_the_same_bits(transparent: bool) -> None:
                 planes = random_planes(40 * 30, np.random.default_rng(seed))
                 rest = function(planes, (40, 30), all_pixels(40, 30, stage), stage, transparent)
                 both.append([rest, *planes])
-            assert all(a.tobytes() == b.tobytes() for a, b in zip(*both, strict=True))
+            TWINS.holds([a.tobytes() == b.tobytes() for a, b in zip(*both, strict=True)])
 
 
 def render(asset: Asset, camera: Camera, quality: Quality, march: str = "numpy", **settings: object) -> Frame:
@@ -157,7 +194,11 @@ def camera(asset: Asset) -> Camera:
 
 @pytest.mark.parametrize("march", MARCHES)
 @pytest.mark.parametrize("quality", LOSSY)
-@pytest.mark.parametrize("settings", [{}, {"background": "transparent"}, {"n_fetches": 1}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"background": "transparent"}, {"n_fetches": 1}],
+    ids=["usual", "transparent", "one fetch"],
+)
 def test_marched_pixels_are_those_of_the_whole_picture(
     march: str, quality: Quality, settings: dict, asset: Asset, camera: Camera
 ) -> None:
@@ -174,13 +215,13 @@ def test_marched_pixels_are_those_of_the_whole_picture(
     lattice[::step, ::step] = True
     same = marched | lattice
     for name in ("rgb", "opacity", "depth", "n_density_samples"):
-        assert getattr(other, name)[same].tobytes() == getattr(whole, name)[same].tobytes(), name
-    assert np.abs(other.opacity - exact.opacity).mean() < 0.01
+        MARCHED.holds(getattr(other, name)[same].tobytes() == getattr(whole, name)[same].tobytes())
+    MEAN_OPACITY.check(np.abs(other.opacity - exact.opacity).mean())
     a, b = (
         frame.rgb * (frame.opacity[..., None] if settings.get("background") else 1)
         for frame in (exact, other)
     )
-    assert -10 * np.log10(np.mean((a - b) ** 2)) > (34 if quality == "high" else 28)
+    (HIGH if quality == "high" else FAST).check(np.sqrt(np.mean((a - b) ** 2)))
 
 
 @pytest.mark.parametrize("march", MARCHES)
@@ -195,7 +236,7 @@ def test_threads_and_tasks_do_not_change_a_bit(
             frames += [renderer.render(camera, quality=quality) for _ in range(2)]
     for frame in frames[1:]:
         for name in ("rgb", "opacity", "depth", "n_density_samples"):
-            assert getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes(), name
+            THREADS.holds(getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes())
 
 
 @pytest.mark.parametrize("quality", LOSSY)
@@ -204,7 +245,7 @@ def test_small_pictures(quality: Quality, size: tuple[int, int], asset: Asset, c
     whole, other = (of(asset, camera.resized(*size), quality) for of in (render_all, render))
     assert other.rgb.shape == whole.rgb.shape and np.isfinite(other.rgb).all()
     if min(size) == 1:  # no pixel has four neighbours
-        assert other.rgb.tobytes() == whole.rgb.tobytes()
+        LINE.holds(other.rgb.tobytes() == whole.rgb.tobytes())
 
 
 @pytest.mark.parametrize("quality", LOSSY)
@@ -266,4 +307,5 @@ def test_a_wire_between_the_pixels_of_the_lattice_does_not_vanish(
     for wire, found in ((seen[row], other.opacity[row]), (seen[:, column], other.opacity[:, column])):
         places = np.flatnonzero(wire)
         pieces = [found[first : first + BLOCK] for first in places[: 1 - BLOCK]]
-        assert len(pieces) > 8 and all(piece.max() > 0.5 for piece in pieces)
+        assert len(pieces) > 8
+        WIRE.holds([piece.max() > 0.5 for piece in pieces])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.numerics.bounds import Row
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.networks import Head
 from vfr_bake.kernels import njit
@@ -23,6 +24,34 @@ from vfr_bake.kernels.head.bfloat16 import as_array, fast_products, get, put
 
 HARD = np.array([0.0, -0.0, 1e-42, -1e-42, 1.0, -1.0, 7.9, -7.9, 8.1, -8.1, 90.0, -90.0, 1e18, -1e18])
 
+KERNELS = "The head in training"
+GELU = Row(
+    KERNELS, "GELU in float32", "-13 to 13 and ±1e18, subnormal too", 1e-6, "times (1 + its size)",
+    "NaN stays NaN; subnormal only where its argument is",
+)  # fmt: skip
+SLOPE = Row(KERNELS, "slope of GELU in float32", "the same", 5e-7)
+ROUNDED = Row(
+    KERNELS, "rounding to bfloat16 and back", "all of float32", unit="torch's bits",
+    at_ends="ties to even; NaN, infinite and subnormal numbers too",
+)  # fmt: skip
+BFLOAT16_GELU = Row(
+    KERNELS, "GELU and its slope in bfloat16", "-13 to 13 and ±1e18", 2**-8, "of it, and 1e-6"
+)
+BFLOAT16_BASIS = Row(
+    KERNELS, "products with the harmonics in bfloat16", "normal numbers", 2**-8, "of it, and 1e-6", "no ray"
+)
+BASIS = Row(
+    KERNELS, "products with the harmonics in float32", "normal numbers", 2**-22, "of it, and 1e-6", "no ray"
+)
+FLOAT32_HEAD = Row(
+    KERNELS, "colours and gradients of the whole head in float32", "64 wide", 1e-5, "of their length",
+    "rays without a gradient",
+)  # fmt: skip
+BFLOAT16_HEAD = Row(
+    KERNELS, "colours and gradients of the whole head with products in bfloat16", "the same", 10 * 2**-9,
+    "of their length", "rays without a gradient; pictures are shown in float32",
+)  # fmt: skip
+
 
 def test_gelu_and_its_slope_match_float64() -> None:
     x = np.concatenate([np.linspace(-12, 12, 4000), HARD]).astype(np.float32).reshape(2, -1)
@@ -35,8 +64,8 @@ def test_gelu_and_its_slope_match_float64() -> None:
     ours, slopes = x.copy(), np.empty_like(x)
     gelu(ours, bias, slopes)
     # The sum with the bias is rounded, too: seven digits of numbers up to 13.
-    np.testing.assert_allclose(ours, values.detach().numpy(), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(slopes, expected.grad.numpy(), rtol=0, atol=5e-7)
+    GELU.check(ours, values.detach(), of=values.detach().abs() + 1)
+    SLOPE.check(slopes, expected.grad)
     assert not (ours[(ours != 0) & (np.abs(x) > 1e-30)] == 0).any()
     tiny = np.abs(np.concatenate([ours, slopes])) < np.finfo(np.float32).tiny
     assert np.abs(np.concatenate([ours, slopes]))[tiny].max() <= 1e-42, "subnormal only where x is"
@@ -45,7 +74,7 @@ def test_gelu_and_its_slope_match_float64() -> None:
 def test_gelu_keeps_nan_and_takes_nothing() -> None:
     x, slopes = np.full((1, 3), np.nan, np.float32), np.empty((1, 3), np.float32)
     gelu(x, np.zeros(3, np.float32), slopes)
-    assert np.isnan(x).all() and np.isnan(slopes).all()
+    GELU.holds(np.isnan(x) & np.isnan(slopes))
     gelu(np.empty((0, 3), np.float32), np.zeros(3, np.float32), np.empty((0, 3), np.float32))
     grad_bias = np.ones(3, np.float32)
     gelu_backward(np.empty((0, 3), np.float32), slopes, np.empty(0, np.int64), grad_bias)
@@ -68,6 +97,7 @@ def test_kernels_round_to_bfloat16_as_torch_does() -> None:
     torch.testing.assert_close(rounded, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
     copy(as_array(rounded), as_array(again))
     torch.testing.assert_close(again, rounded.float(), rtol=0, atol=0, equal_nan=True)
+    ROUNDED.holds()
 
 
 def test_which_processors_multiply_in_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,8 +121,8 @@ def test_activations_in_bfloat16_are_those_of_float64_rounded() -> None:
     ours, slopes = x.clone(), torch.empty(2, x.shape[1]).bfloat16()
     gelu(as_array(ours), bias, as_array(slopes[1:]))
     # Half of the last of eight binary digits, beside what float32 is allowed.
-    torch.testing.assert_close(ours[0].double(), values.detach(), rtol=2**-8, atol=1e-6)
-    torch.testing.assert_close(slopes[1].double(), exact.grad, rtol=2**-8, atol=1e-6)
+    for found, wanted in ((ours[0], values.detach()), (slopes[1], exact.grad)):
+        BFLOAT16_GELU.check(found.double(), wanted, of=wanted.abs() + 1e-6 * 2**8)
     grad = torch.full_like(x, 3.0)
     grad_bias = np.empty(x.shape[1], np.float32)
     gelu_backward(as_array(grad), as_array(slopes), rows, grad_bias)
@@ -100,7 +130,7 @@ def test_activations_in_bfloat16_are_those_of_float64_rounded() -> None:
     np.testing.assert_array_equal(grad_bias, grad[0].float().numpy())
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
 def test_products_with_the_basis_match_float64(kind: torch.dtype) -> None:
     torch.manual_seed(0)
     rows = torch.tensor([4, 0, 2])
@@ -117,9 +147,9 @@ def test_products_with_the_basis_match_float64(kind: torch.dtype) -> None:
     times_basis(as_array(x), bias.numpy(), basis.numpy())
     times_basis_backward(as_array(grad), basis.numpy(), rows.numpy(), grad_bias.numpy())
     # Half of the last of eight binary digits (of 24, twice).
-    digits = 2**-8 if kind == torch.bfloat16 else 2**-22
-    torch.testing.assert_close(x.double(), expected, rtol=digits, atol=1e-6)
-    torch.testing.assert_close(grad.double(), expected_grad, rtol=digits, atol=1e-6)
+    row, digits = (BFLOAT16_BASIS, 2**-8) if kind == torch.bfloat16 else (BASIS, 2**-22)
+    for found, wanted in ((x, expected), (grad, expected_grad)):
+        row.check(found.double(), wanted, of=wanted.abs() + 1e-6 / digits)
     torch.testing.assert_close(grad_bias.double(), expected_grad.sum(dim=0), rtol=0, atol=9 * digits)
     nothing = np.empty((0, 7), np.float32), np.empty((0, 4), np.float32)
     times_basis(nothing[0], bias.numpy(), nothing[1])
@@ -204,8 +234,8 @@ def test_fused_head_in_bfloat16_is_near_float64() -> None:
     for our, single, their in zip(ours, in_float32, theirs, strict=True):
         # Factors are rounded by 2^-9 in each of five layers, forward and back.
         assert our.dtype == torch.float32
-        assert float((our - their).norm()) <= 10 * 2**-9 * float(their.norm())
-        assert float((single - their).norm()) <= 1e-5 * float(their.norm())
+        BFLOAT16_HEAD.check((our - their).norm(), of=their.norm())
+        FLOAT32_HEAD.check((single - their).norm(), of=their.norm())
     assert (ours[0] != in_float32[0]).any() and not ours[1][1::3].any()
     with torch.no_grad():  # pictures are shown by the weights as they are
         torch.testing.assert_close(head(features, dirs), in_float32[0], rtol=0, atol=0)

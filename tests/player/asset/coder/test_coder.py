@@ -28,7 +28,38 @@ from player.asset.coder.tables import (
     unpack_tables,
 )
 from player.errors import FormatError, ShapeError
+from tests.numerics.bounds import Row
 from tests.player.asset.coder.oracle import Oracle
+
+CODER = "The entropy coder"
+ROUND_TRIP = Row(
+    CODER, "symbols, by both twins and an oracle of plain integers", "-255 to 255, none to 5,000 rows", 0,
+    at_ends="symbols beyond ±62 take bytes of their own; no row or no channel is no byte",
+)  # fmt: skip
+TABLES = Row(
+    CODER, "frequencies of a table", "any counts, contexts that never come", 0,
+    at_ends="they add up to 4096, and every symbol that was seen has at least 1",
+)  # fmt: skip
+CONTEXTS = Row(
+    CODER, "context from a sum of three neighbours, against that from themselves", "-63 to 63 each", 0,
+    at_ends="all at one end: the last contexts",
+)  # fmt: skip
+SIZE = Row(
+    CODER, "bytes, as a share of the entropy without contexts", "200,000 symbols that lean on neighbours",
+    0.97,
+)  # fmt: skip
+OUT_OF_RANGE = Row(
+    CODER, "symbols out of range, arrays that do not fit", unit="refused", at_ends="when encoding"
+)
+BROKEN_BYTES = Row(
+    CODER, "broken bytes", "each field of the header, tables, states and words", unit="refused",
+    at_ends="both twins with the same message; tables of 10 MB are not unpacked",
+)  # fmt: skip
+CHANGED = Row(
+    CODER, "any changed or random bytes", "up to 4 bytes changed, cut or added; none to 300 random bytes",
+    unit="the same from both twins",
+)  # fmt: skip
+DAMAGED_WORD = Row(CODER, "one bit changed in the states or words", "300 places", unit="refused")
 
 TWINS = ["numpy", "numba"]
 
@@ -94,10 +125,10 @@ def test_what_was_encoded_is_decoded(name: str, twin: ModuleType) -> None:
     symbols, neighbours, classes, n_classes = case(*CASES[name])
     data = encode(symbols, neighbours, classes, n_classes)
     found = decode(data, neighbours, classes, n_classes, "here")
-    assert found.dtype == np.int16 and found.shape == symbols.shape
-    assert np.array_equal(found, symbols)
+    assert found.dtype == np.int16
+    ROUND_TRIP.check(found, symbols)
     if symbols.size:
-        assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+        ROUND_TRIP.check(oracle(data, neighbours, classes, n_classes), symbols)
     else:
         assert data == b""
 
@@ -107,8 +138,8 @@ def test_ends(value: int, twin: ModuleType) -> None:
     symbols, neighbours, classes, n_classes = case(700, 2, 1.0)
     symbols[::9, 0], symbols[5:9, 1] = value, value
     data = encode(symbols, neighbours, classes, n_classes)
-    assert np.array_equal(decode(data, neighbours, classes, n_classes, "here"), symbols)
-    assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+    ROUND_TRIP.check(decode(data, neighbours, classes, n_classes, "here"), symbols)
+    ROUND_TRIP.check(oracle(data, neighbours, classes, n_classes), symbols)
 
 
 @given(
@@ -125,8 +156,8 @@ def test_any_symbols(n: int, n_channels: int, scale: float, seed: int) -> None:
     for name in TWINS:
         with pytest.MonkeyPatch.context() as patch:
             use(name, patch)
-            assert np.array_equal(decode(data, neighbours, classes, n_classes, "here"), symbols)
-    assert np.array_equal(oracle(data, neighbours, classes, n_classes), symbols)
+            ROUND_TRIP.check(decode(data, neighbours, classes, n_classes, "here"), symbols)
+    ROUND_TRIP.check(oracle(data, neighbours, classes, n_classes), symbols)
 
 
 def test_bytes_are_as_few_as_the_contexts_allow() -> None:
@@ -134,7 +165,7 @@ def test_bytes_are_as_few_as_the_contexts_allow() -> None:
     data = encode(symbols, neighbours, classes, n_classes)
     share = np.bincount(symbols[:, 0] + 255) / len(symbols)
     order_0 = -(share[share > 0] * np.log2(share[share > 0])).sum() * len(symbols) / 8
-    assert len(data) < 0.97 * order_0
+    SIZE.check(len(data), of=order_0)
     # a section of one symbol alone costs its tables and four bytes a lane
     zeros = encode(np.zeros_like(symbols), neighbours, classes, n_classes)
     assert len(zeros) < 4 * (200_000 >> 12) + 80
@@ -144,7 +175,7 @@ def test_contexts_by_their_sums() -> None:
     random = np.random.default_rng(0)
     symbols = random.integers(-END, END + 1, (3, 10000)) // random.integers(1, 40, 10000)
     sums = MIXED[symbols + END].astype(int).sum(axis=0)
-    assert np.array_equal(CONTEXT_OF_SUM[sums + 64], context(symbols))
+    CONTEXTS.check(CONTEXT_OF_SUM[sums + 64], context(symbols))
     assert context(np.full((3, 1), END)) == 80 and context(np.full((3, 1), -END)) == 72
 
 
@@ -154,7 +185,8 @@ def test_tables_cost_what_they_say() -> None:
     seen[:, 1] = 0  # contexts that never come
     seen[0, 0, 5, 0] = 10**6  # and one that comes for nothing else
     tables, n_bits = fit_tables(seen)
-    assert (tables.counts.sum(axis=1) == TOTAL).all()
+    assert TOTAL == 4096
+    TABLES.check(tables.counts.sum(axis=1), TOTAL)
     counts = tables.counts[tables.of_context].astype(float)
     assert (counts[seen > 0] > 0).all()
     assert n_bits == pytest.approx((seen[seen > 0] * (12 - np.log2(counts[seen > 0]))).sum())
@@ -186,6 +218,7 @@ def test_what_cannot_be_encoded(wrong: Callable[..., tuple]) -> None:
     symbols, neighbours, classes, _ = case(100, 2, 1.0)
     with pytest.raises(ShapeError, match="coder: "):
         encode(*wrong(symbols, neighbours, classes))
+    OUT_OF_RANGE.holds()
 
 
 # ---------------------------------------------------------------------------------------------- broken bytes
@@ -263,7 +296,7 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_bytes(name: str) -> None:
     data, said = BROKEN[name]
-    assert said in refused(data)
+    BROKEN_BYTES.holds(said in refused(data))
 
 
 @given(
@@ -279,7 +312,7 @@ def test_changed_bytes(cut: int, changes: list[tuple[int, int]], more: bytes) ->
         data[at] ^= by
     data = bytes(data if cut % 3 else data[:cut]) + more
     found, other = (outcome(data, name) for name in TWINS)
-    assert found == other
+    CHANGED.holds(found == other)
     if isinstance(found, bytes) and data[: len(data) - 40] != WHOLE[: len(data) - 40]:
         assert found == SYMBOLS.tobytes() or data[:12] == WHOLE[:12]
 
@@ -290,7 +323,7 @@ def test_random_bytes(content: bytes, n_lanes: int) -> None:
     packed = WHOLE[12:STATES]
     for data in (content, struct.pack("<III", n_lanes, N_PACKED, 7) + packed + content):
         found, other = (outcome(data, name) for name in TWINS)
-        assert found == other
+        CHANGED.holds(found == other)
 
 
 def test_no_damaged_word_passes() -> None:
@@ -301,6 +334,7 @@ def test_no_damaged_word_passes() -> None:
         data = bytearray(WHOLE)
         data[random.integers(begin, end)] ^= 1 << random.integers(0, 8)
         refused(bytes(data))
+    DAMAGED_WORD.holds()
 
 
 def test_channels_are_read_one_by_one_and_all_of_them(twin: ModuleType) -> None:

@@ -1,0 +1,90 @@
+"""docs/numerics.md from the rows that the tests declare and the worst cases that they have met.
+
+<!-- numerics: SECTION -->
+the table of the rows of this section
+<!-- /numerics -->
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from pathlib import Path
+
+from tests.numerics.bounds import Met, Row
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+PAGE = REPOSITORY / "docs" / "numerics.md"
+WORST = PAGE.with_suffix(".json")
+BLOCK = re.compile(r"(<!-- numerics: ([^>]+) -->\n).*?(<!-- /numerics -->)", re.DOTALL)
+DECLARES = re.compile(r"^[A-Z][A-Z0-9_]* = Row\(", re.MULTILINE)
+HEADER = (
+    "| quantity | range | bound | worst met | at its ends | test |",
+    "|---|---|---|---|---|---|",
+)
+
+
+def modules() -> list[str]:
+    """The test modules that declare rows."""
+    paths = sorted((REPOSITORY / "tests").rglob("test_*.py"))
+    found = [path for path in paths if DECLARES.search(path.read_text(encoding="utf-8"))]
+    return [".".join(path.relative_to(REPOSITORY).with_suffix("").parts) for path in found]
+
+
+def declared() -> dict[str, list[tuple[str, Row]]]:
+    """The name and the row of all that a module declares, in its order."""
+    return {
+        module: [
+            (name, row) for name, row in vars(importlib.import_module(module)).items() if isinstance(row, Row)
+        ]
+        for module in modules()
+    }
+
+
+def line(row: Row, tests: dict[str, dict]) -> str:
+    """The row of the table.
+
+    >>> entry = {"tests/numerics/test_rays.py::test_entry": {"worst": 2.512, "case": "along x"}}
+    >>> line(Row("Rays", "entry", "any", 8, "u", "exact"), entry)
+    '| entry | any | 8 u | 2.5 (`along x`) | exact | `tests/numerics/test_rays.py`: `test_entry` |'
+    """
+    bound = row.unit if row.bound is None else f"{row.bound:.4g} {row.unit}".strip() if row.bound else "exact"
+    numbers = [entry for entry in tests.values() if entry["worst"] is not None]
+    met = ""
+    if numbers:
+        worst = max(numbers, key=lambda entry: entry["worst"])
+        met = f"{worst['worst']:.2g}" + (f" (`{worst['case']}`)" if worst["case"] and worst["worst"] else "")
+    names: dict[str, list[str]] = {}
+    for test in sorted(tests):
+        path, _, name = test.partition("::")
+        names.setdefault(path, []).append(f"`{name}`")
+    where = "; ".join(f"`{path}`: {', '.join(found)}" for path, found in names.items())
+    return f"| {row.quantity} | {row.range} | {bound} | {met} | {row.at_ends} | {where} |"
+
+
+def rendered(text: str, rows: list[Row], met: Met) -> str:
+    """The page with its tables made anew."""
+
+    def block(found: re.Match[str]) -> str:
+        lines = [
+            line(row, met.get(row.section, {}).get(row.quantity, {}))
+            for row in rows
+            if row.section == found[2]
+        ]
+        return "\n".join([found[1], *HEADER, *lines, "", found[3]])
+
+    return BLOCK.sub(block, text)
+
+
+def read_worst() -> Met:
+    return json.loads(WORST.read_text(encoding="utf-8"))
+
+
+def main() -> None:
+    rows = [row for found in declared().values() for _, row in found]
+    PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8"), rows, read_worst()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

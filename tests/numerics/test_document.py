@@ -1,0 +1,127 @@
+"""docs/numerics.md promises what the tests declare, no more, and has the worst cases that they have met."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests import conftest
+from tests.numerics import bounds
+from tests.numerics.bounds import Row
+from tests.numerics.document import BLOCK, PAGE, REPOSITORY, declared, read_worst, rendered
+
+ROWS = [row for found in declared().values() for _, row in found]
+
+
+def test_the_page_is_what_rows_and_worst_cases_give() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert rendered(text, ROWS, read_worst()) == text, "run: make numerics"
+    assert sorted({row.section for row in ROWS}) == sorted(found[2] for found in BLOCK.finditer(text))
+    lines = [line for found in BLOCK.finditer(text) for line in found[0].splitlines() if line.startswith("|")]
+    assert {line.count("|") for line in lines} == {7}
+
+
+def test_every_row_was_met_within_its_bound_and_there_is_no_other() -> None:
+    met = read_worst()
+    found = [(section, quantity) for section, rows in met.items() for quantity in rows]
+    assert sorted(found) == sorted((row.section, row.quantity) for row in ROWS), "run: make numerics"
+    for row in ROWS:
+        worst = [entry["worst"] for entry in met[row.section][row.quantity].values()]
+        numbers = [number for number in worst if number is not None]
+        assert bool(numbers) == (row.bound is not None) and all(n <= (row.bound or 0) for n in numbers), row
+
+
+def test_every_row_is_checked_where_it_is_declared_by_tests_that_exist() -> None:
+    met = read_worst()
+    for name, rows in declared().items():
+        module = importlib.import_module(name)
+        source = Path(str(module.__file__)).read_text(encoding="utf-8")
+        path = name.replace(".", "/") + ".py"
+        for constant, row in rows:
+            assert len(re.findall(rf"\b{constant}\b", source)) > 1, f"{path}: {constant}"
+            for test in met[row.section][row.quantity]:
+                file, _, function = test.partition("::")
+                assert file == path and callable(getattr(module, function)), test
+
+
+# What a row does ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def row(monkeypatch: pytest.MonkeyPatch) -> Row:
+    monkeypatch.setattr(bounds, "MET", {})
+    return Row("Section", "quantity", bound=2.0, unit="u")
+
+
+@pytest.mark.parametrize("case", ["one"])
+def test_the_worst_case_is_kept(row: Row, case: str) -> None:
+    row.check([1.0, 2.0], [1.0, 2.5], of=0.5)
+    row.check(-1.5)
+    row.check(np.zeros((0, 3)), np.zeros((0, 3)))
+    row.holds([True, True])
+    test = "tests/numerics/test_document.py::test_the_worst_case_is_kept"
+    assert bounds.MET == {"Section": {"quantity": {test: {"worst": 1.5, "case": case}}}}
+
+
+@pytest.mark.parametrize(
+    ("found", "wanted", "of"),
+    [
+        (2.1, 0.0, 1.0),
+        (math.nan, 0.0, 1.0),
+        (math.nan, math.nan, 1.0),
+        (0.0, math.inf, math.inf),
+        (math.inf, -math.inf, 1.0),
+        (math.inf, 0.0, math.inf),
+        (1.0, 0.0, 0.0),
+        (1.0, 0.0, math.nan),
+        ([0.0, 3.0], [0.0, 0.0], 1.0),
+        ([0.0], [0.0, 0.0], 1.0),
+    ],
+)
+def test_what_is_beyond_the_bound_fails(row: Row, found: object, wanted: object, of: float) -> None:
+    with pytest.raises(AssertionError, match="quantity: "):
+        row.check(found, wanted, of)
+    assert bounds.MET == {}
+
+
+@pytest.mark.parametrize("number", [0.0, 1e300, math.inf, -math.inf])
+def test_equal_numbers_have_no_error(row: Row, number: float) -> None:
+    row.check(number, number, of=0.0)
+
+
+def test_what_does_not_hold_fails(row: Row) -> None:
+    for wrong in (False, [True, False]):
+        with pytest.raises(AssertionError, match="quantity: expected u"):
+            row.holds(wrong)
+
+
+def test_a_worker_hands_over_what_it_has_met(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(bounds, "MET", {"A": {"a": {"x": {"worst": 1.0, "case": ""}}}})
+    conftest.pytest_testnodedown(SimpleNamespace(workeroutput={"numerics": {"A": {"b": {"y": {}}}}}))
+    conftest.pytest_testnodedown(SimpleNamespace())
+    assert sorted(bounds.MET["A"]) == ["a", "b"]
+    path = tmp_path / "worst.json"
+    bounds.write(path, {"A": {"a": {"old": {}}}})
+    bounds.write(path, bounds.MET)
+    assert sorted(json.loads(path.read_text(encoding="utf-8"))["A"]["a"]) == ["old", "x"]
+
+
+@pytest.mark.parametrize("workers", [[], ["-n", "2"]], ids=["alone", "workers"])
+def test_a_run_writes_what_it_has_met(workers: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "worst.json"
+    test = "tests/numerics/test_quantisation_and_pictures.py::test_8_bit_rounding_at_every_joint"
+    command = [sys.executable, "-m", "pytest", "-q", "--numerics", str(path), *workers, test]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert json.loads(path.read_text(encoding="utf-8"))["Pictures"]["8-bit values"] == {
+        test: {"worst": 0, "case": ""}
+    }
