@@ -27,6 +27,8 @@ from player.asset.bricks import BRICK, bricks_per_axis, stored_bits
 from player.asset.prediction.prediction import Places, values_from
 
 MAX_LEVELS = 8
+_ROWS_AT_ONCE = 1 << 18
+"""Vertices whose symbols are found at once: what is computed meanwhile is eight times as wide as they are."""
 
 _Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
 _ONE, _SEVEN, _EIGHT, _FIFTY_SIX = (np.uint64(n) for n in (1, 7, 8, 56))
@@ -399,14 +401,18 @@ def symbols_of(
     found: list[np.ndarray] = []
     coarse: np.ndarray | None = None
     for level in reversed(range(len(vertices))):
-        here, stored = vertices[level], ~vertices[level].on_border
+        here, rows = vertices[level], np.flatnonzero(~vertices[level].on_border)
         if coarse is None:
             values = np.zeros(wanted[level].shape, np.int16)
         else:
             values = predicted(here, vertices[level + 1], coarse)
-        away = np.rint((np.clip(wanted[level][stored], *limits) - values[stored]) / steps[level])
-        symbols = away.astype(np.int16)
-        values[stored] = np.clip(values[stored] + steps[level] * symbols.astype(np.int32), *limits)
+        symbols = np.empty((len(rows), values.shape[1]), np.int16)
+        for first in range(0, len(rows), _ROWS_AT_ONCE):
+            some = slice(first, first + _ROWS_AT_ONCE)
+            before = values[rows[some]].astype(np.int32)
+            away = np.rint((np.clip(wanted[level][rows[some]], *limits) - before) / steps[level])
+            symbols[some] = away
+            values[rows[some]] = np.clip(before + steps[level] * away.astype(np.int32), *limits)
         found.append(symbols)
         coarse = values
     return found[::-1]

@@ -99,9 +99,10 @@ def encode(
         index = lanes.in_order(named.astype(np.int32) * N_SYMBOLS + rows[channel] + END)
         words += _encode_channel(states, counts.reshape(-1)[index], first[index])
     stream = np.concatenate(words[::-1]) if words else np.zeros(0, np.uint16)
-    beyond = np.abs(symbols.T.astype(np.int64)) - END
+    sizes = np.abs(symbols.T.astype(np.int16))
+    beyond = sizes[sizes >= END] - END
     packed = found.packed()
-    parts = (states.astype("<u4"), stream.astype("<u2"), beyond[beyond >= 0].astype(np.uint8))
+    parts = (states.astype("<u4"), stream.astype("<u2"), beyond.astype(np.uint8))
     header = _HEADER.pack(lanes.n_lanes, len(packed), len(stream))
     return header + packed + b"".join(part.tobytes() for part in parts)
 
