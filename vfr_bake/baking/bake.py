@@ -157,11 +157,13 @@ class _Bake:
         with self._part("detail"):
             needed = self._needed(detail, layout, stored, teacher)
         self.left_out |= detail.left_out
+        layout, weights = needed.layout, stored.head
+        del stored, again  # they hold the features, and the cells that hardly anything sees
         with self._part("codes"):
-            arrays = self._spend(stored.head, needed, teacher, tuning.ranges, len(head))
-            level_steps = detail.level_steps(needed.layout.played(arrays))
+            arrays = self._spend(weights, needed, teacher, tuning.ranges, len(head))
+            level_steps = detail.level_steps(layout.played(arrays))
         manifest = self._manifest(layout, arrays, {}, level_steps)
-        del teacher, needed, stored, layout, again  # what is written is played and meshed in their room
+        del teacher, needed, layout  # what is written is played and meshed in their room
         figures: dict[str, Any] = {
             "n_vertices": int(arrays.densities.first_rows[-1]),
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
@@ -307,7 +309,7 @@ class _Bake:
         matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
         refined = held_out.look("refined", grid, head, self.n_fetches)
         allowed = self._allowed(self.choice.code_loss_db, refined)
-        del grid
+        del grid, stored
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []

@@ -214,7 +214,7 @@ class Choices:
             else:
                 predicted = np.zeros(vertices.n, np.int16)
             inside = ~vertices.on_border  # what is on the border has no symbol
-            wanted = np.clip(self._wanted[level][:, number], *self._limits)[inside]
+            wanted = np.clip(self._wanted[level][inside, number].astype(np.float32), *self._limits)
             weights, near = self._weights[level][inside] * factor, np.zeros(len(wanted) + 1, np.int16)
             values, cost = np.empty(len(wanted), np.int16), first_bits()
             for _ in range(TURNS):

@@ -62,20 +62,25 @@ class LevelsOfFeatures:
         return replace(self.grid, rows=replace(rows, bricks=bricks))
 
 
-def levels_of_features(grid: SparseGrid, pyramid: Pyramid, values: Sequence[np.ndarray]) -> LevelsOfFeatures:
-    """The features `values` of the finest levels of a pyramid, int8 [n_vertices, n_channels] each."""
-    found = [vertex_rows(alone(pyramid, level)) for level in range(len(values))]
+def levels_of_features(
+    grid: SparseGrid, pyramid: Pyramid, codes: np.ndarray, n_levels: int
+) -> LevelsOfFeatures:
+    """The features of the `n_levels` finest levels of a pyramid: `codes` int8 [n_vertices, n_channels], one
+    level's after the other's."""
+    found = [vertex_rows(alone(pyramid, level)) for level in range(n_levels)]
     numbers = finest_numbers(pyramid, found[0].n_per_axis)
     entries, rows = [], []
     n_bricks = n_rows = 0
-    for level, (of_level, codes) in enumerate(zip(found, values, strict=True)):
+    for level, of_level in enumerate(found):
         at = of_level.bricks[numbers] >> 3
         entries.append((at + n_bricks) << 3 | level)
         rows.append(np.where(of_level.rows >= 0, of_level.rows + np.int32(n_rows), -1).astype(np.int32))
-        n_bricks, n_rows = n_bricks + len(of_level.rows) // 729, n_rows + len(codes)
+        n_bricks += len(of_level.rows) // 729
+        n_rows += pyramid.vertices[level].n
     together = replace(found[0], rows=np.concatenate(rows))
-    grid = replace(grid, rows=together, features=np.concatenate(values))
-    return LevelsOfFeatures(grid, np.array(entries, np.int32), numbers)
+    return LevelsOfFeatures(
+        replace(grid, rows=together, features=codes[:n_rows]), np.array(entries, np.int32), numbers
+    )
 
 
 @dataclass(frozen=True, eq=False)

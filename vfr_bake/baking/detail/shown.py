@@ -171,7 +171,7 @@ class Wanted(NamedTuple):
     pyramid: Pyramid
     """The cells that are left."""
     values: list[np.ndarray]
-    """For each level [n_vertices, n_channels] float32."""
+    """For each level [n_vertices, n_channels] float32 or float16."""
 
 
 def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, sampled: bool) -> Wanted:

@@ -54,7 +54,7 @@ def test_the_error_of_a_feature_brick_is_what_the_march_shows_differently(
     grid = layout.grid(faint(layout, 5)[:, 0], codes)
     pyramid, rays = pyramid_beneath(layout.features.pyramid), rays_of(2)
     values = [encode_features(v) for v in mean_values(pyramid, codes, np.ones(len(codes)))]
-    levels = levels_of_features(grid, pyramid, values[:3])
+    levels = levels_of_features(grid, pyramid, np.concatenate(values[:3]), 3)
     errors = feature_errors(levels, rays)
     assert errors.shape == (3, len(pyramid.levels[0])) and not errors[0].any()
 
@@ -199,7 +199,7 @@ def test_what_is_seen_counts_in_the_means() -> None:
     codes = np.zeros((len(layout.features), 1), np.int8)
     grid = layout.grid(np.full(len(layout.densities), 255, np.float32), codes)
     pyramid = pyramid_beneath(layout.features.pyramid)
-    heavy = heavy_vertices(levels_of_features(grid, pyramid, [codes]), len(codes), rays_of(4))
+    heavy = heavy_vertices(levels_of_features(grid, pyramid, codes, 1), len(codes), rays_of(4))
     assert (heavy > 0).all() and heavy.max() > 50 * heavy.min()
     coarse = pyramid.vertices[1]
     finest = np.random.default_rng(0).integers(-99, 99, (len(codes), 1)).astype(np.int8)
