@@ -406,7 +406,7 @@ def symbols_of(
             values = np.zeros(wanted[level].shape, np.int16)
         else:
             values = predicted(here, vertices[level + 1], coarse)
-        symbols = np.empty((len(rows), values.shape[1]), np.int16)
+        symbols = np.empty((len(rows), wanted[level].shape[1]), np.int16)
         for first in range(0, len(rows), _ROWS_AT_ONCE):
             some = slice(first, first + _ROWS_AT_ONCE)
             before = values[rows[some]].astype(np.int32)
