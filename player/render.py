@@ -160,7 +160,8 @@ class Renderer:
                 can have.
             background: colour 0..1 or "transparent"; the asset's own if None.
             quality: "exact" marches every pixel; "high" and "fast" interpolate those between neighbours that
-                agree, and end rays earlier (`player.march.interpolation`).
+                agree, and end rays earlier (`player.march.interpolation`), as far as the asset's `agreement`
+                allows.
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
@@ -174,9 +175,11 @@ class Renderer:
         if background is None:
             red, green, blue = self.asset.manifest.background
             background = (red, green, blue)
-        k, opaque_depth = min(k, self._grid.most_samples), OPAQUE_DEPTH[quality]
+        high, fast = self.asset.manifest.agreement
+        levels = {"exact": 0.0, "high": high, "fast": fast}[quality]
+        k, opaque_depth = min(k, self._grid.most_samples), OPAQUE_DEPTH[quality if levels else "exact"]
         picture = self._blank(camera, background, k, opaque_depth, layers)
-        for stage in stages(quality, picture.view.grid.contracted):
+        for stage in stages(quality, picture.view.grid.contracted, levels):
             self._in_tasks(picture, stage)
         planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
         normals = self._all_normals(picture.view, self._pool.map) if layers else None

@@ -30,6 +30,7 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `density_steps` | 1 to 8 integers, 1..255 | by how much a symbol changes a density code, on each level |
 | `n_channels` | integer, 1..1024 | of the features |
 | `feature_steps` | 1 to 8 integers, 1..255 | the same for features |
+| `agreement` | 2 numbers, 0..255 | levels for `high`, `fast`; [20, 40], contracted [16, 40], if absent |
 | `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
 | `colour_space` | "srgb" | |
 | `view_size` | 2 integers | width and height of the training pictures |
@@ -76,6 +77,8 @@ MAX_VALUES = 1 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_LEVEL_STEP = 128
+AGREEMENT = {False: (20.0, 40.0), True: (16.0, 40.0)}
+"""`agreement` where it is absent, by `contracted`."""
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
@@ -113,6 +116,7 @@ class Manifest:
     near: float = 0.0
     level_steps: tuple[int, ...] = (1,)
     n_fetches: int = 5
+    agreement: Vector = AGREEMENT[False]
     density_steps: tuple[int, ...] = (1,)
     feature_steps: tuple[int, ...] = (1,)
     background: Vector = (1.0, 1.0, 1.0)
@@ -166,6 +170,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
     version = _parse_version(f"{where}: version", document.get("version"))
     if version < (4, 0):
         document = _of_version_4(document, version)
+    document.setdefault("agreement", AGREEMENT[document.get("contracted") is True])
     known = {f.name for f in fields(Manifest)}
     missing = sorted(known - set(document))
     if missing:
@@ -433,6 +438,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "density_steps": _steps_of_levels(255),
     "n_channels": _integer(1, MAX_CHANNELS),
     "feature_steps": _steps_of_levels(255),
+    "agreement": _numbers(2, 0, 255),
     "background": _numbers(3, 0, 1),
     "colour_space": _one_of("srgb"),
     "view_size": _integers(2, 1, 1 << 20),

@@ -21,6 +21,7 @@ tasks nor on the picture before it.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -36,6 +37,8 @@ OPAQUE_DEPTH: dict[Quality, np.float32] = {
     "fast": np.float32(np.log(10)),
 }
 """The optical depth at which the rays of a picture stop (`player.march.march.march`)."""
+OF_FIRST_HALVING = 0.6
+"""Share of the levels by which pixels may differ that are four apart."""
 
 
 class Agreement(NamedTuple):
@@ -63,7 +66,8 @@ _NOTHING = Agreement(np.float32(0), np.float32(0), np.float32(0))
 _NONE = np.zeros((0, 2), np.int64)
 
 
-def stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
+@lru_cache(maxsize=64)
+def stages(quality: Quality, contracted: bool = False, levels: float = 40.0) -> tuple[Stage, ...]:
     """The stages of a picture, in their order.
 
     Args:
@@ -71,13 +75,19 @@ def stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
         contracted: whether it shows all of space. The pictures of a capture are smooth over several pixels,
             and a lattice of every fourth pays. An object's seldom are: of a wider lattice than every second
             pixel's, rays that lie far apart cost more time than there are fewer of them.
+        levels: by how many 8-bit levels four pixels may differ of which another becomes the mean; with 0 all
+            pixels are marched. Those of the first halving of a wide lattice must be nearer.
 
     >>> [len(stage.within) for stage in stages("exact")], [len(stage.within) for stage in stages("fast")]
     ([64], [20, 12, 32])
     >>> [len(stage.within) for stage in stages("fast", contracted=True)]
     [4, 4, 8, 16, 32]
     """
-    return (_OF_SPACE if contracted else _OF_BOX)[quality]
+    if quality == "exact" or levels == 0:
+        return _EXACT
+    if contracted:
+        return _pattern(4, (_agreement(OF_FIRST_HALVING * levels), _agreement(levels)))
+    return _pattern(2, (_agreement(levels),), probed=True)
 
 
 def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = False) -> tuple[Stage, ...]:
@@ -104,16 +114,6 @@ def _agreement(levels: float) -> Agreement:
 
 
 _EXACT = (Stage(EVERY, _NONE, _NOTHING),)
-_OF_BOX: dict[Quality, tuple[Stage, ...]] = {
-    "exact": _EXACT,
-    "high": _pattern(2, (_agreement(20),), probed=True),
-    "fast": _pattern(2, (_agreement(40),), probed=True),
-}
-_OF_SPACE: dict[Quality, tuple[Stage, ...]] = {
-    "exact": _EXACT,
-    "high": _pattern(4, (_agreement(8), _agreement(16))),
-    "fast": _pattern(4, (_agreement(25), _agreement(40))),
-}
 
 
 def interpolate(

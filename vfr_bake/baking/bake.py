@@ -29,6 +29,7 @@ from player.errors import ConfigError
 from player.files.files import check_target
 from player.head.head import Head
 from vfr_bake import __version__
+from vfr_bake.baking.agreement import compared_views, fitting_agreement
 from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
@@ -164,6 +165,8 @@ class _Bake:
             level_steps = detail.level_steps(layout.played(arrays))
         manifest = self._manifest(layout, arrays, {}, level_steps)
         del teacher, needed, layout  # what is written is played and meshed in their room
+        with self._part("agreement"):
+            manifest = replace(manifest, agreement=self._agreement(manifest, arrays, head))
         figures: dict[str, Any] = {
             "n_vertices": int(arrays.densities.first_rows[-1]),
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
@@ -342,6 +345,14 @@ class _Bake:
         if config.max_mb is not None and is_too_large(price):
             _, price = turning_point(is_too_large, RAISED * price)
         return kept[price] if price in kept else prices.at(price).arrays
+
+    def _agreement(self, manifest: Manifest, arrays: GridArrays, head: bytes) -> tuple[float, float]:
+        """How nearly pixels have to agree in `high` and `fast` pictures of the asset."""
+        views = compared_views(self.model, self.config.check_views)
+        error = self.held_out.model_error * 10 ** (self.held_out.stages[-1].loss.db / 10)
+        with TemporaryDirectory() as folder:
+            asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head})
+            return fitting_agreement(asset, views, error)
 
     def _other_bytes(self, max_mb: float) -> int:
         """What the files of an asset of `max_mb` megabytes take beside the stored values and the

@@ -1,0 +1,112 @@
+"""How nearly pixels have to agree in `high` and `fast` pictures: as much as each asset allows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from player.asset.asset import Asset
+from player.asset.manifest import AGREEMENT
+from player.cameras.camera import Camera, orbit
+from player.march.interpolation import Quality
+from player.render import Renderer
+from vfr_bake.baking.agreement import ALLOWED_DB, SHARES, WORST, View, compared_views, fitting_agreement
+from vfr_bake.baking.bake import bake
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
+
+
+@pytest.fixture(scope="module")
+def asset(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Asset:
+    folder = tmp_path_factory.mktemp("agreement") / "asset"
+    config = BakeConfig(
+        resolution=96, feature_resolution=96, mesh_resolution=16, refine_steps=0, check_views=1
+    )
+    bake(model, folder, config, lambda stage, done, of: None)
+    return Asset.open(folder)
+
+
+@pytest.fixture(scope="module")
+def cameras(model: Model) -> list[Camera]:
+    return [camera.resized(96, 80) for camera in orbit(model.cameras, 5)]
+
+
+def pictures(asset: Asset, cameras: list[Camera], quality: Quality) -> list[np.ndarray]:
+    with Renderer(asset) as renderer:
+        return [
+            renderer.render(camera, quality=quality).to_uint8().reshape(-1, 3) / 255 for camera in cameras
+        ]
+
+
+def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[View]:
+    """Views whose photographs are the asset's exact pictures with noise."""
+    random, pixels = np.random.default_rng(0), np.arange(96 * 80)
+    return [
+        View(camera, pixels, exact + random.normal(0, noise, exact.shape))
+        for camera, exact in zip(cameras, pictures(asset, cameras, "exact"), strict=True)
+    ]
+
+
+def lost(asset: Asset, views: list[View], quality: Quality) -> np.ndarray:
+    """[n_views] what pictures of a quality lose in dB, by a loop."""
+    cameras = [view.camera for view in views]
+    found = []
+    for view, exact, other in zip(
+        views, pictures(asset, cameras, "exact"), pictures(asset, cameras, quality), strict=True
+    ):
+        before, after = (np.mean((rgb[view.pixels] - view.photograph) ** 2) for rgb in (exact, other))
+        found.append(10 * np.log10(after / before))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.01, 0.03])
+def test_pictures_with_the_levels_that_are_found_lose_what_is_allowed(
+    asset: Asset, cameras: list[Camera], noise: float
+) -> None:
+    views = views_with(asset, cameras, noise)
+    found = fitting_agreement(asset, views, 1.0)
+    agreed = Asset.open(asset.folder)
+    object.__setattr__(agreed, "manifest", replace(asset.manifest, agreement=found))
+    for quality, allowed in ALLOWED_DB.items():
+        loss = lost(agreed, views, quality)
+        assert loss.mean() <= allowed and loss.max() <= WORST * allowed
+    usual = AGREEMENT[False]
+    next_wider = [(n or SHARES[-1] * most * 0.85) / 0.85 for n, most in zip(found, usual, strict=True)]
+    wider = replace(asset.manifest, agreement=tuple(next_wider))
+    object.__setattr__(agreed, "manifest", wider)
+    for (quality, allowed), levels, most in zip(ALLOWED_DB.items(), found, usual, strict=True):
+        if levels < most:
+            loss = lost(agreed, views, quality)
+            bound = loss.mean() + 2 * loss.std(ddof=1) / np.sqrt(len(loss))
+            assert bound > allowed or loss.max() > WORST * allowed, "more levels would have been allowed"
+
+
+def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras: list[Camera]) -> None:
+    views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
+    found = [fitting_agreement(asset, views, error) for error in (1.0, 1e-3, 3e-4, 1e-9)]
+    assert found[0] == AGREEMENT[False] and found[-1] == (0.0, 0.0)
+    assert found == sorted(found, reverse=True) and found[1] > found[2]
+    assert all(high <= fast for high, fast in found)
+
+
+def test_one_view_is_trusted_less(asset: Asset, cameras: list[Camera]) -> None:
+    view = View(cameras[0], np.arange(96 * 80), None)
+    alone, twice = (fitting_agreement(asset, [view] * n, 1e-3) for n in (1, 2))
+    assert all(a <= b for a, b in zip(alone, twice, strict=True))
+
+
+def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> None:
+    (view,) = compared_views(model, 3)
+    assert model.witnesses is not None and view.photograph is not None
+    assert view.camera is model.cameras[model.witnesses.whole[0]] and len(view.pixels) == len(view.photograph)
+    none = replace(model, witnesses=None)
+    between = compared_views(none, 3)
+    assert len(between) == 3 and all(view.photograph is None for view in between)
+    wide = replace(none, cameras=[camera.resized(1600, 1200) for camera in model.cameras])
+    assert {(view.camera.width, view.camera.height) for view in compared_views(wide, 2)} == {(640, 480)}
+
+
+def test_the_asset_has_what_was_found(model: Model, asset: Asset) -> None:
+    assert asset.manifest.agreement == fitting_agreement(asset, compared_views(model, 1), 1.0)
