@@ -198,7 +198,7 @@ def test_bad_manifest(change: dict[str, Any], message: str, asset: Asset) -> Non
 
 
 def keys_of_a_manifest() -> list[str]:
-    return [key for key in json.loads(manifest_bytes(SMALLEST)) if key != "format"]
+    return [key for key in json.loads(manifest_bytes(SMALLEST)) if key not in ("format", "agreement")]
 
 
 @pytest.mark.parametrize("key", keys_of_a_manifest())
@@ -207,6 +207,18 @@ def test_missing_key(key: str, asset: Asset) -> None:
     del document[key]
     with pytest.raises(FormatError, match=key):
         parse_manifest(json.dumps(document).encode(), "m.json")
+
+
+def test_agreement_may_be_absent(asset: Asset) -> None:
+    document = json.loads(manifest_bytes(replace(asset.manifest, agreement=(3.5, 9))))
+    assert parse_manifest(json.dumps(document).encode(), "m.json").agreement == (3.5, 9.0)
+    for wrong in ([3.5], [3.5, 256], [-1, 3], "20", None):
+        with pytest.raises(FormatError, match="agreement: expected"):
+            parse_manifest(json.dumps(document | {"agreement": wrong}).encode(), "m.json")
+    del document["agreement"]
+    assert parse_manifest(json.dumps(document).encode(), "m.json").agreement == (20.0, 40.0)
+    space = {"contracted": True, "aabb": [[-2.0] * 3, [2.0] * 3]}
+    assert parse_manifest(json.dumps(document | space).encode(), "m.json").agreement == (16.0, 40.0)
 
 
 def test_versions(asset: Asset) -> None:
@@ -251,7 +263,7 @@ def test_golden_manifest() -> None:
     manifest = replace(SMALLEST, feature_resolution=4, step=0.5, view_size=(4, 3), n_fetches=0)
     text = manifest_bytes(manifest).decode()
     assert "".join(text.split()) == (
-        '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
+        '{"aabb":[[-1.0,-1.0,-1.0],[1.0,1.0,1.0]],"agreement":[20.0,40.0],"background":[1.0,1.0,1.0],"colour_space":"srgb",'
         '"contracted":false,"density_range":[0.0,1.0],"density_steps":[1],"feature_resolution":4,"feature_steps":[1],"files":{},"format":"vfr-asset","generator":"t","level_steps":[1],"n_channels":1,"n_fetches":0,"near":0.0,"parts":[],'
         '"provenance":{},"resolution":6,"step":0.5,"version":[4,0],"view_size":[4,3],'
         '"world_from_model":[[1.0,0.0,0.0,0.0],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]}'

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from player.app import cli
+from player.asset.arranging import write_parts
 from player.asset.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import manifest_bytes, parse_manifest
@@ -394,3 +395,26 @@ def test_what_a_manifest_asks_for_is_refused_before_a_part_is_opened(broken: Pat
         Asset.open(broken, max_memory=1e-3)
     with pytest.raises(IntegrityError, match="sha256"):
         Asset.open(broken)
+
+
+def test_an_asset_is_written_in_little_more_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Symbols of all vertices at once, in float64, took 2.3 GB beside 0.14 GB of values."""
+    monkeypatch.setattr("player.asset.pyramid._ROWS_AT_ONCE", 1 << 14)
+    random, n_channels = np.random.default_rng(0), 16
+    coords, masks, _ = pack_vertices(np.argwhere(random.random((88,) * 3) < 0.6))
+    pyramid = whole_pyramid(88, [Bricks(coords, masks), NONE])
+    steps, vertices = (1, 1), pyramid.vertices
+    symbols = [random.integers(-3, 4, (np.count_nonzero(~v.on_border), n_channels)) for v in vertices]
+    features = PyramidValues(pyramid, tuple(values_of(vertices, symbols, steps, LIMITS["features"], np.int8)))
+    densities = PyramidValues(pyramid, tuple(np.zeros((v.n, 1), np.uint8) for v in vertices))
+    manifest = replace(
+        MANIFEST, level_steps=steps, density_steps=steps, feature_steps=steps, n_channels=n_channels
+    )
+    del symbols
+    tracemalloc.start()
+    try:
+        write_parts(densities, features, manifest, 0, 0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 9.5 * sum(of_level.nbytes for of_level in features.values)
