@@ -100,7 +100,7 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 	$(WHEEL_PIP) "$$(echo dist/*.whl)[fast,viewer,video,cluster]" playwright
 	$(WHEEL_TESTS)
 
-fuzz: $(VENV)/.dev  ## a million broken inputs to every reader, a tenth of that to the viewer
+fuzz: $(VENV)/.dev  ## a million broken inputs to all readers together, a tenth of that to the viewer
 	$(BIN)/python -m tests.reliability.fuzz --inputs 1000000
 	$(BIN)/python -m tests.reliability.fuzz.viewer --inputs 100000
 

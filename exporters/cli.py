@@ -122,7 +122,7 @@ def make_parser() -> argparse.ArgumentParser:
     methods = ("baked", "density", "tsdf")
     add("--method", choices=methods, help="the baked mesh; marching cubes in all voxels; fused depth")
     density, seconds = number("a density", "12.5"), number("seconds", "300")
-    value("--level", "X", "density of the surface, 1/model unit (half opaque: two steps)", type=density)
+    value("--level", "X", "density of the surface, 1/model unit (half opaque: two voxels)", type=density)
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
     value("--time-limit", "S", "seconds that laying out a texture may take (300)", type=seconds)
     value("--points", "N", f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})", type=cloud)

@@ -167,7 +167,7 @@ def _check_ranges(options: ExportOptions) -> None:
         value = getattr(options, key)
         if value is not None and (value < low or (high is not None and value > high)):
             wanted = f"{low} or more" if high is None else f"{low} to {high}"
-            raise ConfigError(f"--{key}: expected {wanted}, got {value}")
+            raise ConfigError(f"{_flag(key)}: expected {wanted}, got {value}")
     if options.time_limit is not None and not options.time_limit > 0:
         raise ConfigError(f"--time-limit: expected seconds > 0, got {options.time_limit:g}")
     if options.time_limit is not None and options.texture is None:

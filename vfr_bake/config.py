@@ -241,8 +241,8 @@ class TrainConfig:
     """Scenes: weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together."""
     near_gradients: float = 2.0
     """Scenes: what is nearer to a camera than this learns more slowly, by the square of its distance, so that
-    no fog settles before the cameras; model units, in which the farthest camera is at 1; 0: all learn
-    alike."""
+    no fog settles before the cameras; model units, in which nine in ten cameras are nearer than 1; 0: all
+    learn alike."""
     seed: int = 0
     """Seed of every random number."""
     eval_views: int | None = None
@@ -300,8 +300,8 @@ class BakeConfig:
     """Settings of `vfr-bake`; what is None follows from the preset (`choice`)."""
 
     preset: Preset = "balanced"
-    """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: the
-    fewest bytes and the smallest head."""
+    """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: fewer
+    bytes and a smaller head. Phone: the fewest bytes, for pages on phones."""
     resolution: int | None = None
     """Cells per axis of the baked densities, at most half again the field's finest level."""
     feature_resolution: int | None = None
@@ -315,7 +315,7 @@ class BakeConfig:
     The player can be asked for another number."""
     weight_floor: float | None = None
     """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
-    a few that loses next to nothing on what is kept apart, or none."""
+    a few that loses next to nothing on what is kept apart, or none; 0.01 for an unbounded scene."""
     no_cull: bool = False
     """Store what no view sees as well: every cell that the model holds matter in."""
     code_levels: int | None = None
@@ -333,8 +333,8 @@ class BakeConfig:
     max_loss_db: float | None = None
     """Fail, and write nothing, if the written files lose more than this against photographs."""
     max_mb: float | None = None
-    """Take so many channels as fit into this many megabytes, the report not counted; fail, and write nothing,
-    if the asset takes more all the same."""
+    """Store as much of each value as fits into this many megabytes, the report not counted; fail, and write
+    nothing, if the asset takes more all the same."""
     target_ms: float | None = None
     """Take no wider a head and no more lookups than a frame of 800x800 in so many milliseconds allows,
     measured by the player on this machine; fail, and write nothing, if it takes longer all the same."""
