@@ -26,8 +26,8 @@ from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import over_background
 
 ALLOWED_DB: dict[Quality, float] = {"high": 0.03, "fast": 0.3}
-"""Loss in dB of pictures, on average. `high` pictures may lose 0.05: a few views know that little only roughly,
-and with 0.05 lego's test views lost 0.06."""
+"""Loss in dB of pictures, on average. `high` pictures may lose 0.05: a few views know that little only
+roughly, and with 0.05 lego's test views lost 0.06."""
 SPREADS, OF_ONE = 2.0, 1.5
 """How many standard errors above the mean of a few views' losses is allowed that; of one view, which has
 none, so many times its loss."""
