@@ -179,7 +179,7 @@ class Renderer:
         levels = {"exact": 0.0, "high": high, "fast": fast}[quality]
         k, opaque_depth = min(k, self._grid.most_samples), OPAQUE_DEPTH[quality if levels else "exact"]
         picture = self._blank(camera, background, k, opaque_depth, layers)
-        for stage in stages(quality, picture.view.grid.contracted, levels):
+        for stage in stages(levels, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
         planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
         normals = self._all_normals(picture.view, self._pool.map) if layers else None

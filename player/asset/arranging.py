@@ -72,7 +72,7 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
                 f"the border, from the next coarser level: {got[row, channel]} at row {row}, channel "
                 f"{channel}, got {wanted[row, channel]}"
             )
-    del again
+    del again  # as many bytes as the symbols
     for level, bricks in enumerate(pyramid.levels):
         if not len(bricks):
             continue

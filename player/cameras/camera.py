@@ -61,6 +61,18 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def at_most(self, longest: int) -> Camera:
+        """The same view with at most `longest` pixels along each side; itself if it has no more.
+
+        >>> small = Camera("a", np.eye(4), 1600, 1200, 800.0, 800.0, 800.0, 600.0).at_most(640)
+        >>> small.width, small.height, small.fx
+        (640, 480, 320.0)
+        """
+        share = longest / max(self.width, self.height)
+        if share >= 1:
+            return self
+        return self.resized(max(round(self.width * share), 1), max(round(self.height * share), 1))
+
     def transformed(self, matrix: np.ndarray) -> Camera:
         """The camera in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale,
         translation).

@@ -67,24 +67,24 @@ _NONE = np.zeros((0, 2), np.int64)
 
 
 @lru_cache(maxsize=64)
-def stages(quality: Quality, contracted: bool = False, levels: float = 40.0) -> tuple[Stage, ...]:
+def stages(levels: float, contracted: bool = False) -> tuple[Stage, ...]:
     """The stages of a picture, in their order.
 
     Args:
-        quality: of the picture.
+        levels: by how many 8-bit levels four pixels may differ of which another becomes the mean; with 0, as
+            in exact pictures, all pixels are marched. Those of the first halving of a wide lattice must be
+            nearer.
         contracted: whether it shows all of space. The pictures of a capture are smooth over several pixels,
             and a lattice of every fourth pays. An object's seldom are: of a wider lattice than every second
             pixel's, rays that lie far apart cost more time than there are fewer of them.
-        levels: by how many 8-bit levels four pixels may differ of which another becomes the mean; with 0 all
-            pixels are marched. Those of the first halving of a wide lattice must be nearer.
 
-    >>> [len(stage.within) for stage in stages("exact")], [len(stage.within) for stage in stages("fast")]
+    >>> [len(stage.within) for stage in stages(0)], [len(stage.within) for stage in stages(40)]
     ([64], [20, 12, 32])
-    >>> [len(stage.within) for stage in stages("fast", contracted=True)]
+    >>> [len(stage.within) for stage in stages(40, contracted=True)]
     [4, 4, 8, 16, 32]
     """
-    if quality == "exact" or levels == 0:
-        return _EXACT
+    if not levels:
+        return (Stage(EVERY, _NONE, _NOTHING),)
     if contracted:
         return _pattern(4, (_agreement(OF_FIRST_HALVING * levels), _agreement(levels)))
     return _pattern(2, (_agreement(levels),), probed=True)
@@ -111,9 +111,6 @@ def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = Fal
 def _agreement(levels: float) -> Agreement:
     """Colours and opacities within so many 8-bit levels."""
     return Agreement(np.float32(levels / 255), np.float32(levels / 255), np.float32(0.1))
-
-
-_EXACT = (Stage(EVERY, _NONE, _NOTHING),)
 
 
 def interpolate(

@@ -22,11 +22,9 @@ def poster_bytes(asset: Asset) -> bytes:
     """
     from PIL import Image
 
-    camera = rest_camera(asset_cameras(asset))
-    scale = min(LONGEST / max(camera.width, camera.height), 1.0)
-    size = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
+    camera = rest_camera(asset_cameras(asset)).at_most(LONGEST)
     with Renderer(asset) as renderer:
-        frame = renderer.render(camera.resized(*size))
+        frame = renderer.render(camera)
     buffer = io.BytesIO()
     Image.fromarray(frame.to_uint8()).save(buffer, "JPEG", quality=QUALITY, optimize=True, progressive=True)
     return buffer.getvalue()

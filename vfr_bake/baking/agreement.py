@@ -58,7 +58,7 @@ def compared_views(model: Model, n_views: int) -> list[View]:
     witnesses = model.neutral_witnesses()
     if witnesses is None or not len(witnesses.whole):
         between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
-        small = [_at_most(camera) for camera in between]
+        small = [camera.at_most(LONGEST_SIDE) for camera in between]
         return [View(camera, np.arange(camera.width * camera.height), None) for camera in small]
     found, numbers, n_pixels = [], witnesses.views(), 0
     for number in witnesses.whole:
@@ -69,11 +69,6 @@ def compared_views(model: Model, n_views: int) -> list[View]:
         photograph = to_8_bit(over_background(witnesses.rgba[rows], model.background)) / 255
         found.append(View(camera, witnesses.pixels[rows], photograph))
     return found
-
-
-def _at_most(camera: Camera) -> Camera:
-    share = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
-    return camera.resized(max(round(camera.width * share), 1), max(round(camera.height * share), 1))
 
 
 def fitting_agreement(asset: Asset, views: Sequence[View], error: float) -> tuple[float, float]:

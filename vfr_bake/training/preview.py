@@ -34,15 +34,12 @@ class Preview:
     def __init__(self, scene: Scene, path: Path) -> None:
         views = scene.test if scene.test.cameras else scene.train
         number = len(views.cameras) // 2
-        camera = views.cameras[number]
-        factor = min(1.0, SIDE / max(camera.width, camera.height))
-        width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-        self._camera = camera.resized(width, height)
+        self._camera = camera = views.cameras[number].at_most(SIDE)
         rgba = views.images[number]
         # A picture with alpha is shown over white, as data sets of objects are; another has no background.
         self._background = np.ones(3) if scene.has_alpha else rgba[..., :3].mean(axis=(0, 1)) / 255
         whole = Image.fromarray(to_8_bit(over_background(rgba, self._background)))
-        self._photograph = np.asarray(whole.resize((width, height), Image.Resampling.BOX)) / 255
+        self._photograph = np.asarray(whole.resize((camera.width, camera.height), Image.Resampling.BOX)) / 255
         self._path = path
         # Before, all of the box is fog still, and a picture takes many times as long.
         self._due = SECONDS / 4

@@ -10,7 +10,7 @@ import pytest
 from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import encode_density
-from player.asset.manifest import Manifest
+from player.asset.manifest import AGREEMENT, Manifest
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.compiled import interpolation as compiled
@@ -24,6 +24,13 @@ from tests.vertex_grids import arrays_of
 
 QUALITIES: tuple[Quality, ...] = ("exact", "high", "fast")
 LOSSY = QUALITIES[1:]
+
+
+def usual_stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
+    """The stages of a picture whose asset says nothing of its agreement."""
+    return stages(dict(zip(QUALITIES, (0.0, *AGREEMENT[contracted]), strict=True))[quality], contracted)
+
+
 MARCHES = ["numpy", pytest.param("numba", marks=pytest.mark.extra)]
 
 REUSE = "Reuse within a frame"
@@ -111,7 +118,7 @@ def expected_pixel(
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality, contracted: bool) -> None:
     found = np.full((3 * BLOCK, 3 * BLOCK), -1)
-    for number, stage in enumerate(stages(quality, contracted)):
+    for number, stage in enumerate(usual_stages(quality, contracted)):
         rows, columns = (
             (axis[:, None] + BLOCK * np.arange(3)).reshape(len(axis), 3) for axis in stage.within.T
         )
@@ -120,7 +127,7 @@ def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality, contr
                 assert found[y, x] == -1
                 found[y, x] = number
     assert (found >= 0).all()
-    for number, stage in enumerate(stages(quality, contracted)):
+    for number, stage in enumerate(usual_stages(quality, contracted)):
         for row, column in stage.within + BLOCK:
             assert all(found[row + down, column + right] < number for down, right in stage.neighbours)
 
@@ -137,7 +144,9 @@ def test_every_pixel_is_found_once_and_from_earlier_ones(quality: Quality, contr
 def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int, int]) -> None:  # type: ignore[no-untyped-def]
     random = np.random.default_rng(3)
     kept = filled = 0
-    for stage in [stage for quality in LOSSY for kind in (False, True) for stage in stages(quality, kind)]:
+    for stage in [
+        stage for quality in LOSSY for kind in (False, True) for stage in usual_stages(quality, kind)
+    ]:
         planes = random_planes(size[0] * size[1], random)
         before = Planes(*(plane.copy() for plane in planes))
         pixels = all_pixels(*size, stage)
@@ -164,7 +173,7 @@ def test_means_are_those_of_a_loop(function, transparent: bool, size: tuple[int,
 @pytest.mark.parametrize("transparent", [False, True])
 def test_compiled_code_gives_the_same_bits(transparent: bool) -> None:
     for seed in range(5):
-        for stage in (*stages("fast"), *stages("fast", contracted=True)):
+        for stage in (*usual_stages("fast"), *usual_stages("fast", contracted=True)):
             both = []
             for function in (interpolate, compiled.interpolate):
                 planes = random_planes(40 * 30, np.random.default_rng(seed))
@@ -183,7 +192,7 @@ def render_all(
 ) -> Frame:
     """The picture of a quality, with every pixel marched."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("player.render.stages", lambda *_: stages("exact"))
+        patch.setattr("player.render.stages", lambda *_: stages(0.0))
         return render(asset, camera, quality, march, **settings)
 
 
@@ -209,7 +218,7 @@ def test_marched_pixels_are_those_of_the_whole_picture(
     other = render(asset, camera, quality, march, **settings)
     marched = other.n_density_samples > 0
     assert 0.05 < marched.mean() < (exact.n_density_samples > 0).mean()
-    first = stages(quality)[0].within
+    first = usual_stages(quality)[0].within
     step = first[1, 1] - first[0, 1]
     lattice = np.zeros(exact.opacity.shape, bool)
     lattice[::step, ::step] = True
