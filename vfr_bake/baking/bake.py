@@ -34,13 +34,14 @@ from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
+    LARGEST_CODE,
     Layout,
     Parts,
     Projection,
     code_step,
+    codes_of_field,
     evaluate_densities,
     evaluate_features,
-    features_of_field,
     head_sensitivity,
     make_layout,
     project,
@@ -80,8 +81,8 @@ Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
 SPARING = 0.25
 """Factor of what choices may lose where the asset has already lost what its preset aims at."""
-N_SENSITIVITY = 50_000
-"""Rays that decide which directions of the features the colours depend on."""
+N_PROJECTED = 100_000
+"""Rays that decide which directions of the features the colours depend on, and how much of each there is."""
 
 
 @dataclass(frozen=True)
@@ -251,12 +252,11 @@ class _Bake:
             features = evaluate_features(model, layout, projection.matrix, self._progress("features"))
             step = code_step(features, choice.code_levels)
             features /= np.float32(step)
+            np.clip(features, -LARGEST_CODE, LARGEST_CODE, out=features)
             first = model.field.head.first_weights().astype(np.float64)
             head = fold_head(model.field.head, first @ projection.back * step)
             grid = layout.grid(density, features)
             played = held_out.march(replace(grid, features=features), 0)
-            n_samples = float(played.n_density_samples[played.hits].mean()) if len(played.hits) else 0.0
-            teacher = teacher.some(self.plan.rays_that_fit(n_rays, n_samples))
             own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
             held_out.measure_march("grid", own, runner(fold_head(model.field.head, first)))
             held_out.measure_march("rank", played, runner(head))
@@ -266,7 +266,7 @@ class _Bake:
             f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
             "than that after 'grid', before refinement"
         )
-        again = partial(features_of_field, model, layout, projection.matrix / step)
+        again = partial(codes_of_field, model, layout, projection.matrix / step)
         return Stored(head, features, density), teacher, again
 
     def _needed(self, detail: Detail, layout: Layout, stored: Stored, teacher: TeacherRays) -> Needed:
@@ -283,9 +283,12 @@ class _Bake:
     def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
-        some = teacher.some(N_SENSITIVITY)
-        sensitivity = head_sensitivity(head, some.features, some.rays_d, some.opacity)
-        every = project(sensitivity, teacher.features, most)
+        some = teacher.some(N_PROJECTED)
+        features, opacity, _ = self.model.sampler.composited_features(
+            self.model.field, some.rays_o, some.rays_d
+        )
+        sensitivity = head_sensitivity(head, features, some.rays_d, opacity)
+        every = project(sensitivity, features, most)
         if self.config.n_channels is not None:
             return every
 

@@ -11,7 +11,7 @@ With the field's own features in place of the stored codes, the same map tells w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,69 +63,14 @@ class Fetches(NamedTuple):
     lengths: np.ndarray
     """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
     were merged into."""
+    opacity: np.ndarray
+    """[n] float32 opacity of the baked grid."""
 
     def compose(self, codes: np.ndarray) -> np.ndarray:
         """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded."""
-        out = np.empty((len(self.starts) - 1, codes.shape[1]), np.float32)
+        out = np.empty((len(self.opacity), codes.shape[1]), np.float32)
         compose(self.starts, *self.features, self.weights, codes, out)
         return out
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingRays:
-    """n rays that meet something in the baked grid. They keep the places of their fetches, 20 bytes each; the
-    corners around them, 128 bytes, are found where a batch needs them."""
-
-    starts: np.ndarray
-    """[n + 1] int64: ray i has the fetches starts[i] to starts[i + 1]."""
-    points: np.ndarray
-    """[n_fetches, 3] float32 places, cells of the densities' grid."""
-    weights: np.ndarray
-    """[n_fetches] float32 compositing weights."""
-    lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
-    were merged into."""
-    dirs: np.ndarray
-    """[n, 3] float32 unit view directions."""
-    opacity: np.ndarray
-    """[n] float32 opacity of the baked grid."""
-    colours: np.ndarray
-    """[n, 3] float32: the full model's colours times its opacity."""
-    full_opacity: np.ndarray
-    """[n] float32 opacity of the full model."""
-    features: VertexRows
-    feature_scale: np.float32
-    """Cells of the features' grid in a cell of the densities'."""
-    densities: VertexRows | None
-    """Rows of the stored densities where they are trained too."""
-
-    def __len__(self) -> int:
-        return len(self.opacity)
-
-    def fetches(self, some: np.ndarray) -> Fetches:
-        """The fetches of the rays whose numbers are in `some`, in that order."""
-        counts = self.starts[some + 1] - self.starts[some]
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        index = np.repeat(self.starts[some] - starts[:-1], counts) + np.arange(starts[-1])
-        points = self.points[index]
-        of_features = corners(self.features, points * self.feature_scale, MIN_TOTAL)
-        none = Corners(np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32))
-        of_densities = none if self.densities is None else corners(self.densities, points, np.float32(0))
-        return Fetches(starts, of_features, of_densities, self.weights[index], self.lengths[index])
-
-    def composed(self, codes: np.ndarray) -> np.ndarray:
-        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded."""
-        out = np.empty((len(self), codes.shape[1]), np.float32)
-        for first in range(0, len(self), RAYS_AT_ONCE):
-            rows = slice(first, min(first + RAYS_AT_ONCE, len(self)))
-            out[rows] = self.fetches(np.arange(rows.start, rows.stop)).compose(codes)
-        return out
-
-    def typical(self, codes: np.ndarray) -> np.ndarray:
-        """[n_channels] mean size of the composites of `codes` over some of the rays; never 0."""
-        n_some = min(N_TYPICAL, len(self))
-        composites = self.fetches(np.arange(n_some) * len(self) // n_some).compose(codes)
-        return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +81,6 @@ class TeacherRays:
     """[n, 3] float32, model frame."""
     rays_d: np.ndarray
     """[n, 3] float32, of unit length."""
-    features: np.ndarray
-    """[n, n_channels] float32 composited features of the model."""
     colours: np.ndarray
     """[n, 3] float32 colours of the model times its opacity."""
     opacity: np.ndarray
@@ -148,8 +91,62 @@ class TeacherRays:
         n_all = len(self.opacity)
         if n >= n_all:
             return self
-        chosen = np.arange(n) * n_all // n
-        return TeacherRays(*(column[chosen] for column in vars(self).values()))
+        return self.chosen(np.arange(n) * n_all // n)
+
+    def chosen(self, rays: np.ndarray | slice) -> TeacherRays:
+        """The rays with these numbers."""
+        return TeacherRays(*(column[rays] for column in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRays:
+    """n of the teacher's rays, and the baked grid, in which all of them meet something. What a ray fetches is
+    found whenever a batch needs it: that takes a tenth of a step's time, and the samples of all rays would
+    take more memory than the grid where there is fog."""
+
+    teacher: TeacherRays
+    grid: SparseGrid
+    """As the player has it."""
+    n_fetches: int
+    """The player's k, 0 for every sample."""
+    densities: VertexRows | None
+    """Rows of the stored densities where they are trained too."""
+
+    def __len__(self) -> int:
+        return len(self.teacher.opacity)
+
+    def some(self, n: int) -> TrainingRays:
+        """n of the rays, spread evenly; all where there are no more."""
+        return replace(self, teacher=self.teacher.some(n))
+
+    def fetches(self, some: np.ndarray) -> Fetches:
+        """The fetches of the rays whose numbers are in `some`, in that order."""
+        rays_o, rays_d = self.teacher.rays_o[some], self.teacher.rays_d[some]
+        found = player_fetches(self.grid, rays_o, rays_d, self.n_fetches)
+        counts, opacity = np.zeros(len(some), np.int64), np.zeros(len(some), np.float32)
+        counts[found.hits], opacity[found.hits] = found.counts, found.opacity
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        of_features = corners(self.grid.rows, found.points * self.grid.feature_scale, MIN_TOTAL)
+        none = Corners(np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32))
+        of_densities = (
+            none if self.densities is None else corners(self.densities, found.points, np.float32(0))
+        )
+        return Fetches(starts, of_features, of_densities, found.weights, found.lengths, opacity)
+
+    def composed(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """([n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded; [n]
+        float32 opacity of the baked grid)."""
+        out, opacity = np.empty((len(self), codes.shape[1]), np.float32), np.empty(len(self), np.float32)
+        for first in range(0, len(self), RAYS_AT_ONCE):
+            some = np.arange(first, min(first + RAYS_AT_ONCE, len(self)))
+            fetches = self.fetches(some)
+            out[some], opacity[some] = fetches.compose(codes), fetches.opacity
+        return out, opacity
+
+    def typical(self, codes: np.ndarray) -> np.ndarray:
+        """[n_channels] mean size of the composites of `codes` over some of the rays; never 0."""
+        composites, _ = self.some(N_TYPICAL).composed(codes)
+        return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
 
 
 def render_teacher(
@@ -167,7 +164,7 @@ def render_teacher(
         met = np.flatnonzero(opacity > 0)
         rays_o, rays_d, features, opacity = rays_o[met], rays_d[met], features[met], opacity[met]
         colours = head_colours(model.field, features, rays_d) * opacity[:, None]
-        parts.append((rays_o, rays_d, features, colours, opacity))
+        parts.append((rays_o, rays_d, colours, opacity))
         progress(done + 1, len(cameras))
     return TeacherRays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -185,22 +182,14 @@ def collect_training_rays(
 
     Raises TrainingError where no ray meets anything.
     """
-    parts = []
-    for first in range(0, len(teacher.opacity), RAYS_AT_ONCE):
+    meets = np.zeros(len(teacher.opacity), bool)
+    for first in range(0, len(meets), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        hits, *fetched = player_fetches(grid, teacher.rays_o[rows], teacher.rays_d[rows], n_fetches)
-        shown = (column[rows][hits] for column in (teacher.rays_d, teacher.colours, teacher.opacity))
-        parts.append((*fetched, *shown))
-    if not any(len(part[0]) for part in parts):
+        sampled = sample_rays(grid, teacher.rays_o[rows], teacher.rays_d[rows])
+        meets[rows] = -np.expm1(-sampled.tau) > MIN_OPACITY
+    if not meets.any():
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
-    columns = [list(column) for column in zip(*parts, strict=True)]
-    parts.clear()  # or all samples would be there twice, and not one column of them
-    opacity, counts, points, weights, lengths, dirs, colours, full_opacity = (
-        np.concatenate(columns.pop(0)) for _ in range(len(columns))
-    )
-    starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    shown = (dirs, opacity, colours, full_opacity)
-    return TrainingRays(starts, points, weights, lengths, *shown, grid.rows, grid.feature_scale, densities)
+    return TrainingRays(teacher.chosen(np.flatnonzero(meets)), grid, n_fetches, densities)
 
 
 class PlayerFetches(NamedTuple):

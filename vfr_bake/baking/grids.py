@@ -45,6 +45,11 @@ FAR = 30.0
 times the square of the distance far away. The smallest density code is invisible even at this distance."""
 ROWS_AT_ONCE = 1 << 18
 """Vertices whose codes are rounded at once."""
+LARGEST_CODE = 127
+"""Largest magnitude of a feature's code."""
+FAR_OUT, N_RANKED = 1e-4, 1_000_000
+"""Share of the vertices whose features may have larger codes than was asked for, and vertices that decide it.
+The largest of ten million of a room was 2.5 times as large as all but a ten thousandth."""
 LEAST_SENSITIVITY = 1e-6
 """Every eigenvalue of M is at least this share of their mean, so that S has an inverse."""
 
@@ -197,6 +202,12 @@ def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts
         yield rows, model.field.features(points) @ back
 
 
+def codes_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts:
+    """The same as codes, which need not be whole, but end at 127."""
+    for rows, values in features_of_field(model, layout, matrix):
+        yield rows, np.clip(values, -LARGEST_CODE, LARGEST_CODE)
+
+
 def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
     for start in range(0, len(vertices), VERTEX_CHUNK):
         rows = slice(start, min(start + VERTEX_CHUNK, len(vertices)))
@@ -278,8 +289,9 @@ def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity
 
 
 def code_step(values: np.ndarray, levels: int = 127) -> float:
-    """The step between signed codes of projected `values` [n, n_stored], such that the largest magnitude has
-    the code `levels`; 1 if all values are 0.
+    """The step between signed codes of projected `values` [n, n_stored]; 1 if all values are 0. In all but
+    FAR_OUT of the rows the largest magnitude has at most the code `levels`. The few others would make the
+    steps of all coarse; their codes end at 127.
 
     It is the same for all channels: P makes an error in any of them weigh alike in the colours, so that the
     least bytes for a given error are those of one step, and a channel of little use takes few bits by itself.
@@ -287,8 +299,12 @@ def code_step(values: np.ndarray, levels: int = 127) -> float:
     >>> code_step(np.array([[127.0, 0.0], [-254.0, 1.0]]))
     2.0
     """
-    largest = float(max(values.max(initial=0), -values.min(initial=0)))  # a copy of `values` may not fit
-    return largest / levels if largest > 0 else 1.0
+    if not len(values):
+        return 1.0
+    some = values[:: -(-len(values) // N_RANKED)]
+    magnitudes = np.maximum(some.max(axis=1), -some.min(axis=1))
+    largest = np.quantile(magnitudes, 1 - FAR_OUT, method="higher") or max(values.max(), -values.min())
+    return float(largest) / levels if largest > 0 else 1.0
 
 
 def encode_features(codes: np.ndarray) -> np.ndarray:
@@ -296,7 +312,7 @@ def encode_features(codes: np.ndarray) -> np.ndarray:
     whole = np.empty(codes.shape, np.int8)
     for first in range(0, len(codes), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
-        whole[rows] = np.clip(np.rint(codes[rows]), -127, 127)
+        whole[rows] = np.clip(np.rint(codes[rows]), -LARGEST_CODE, LARGEST_CODE)
     return whole
 
 

@@ -31,26 +31,20 @@ from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
 """Bytes that Python, torch, numba and the model itself take."""
-N_RAYS = 2_000_000
-"""Rays that head and stored values are trained on, where there is memory for them."""
-UNBOUNDED_RAYS = 500_000
+N_RAYS = 8_000_000
+"""Rays that head and stored values are trained on, where there is memory for them: a third of them meets
+something. The fewer they are, the more what is stored suits them alone."""
+UNBOUNDED_RAYS = 1_000_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
 RAYS_SHARE = 0.3
-"""Share of the memory for cells and rays that rays may take at least, if they need it. 71 phone photographs
-have some 15 million cells at 1088 an axis, beside which there was room for a fifth of the rays. On a grid of
-200 cells an axis, refinement of that scene gains 0.10 dB with 146 vertices for each ray, as many as there
-were then, and 0.34 dB with 26."""
+"""Share of the memory for cells and rays that rays may take at least, if they need it."""
 FEWEST_RAYS = 100_000
-RAYS_OF_CELL = 0.8
-"""Training rays for each stored cell of the features' grid: as many as teach all of lego's. A third of them
-meets something."""
-RAY_BYTES = {False: 300, True: 1_900}
-"""Bytes that a training ray takes, by whether the scene is unbounded: 168 bytes for what the model shows, and
-up to 32 bytes for each of its samples. A third of an object's rays meets something, at about 10 samples; all
-rays of an unbounded scene do, at 33, and where they have more, fewer rays are taken."""
-HIT_BYTES, SAMPLE_BYTES = 210, 32
-"""The same of a ray that meets something, and of each of its samples: 20 bytes, and 12 more while they are
-put together."""
+RAYS_OF_CELL = 2.7
+"""Training rays for each stored cell of the features' grid."""
+RAY_BYTES = {False: 40, True: 120}
+"""Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what the model shows,
+twice that for those that meet something in the grid, too, and as much again while they are put together. A
+third of an object's rays meets something."""
 CHANNEL_BYTES = 6
 """Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, and
 the code that is played."""
@@ -114,11 +108,6 @@ class Plan:
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
         most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
         return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, most))
-
-    def rays_that_fit(self, n_rays: int, n_samples: float) -> int:
-        """The rays that meet something for which there is room where `n_rays` were planned, if each has
-        `n_samples` samples on average: through fog they have hundreds."""
-        return int(n_rays * self.ray_bytes / (HIT_BYTES + SAMPLE_BYTES * n_samples))
 
     @property
     def n_bytes(self) -> int:

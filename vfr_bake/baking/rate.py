@@ -125,10 +125,10 @@ def importance(
     behind = torch.from_numpy(background.astype(np.float32))
     for first in range(0, len(rays), RAYS_AT_ONCE):
         some = np.arange(first, min(first + RAYS_AT_ONCE, len(rays)))
-        fetches, grid_opacity = rays.fetches(some), rays.opacity[some]
+        fetches = rays.fetches(some)
         composed = torch.from_numpy(fetches.compose(stored.features)).requires_grad_()
-        opacity = torch.from_numpy(grid_opacity).requires_grad_()
-        shown = (head(composed, torch.from_numpy(rays.dirs[some])) - behind) * opacity[:, None]
+        opacity = torch.from_numpy(fetches.opacity).requires_grad_()
+        shown = (head(composed, torch.from_numpy(rays.teacher.rays_d[some])) - behind) * opacity[:, None]
         signs = torch.from_numpy(random.choice(np.array([-1, 1], np.float32), (len(some), 3)))
         along, along_opacity = torch.autograd.grad((shown * signs).sum(), (composed, opacity))
         gradient = np.ascontiguousarray(along.numpy())
@@ -139,7 +139,7 @@ def importance(
         add_squares(fetches.starts, *fetches.features, slopes, changed[1], of_features)
         slopes = np.empty(len(fetches.weights), np.float32)
         slants(
-            fetches.starts, *fetches.features, *fetches.densities, fetches.weights, grid_opacity,
+            fetches.starts, *fetches.features, *fetches.densities, fetches.weights, fetches.opacity,
             stored.features, gradient, along_opacity.numpy(), grid.density_low, grid.density_slope,
             fetches.lengths, stored.density, slopes,
         )  # fmt: skip

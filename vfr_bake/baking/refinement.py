@@ -38,9 +38,10 @@ from vfr_bake.training.muon import Muon
 
 N_CALIBRATION = 20_000
 """Rays that the calibration of the head's activations takes: they decide the ranges."""
-BATCH, HEAD_BATCH = 2048, 1024
-"""Rays of a step, and of a step in which the head alone is trained: twice the steps with half the rays gain
-more."""
+BATCH, HEAD_BATCH = 4096, 1024
+"""Rays of a step, and of a step in which the head alone is trained. Codes are rounded anew in each step, to
+which a head adapts better with more rays; one that is trained alone gains more by twice the steps with half
+the rays."""
 UNIT = 4.0
 """Mean sizes of a channel's composites that make a unit of it; so large a unit makes the first weights of the
 size that the learning rate fits."""
@@ -57,14 +58,14 @@ rays alone."""
 PASSES = 10
 """How often a round of refinement looks at each training ray, unless that takes more steps than the preset
 has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
-HEAD_STEPS, LAST_STEPS = 2000, 1000
+HEAD_STEPS, LAST_STEPS = 1000, 1000
 """Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
 the lookups and bits with which it is played: at most as many as refinement may have. They take a fifth of the
 time of its steps."""
 AT_K = 0.25
 """Factor of the head's learning rate in the last round, where little is left to be learned."""
-N_LAST = 200_000
-"""Rays from which the head is trained in the last round."""
+N_HEAD = 1_000_000
+"""Rays from which a head is trained alone, whose composites are found once."""
 SHARES = {"small head": 0.2, "refinement": 0.85, "head at k": 1.0, "refinement at k": 1.0}
 """Share of the time that is left which a round may take."""
 DIRECTION_SHARE = 0.1
@@ -147,7 +148,7 @@ class Tuning:
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
             with self._steps("small head", min(HEAD_STEPS, choice.refine_steps)) as steps:
-                stored = replace(stored, head=train_head(stored, rays, steps, NEW_HEAD_RATE))
+                stored = replace(stored, head=train_head(stored, rays.some(N_HEAD), steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
@@ -178,7 +179,7 @@ class Tuning:
         if self.n_fetches and lost > WORTH_FEATURES:
             return self._refined_at_k(stored, grid, teacher, before, AT_K * head_rate, code_rate)
         if lost > WORTH_A_ROUND:
-            rays = collect_training_rays(teacher.some(N_LAST), grid, self.n_fetches)
+            rays = collect_training_rays(teacher.some(N_HEAD), grid, self.n_fetches)
             with self._steps("head at k", min(LAST_STEPS, choice.refine_steps)) as steps:
                 head = train_head(stored, rays, steps, AT_K * head_rate, self.ranges)
             after = self._held_out.measure("head at k", grid, runner(head, self.ranges), self.n_fetches)
@@ -244,7 +245,7 @@ class Tuning:
         if self._choice.head_bits == 32:
             return before
         rays = collect_training_rays(teacher.some(N_CALIBRATION), grid, self.n_fetches)
-        ranges = activation_ranges(stored.head, rays.composed(stored.features), rays.dirs)
+        ranges = activation_ranges(stored.head, rays.composed(stored.features)[0], rays.teacher.rays_d)
         after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_fetches)
         lost = self._held_out.lost(before.shown, after.shown)
         if lost.most * ROUNDING_LEFT > self._choice.target_loss_db:
@@ -318,11 +319,10 @@ def train_head(
     torch.manual_seed(0)
     head = FoldedHead(stored.head, UNIT * rays.typical(stored.features), ranges)
     muon = Muon(head.parameters())
-    composed = rays.composed(stored.features)
+    composed, opacity = (torch.from_numpy(of_rays) for of_rays in rays.composed(stored.features))
     for step in steps:
         some = random.integers(0, len(rays), HEAD_BATCH)
-        shown, opacity = torch.from_numpy(composed[some]), torch.from_numpy(rays.opacity[some])
-        _loss(head, shown, opacity, rays, some).backward()
+        _loss(head, composed[some], opacity[some], rays.teacher.chosen(some)).backward()
         muon.step(rate * steps.falling(step))
     return head.weights()
 
@@ -355,15 +355,15 @@ def refine(
         falling = steps.falling(step)
         moving = falling if step else 0.0  # stored values wait for the squared gradients of the first rays
         some = random.integers(0, len(rays), BATCH)
-        fetches, shown_opacity = rays.fetches(some), rays.opacity[some]
+        fetches = rays.fetches(some)
         if density_range is not None:
             weigh(
                 fetches.starts, *fetches.densities, density, low, slope, fetches.lengths, MAX_TAU,
-                fetches.weights, shown_opacity,
+                fetches.weights, fetches.opacity,
             )  # fmt: skip
         composed = torch.from_numpy(fetches.compose(features)).requires_grad_()
-        opacity = torch.from_numpy(shown_opacity).requires_grad_()
-        _loss(head, composed, opacity, rays, some).backward()
+        opacity = torch.from_numpy(fetches.opacity).requires_grad_()
+        _loss(head, composed, opacity, rays.teacher.chosen(some)).backward()
         muon.step(head_rate * falling)
         assert composed.grad is not None and opacity.grad is not None
         composed_gradient = composed.grad.numpy()
@@ -371,7 +371,7 @@ def refine(
         if density_range is not None:
             fetch_gradient = np.empty(len(fetches.weights), np.float32)
             slants(
-                *where, *fetches.densities, fetches.weights, shown_opacity, features, composed_gradient,
+                *where, *fetches.densities, fetches.weights, fetches.opacity, features, composed_gradient,
                 opacity.grad.numpy(), low, slope, fetches.lengths, density, fetch_gradient,
             )  # fmt: skip
             rate = np.float32(DENSITY_RATE * moving)
@@ -391,14 +391,11 @@ def _damp(squares: np.ndarray) -> None:
     squares[:] = DAMPING * met.mean() if len(met) else 0
 
 
-def _loss(
-    head: FoldedHead, composed: Tensor, opacity: Tensor, rays: TrainingRays, some: np.ndarray
-) -> Tensor:
-    """Mean squared error of the colours of the rays `some` over random backgrounds."""
-    dirs, colours, full_opacity = (
-        torch.from_numpy(column[some]) for column in (rays.dirs, rays.colours, rays.full_opacity)
-    )
-    background = torch.rand(len(some), 3)
+def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, rays: TeacherRays) -> Tensor:
+    """Mean squared error of the colours of the `rays` over random backgrounds, where they compose
+    [n, n_channels] and have this opacity [n]."""
+    dirs, colours, full_opacity = map(torch.from_numpy, (rays.rays_d, rays.colours, rays.opacity))
+    background = torch.rand(len(dirs), 3)
     shown = head(composed, dirs) * opacity[:, None] + background * (1 - opacity)[:, None]
     wanted = colours + background * (1 - full_opacity)[:, None]
     return ((shown - wanted) ** 2).mean()

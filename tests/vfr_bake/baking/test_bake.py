@@ -20,12 +20,21 @@ from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.cameras.camera import orbit
 from player.errors import ConfigError, OutputError, TrainingError
+from player.march.fetches import MIN_TOTAL
 from player.march.march import march
 from player.render import render
+from tests.numerics.fog import fog
 from tests.vertex_grids import rows_of
 from vfr_bake.baking.bake import BakeResult, _Bake, bake
 from vfr_bake.baking.cells import corners_of, pixel_footprints
-from vfr_bake.baking.distillation import TrainingRays, player_fetches
+from vfr_bake.baking.distillation import (
+    Fetches,
+    TeacherRays,
+    TrainingRays,
+    collect_training_rays,
+    corners,
+    player_fetches,
+)
 from vfr_bake.baking.grids import code_step, encode_features, head_sensitivity, project
 from vfr_bake.baking.head import FoldedHead, fold_head
 from vfr_bake.baking.held_out import views_between
@@ -118,6 +127,17 @@ def test_feature_codes_are_within_half_a_step(size: float) -> None:
     assert np.abs(codes[:, 2].astype(int)).max() < 30, "a channel of little use takes few bits"
 
 
+def test_the_few_largest_features_do_not_make_all_codes_coarse() -> None:
+    values = np.random.default_rng(1).uniform(-1, 1, (50_000, 2)).astype(np.float32)
+    values[:4] *= 1000
+    step = code_step(values)
+    assert step == pytest.approx(1 / 127, rel=1e-3)
+    assert np.abs(encode_features(values / step)[:4]).max() == 127, "they end there"
+    few = np.zeros((50_000, 2), np.float32)
+    few[7, 1] = -5.0
+    assert code_step(few) == pytest.approx(5 / 127), "there is nothing else"
+
+
 def test_every_corner_of_a_visible_cell_is_stored() -> None:
     cells = np.random.default_rng(0).random((5, 5, 5)) < 0.1
     expected = {tuple(cell + corner) for cell in np.argwhere(cells) for corner in np.ndindex(2, 2, 2)}
@@ -150,15 +170,22 @@ def test_folded_head_equals_the_head() -> None:
     np.testing.assert_allclose(rgb, expected, rtol=0, atol=2e-6)
 
 
-def training_rays_of(codes: np.ndarray, dirs: np.ndarray, wanted: np.ndarray) -> TrainingRays:
-    """One fetch a ray, each of its own vertex of a grid of 16 cells."""
-    n = len(codes)
-    coords, masks, order = pack_vertices(np.argwhere(np.ones((16, 16, 16)))[:n])
-    points = np.argwhere(np.ones((16, 16, 16)))[:n][order].astype(np.float32)
-    rows, ones = rows_of(coords, masks, 16), np.ones(n, np.float32)
-    return TrainingRays(
-        np.arange(n + 1), points, ones, ones, dirs, ones.copy(), wanted, ones, rows, np.float32(1), rows
-    )
+class OneFetchEach(TrainingRays):
+    """Rays of one fetch each, with the weight 1: the first vertices of a grid of 16 cells, one after the
+    other."""
+
+    def fetches(self, some: np.ndarray) -> Fetches:
+        n = len(self)
+        coords, masks, order = pack_vertices(np.argwhere(np.ones((16, 16, 16)))[:n])
+        points = np.argwhere(np.ones((16, 16, 16)))[:n][order].astype(np.float32)
+        around, ones = corners(rows_of(coords, masks, 16), points[some], MIN_TOTAL), np.ones(len(some))
+        weights = ones.astype(np.float32)
+        return Fetches(np.arange(len(some) + 1), around, around, weights, weights.copy(), weights.copy())
+
+
+def training_rays_of(dirs: np.ndarray, wanted: np.ndarray) -> TrainingRays:
+    teacher = TeacherRays(np.zeros_like(wanted), dirs, wanted, np.ones(len(dirs), np.float32))
+    return OneFetchEach(teacher, fog(0.1), 0, None)
 
 
 def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,12 +199,12 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
         wanted = FoldedHead(weights)(codes, dirs).numpy()
     # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
     baked = (codes * 0.8 + 10).numpy().round()
-    training_rays = training_rays_of(baked, dirs.numpy(), wanted)
+    training_rays = training_rays_of(dirs.numpy(), wanted)
     stored = Stored(weights, baked, np.full(4000, 255, np.float32))
     opaque = (0.0, float(np.log(20)))  # of a sample of length 1 with the largest code
 
     def error(stored: Stored) -> float:
-        composed = torch.from_numpy(training_rays.composed(stored.features))
+        composed = torch.from_numpy(training_rays.composed(stored.features)[0])
         with torch.no_grad():
             shown = FoldedHead(stored.head)(composed, dirs).numpy()
         return float(np.mean((shown - wanted) ** 2))
@@ -267,21 +294,20 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, n_fetche
     grid = layout.grid(stored.density, stored.features)
     rays_o, rays_d = model.model_cameras()[3].rays()
     played = march(grid, rays_o, rays_d, n_fetches)
-    hits, opacity, *fetches = player_fetches(grid, rays_o, rays_d, n_fetches)
-    counts, points, weights, lengths = fetches
-    assert np.array_equal(hits, played.hits) and len(hits) > 100
-    np.testing.assert_allclose(opacity, played.opacity[hits], rtol=1e-6)  # compiled, and in numpy
-    training_rays = training_rays_of(np.zeros((len(hits), 1)), rays_d[hits], rays_d[hits])
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    training_rays = replace(training_rays, starts=starts, points=points, weights=weights, lengths=lengths)
-    training_rays = replace(training_rays, features=grid.rows, feature_scale=grid.feature_scale)
+    found = player_fetches(grid, rays_o, rays_d, n_fetches)
+    assert np.array_equal(found.hits, played.hits) and len(found.hits) > 100
+    np.testing.assert_allclose(found.opacity, played.opacity[found.hits], rtol=1e-6)  # compiled, and in numpy
     merged = (
-        lengths == 0
+        found.lengths == 0
     )  # several samples, of which there is none in a ray that has no more than are fetched
-    assert (lengths[~merged] == grid.step).all() and merged.any() == (n_fetches > 0)
-    composed = training_rays.composed(grid.features.astype(np.float32))
+    assert (found.lengths[~merged] == grid.step).all() and merged.any() == (n_fetches > 0)
+    nothing = np.zeros_like(rays_o)
+    teacher = TeacherRays(rays_o, rays_d, nothing, nothing[:, 0])
+    training_rays = collect_training_rays(teacher, grid, n_fetches)
+    composed, opacity = training_rays.composed(grid.features.astype(np.float32))
     # float32 sums of up to 127 in another order
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
+    assert np.array_equal(opacity, found.opacity)
 
 
 def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:

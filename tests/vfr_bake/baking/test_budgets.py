@@ -16,24 +16,21 @@ from player.asset.asset import Asset
 from player.errors import TrainingError
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
     FEWEST_RAYS,
-    HIT_BYTES,
     N_RAYS,
     OWN_REST_COST,
     RAYS_OF_CELL,
-    SAMPLE_BYTES,
     UNBOUNDED_RAYS,
     VERTEX_COST,
     expected_seconds,
     make_plan,
 )
-from vfr_bake.baking.refinement import Stored, Tuning
+from vfr_bake.baking.refinement import Stored
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 from vfr_bake.training.model_file import Model
@@ -103,7 +100,7 @@ def test_less_memory_means_fewer_rays(model: Model) -> None:
     plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in sizes]
     rays = [plan.n_rays(n_cells) for plan in plans]
     assert rays[0] < rays[1] < rays[2] == N_RAYS
-    assert plans[1].n_rays(plans[1].most_cells) < rays[1]  # the more cells, the less room
+    assert plans[1].n_rays(1.2 * n_cells) < rays[1]  # the more cells, the less room
     assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, sizes, strict=True))
 
 
@@ -120,26 +117,6 @@ def test_as_many_cells_as_fit_leave_room_for_the_rays_that_teach_them(unbounded:
 def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:
     plan = make_plan(model, BakeConfig(resolution=48))
     assert [plan.n_rays(n) for n in (1e3, 5e5, 3e6)] == [FEWEST_RAYS, 5e5 * RAYS_OF_CELL, N_RAYS]
-
-
-def test_rays_through_fog_are_fewer(model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They have hundreds of samples, for which there is as much room as for those that were expected."""
-    plan = replace(make_plan(model, BakeConfig(resolution=48)), unbounded=True)
-    n = plan.rays_that_fit(500_000, 112)
-    assert 0.95 < n * (HIT_BYTES + SAMPLE_BYTES * 112) / (500_000 * plan.ray_bytes) <= 1
-    assert plan.rays_that_fit(500_000, 33) > 500_000, "what was expected"
-    learned_from = []
-
-    def run(tuning: Tuning, stored: Stored, layout: Layout, teacher: TeacherRays, again: object) -> Stored:
-        learned_from.append(len(teacher.opacity))
-        return tune(tuning, stored, layout, teacher, again)
-
-    tune: Any = Tuning.run
-    monkeypatch.setattr(Tuning, "run", run)
-    bake(model, tmp_path / "clear", BakeConfig(**SMALL), quiet)
-    monkeypatch.setattr("vfr_bake.baking.plan.SAMPLE_BYTES", 5000)
-    bake(model, tmp_path / "fog", BakeConfig(**SMALL), quiet)
-    assert 0 < learned_from[1] < learned_from[0] / 2
 
 
 def test_what_was_refined_is_gone_when_the_mesh_is_made(

@@ -58,10 +58,10 @@ def test_refinement_gets_back_what_8_bits_lose() -> None:
     codes = codes.round()
     wanted = runner(weights)(codes, dirs)
     ranges = tuple((low, 2 * high) for low, high in activation_ranges(weights, codes, dirs))
-    training_rays = training_rays_of(codes, dirs, wanted)
+    training_rays = training_rays_of(dirs, wanted)
 
     def error(stored: Stored) -> float:
-        composed = training_rays.composed(stored.features)
+        composed, _ = training_rays.composed(stored.features)
         return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
 
     stored = Stored(weights, codes, np.zeros(len(codes), np.float32))

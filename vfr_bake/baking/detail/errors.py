@@ -204,7 +204,7 @@ def density_errors(levels: LevelsOfDensities, rays: TeacherRays) -> np.ndarray:
     out = np.zeros((n_levels, n_bricks))
     grids = [levels.at(level) for level in range(n_levels)]
     for first in range(0, len(rays.opacity), RAYS_AT_ONCE):
-        some = TeacherRays(*(column[first : first + RAYS_AT_ONCE] for column in vars(rays).values()))
+        some = rays.chosen(slice(first, first + RAYS_AT_ONCE))
         parts = []
         for grid in grids:
             (samples,) = samples_of(grid, some)

@@ -32,7 +32,7 @@ def rays_of(n_views: int) -> TeacherRays:
     pairs = [camera.rays() for camera in views(n_views)]
     rays_o, rays_d = (np.concatenate(column) for column in zip(*pairs, strict=True))
     n = len(rays_o)
-    return TeacherRays(rays_o, rays_d, np.zeros((n, 1)), np.zeros((n, 3)), np.ones(n, np.float32))
+    return TeacherRays(rays_o, rays_d, np.zeros((n, 3)), np.ones(n, np.float32))
 
 
 def some_layout(seed: int, features: int = 40, contracted: bool = False) -> Layout:

@@ -221,8 +221,9 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
     head = runner(stored.head)
 
     def colours(features: np.ndarray) -> np.ndarray:
-        rgb = head(rays.composed(features), rays.dirs).astype(np.float64) - model.background
-        return rgb * rays.opacity[:, None]
+        composed, opacity = rays.composed(features)
+        rgb = head(composed, rays.teacher.rays_d).astype(np.float64) - model.background
+        return rgb * opacity[:, None]
 
     some = np.argsort(found.features)[-400::40]
     changes, base = [], colours(np.rint(stored.features))
