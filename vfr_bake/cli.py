@@ -241,11 +241,11 @@ def _preview(options: Any, scene: Scene) -> Preview:
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
-    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM
+    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, seconds_a_step
 
     last = None
     interrupted = False
-    timed_from = None
+    ends: list[float] = []
     saved = time.monotonic()
     with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
@@ -262,10 +262,10 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                     last.progress,
                     f"loss {error:.5f}  PSNR {_decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
                 )
-                if trainer.next_step == TIMED_FROM:
-                    timed_from = last.seconds
-                if trainer.next_step == EXPECTED_AT and timed_from is not None:
-                    _expect(trainer, (last.seconds - timed_from) / (EXPECTED_AT - TIMED_FROM), bar)
+                if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
+                    ends.append(last.seconds)
+                if trainer.next_step == EXPECTED_AT and len(ends) > 1:
+                    _expect(trainer, seconds_a_step(ends), bar)
                 if preview is not None:
                     preview.update(trainer)
                 due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes

@@ -58,7 +58,7 @@ rays alone."""
 PASSES = 10
 """How often a round of refinement looks at each training ray, unless that takes more steps than the preset
 has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
-HEAD_STEPS, LAST_STEPS = 1000, 1000
+HEAD_STEPS, LAST_STEPS = 2000, 1000
 """Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
 the lookups and bits with which it is played: at most as many as refinement may have. They take a fifth of the
 time of its steps."""

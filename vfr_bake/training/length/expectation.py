@@ -8,13 +8,24 @@ is a range.
 from __future__ import annotations
 
 import math
+import statistics
+from itertools import pairwise
 
 TIMED_FROM, EXPECTED_AT = 300, 400
-"""The speed is that of the steps between these two: before them kernels are compiled, and the pilot network
-learns."""
+"""The speed is that of the steps between these two: before them the pilot network learns."""
 DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.3)}
 """Gain in dB at the least and at the most, by whether the scene is unbounded: of lego and the built-in scene,
 and of fox and can, from 400 steps to the end of 2 to 10 minutes."""
+
+
+def seconds_a_step(ends: list[float]) -> float:
+    """How long a step takes, by the seconds at which steps ended, two of them at least: the median, because
+    whatever is compiled in the first of them takes as long as hundreds.
+
+    >>> round(seconds_a_step([10.0, 10.01, 14.0, 14.01, 14.02]), 6)
+    0.01
+    """
+    return statistics.median(after - before for before, after in pairwise(ends))
 
 
 def expectation(psnr: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool) -> str:
