@@ -60,7 +60,7 @@ VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
 fast as the millions of a bake."""
-STEP_COST, HEAD_COST = {False: 2.0, True: 1.2}, {False: 1.3, True: 0.45}
+STEP_COST, HEAD_COST = {False: 2.7, True: 0.5}, {False: 1.3, True: 0.45}
 """Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
 unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
 and the following count what one thread waits for on two cores
