@@ -59,13 +59,13 @@ class BakeChoice:
 
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
-        cells_per_pixel=1.95, contracted_resolution=1152, feature_share=0.68, culled_loss_db=0.02,
+        cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.01, density_step=2, code_levels=127, head_width=0, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=400, minutes=5, mesh_resolution=128, target_loss_db=0.05,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.55, contracted_resolution=1088, feature_share=0.71, culled_loss_db=0.04,
+        cells_per_pixel=1.55, contracted_resolution=1408, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.04, density_step=4, code_levels=50, head_width=64, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
