@@ -24,6 +24,7 @@ from vfr_bake.baking.plan import (
     FEWEST_RAYS,
     N_RAYS,
     OWN_REST_COST,
+    PROGRAM_BYTES,
     RAYS_OF_CELL,
     UNBOUNDED_RAYS,
     VERTEX_COST,
@@ -96,7 +97,9 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
 
 
 def test_less_memory_means_fewer_rays(model: Model) -> None:
-    sizes, n_cells = (1.6, 1.8, 4.0), N_RAYS / RAYS_OF_CELL
+    n_cells = N_RAYS / RAYS_OF_CELL
+    of_cells = n_cells * make_plan(model, BakeConfig(resolution=48)).cell_bytes + PROGRAM_BYTES
+    sizes = [of_cells / 1e9 + more for more in (0.05, 0.2, 2.0)]
     plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in sizes]
     rays = [plan.n_rays(n_cells) for plan in plans]
     assert rays[0] < rays[1] < rays[2] == N_RAYS
