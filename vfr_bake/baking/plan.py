@@ -131,9 +131,9 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
     plan = replace(plan, n_cells=min(plan.n_cells, float(max(plan.most_cells, 0))))
     if plan.most_cells <= 0 or marks > room:
-        least = max(marks, FEWEST_RAYS * plan.ray_bytes)
+        least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(
-            f"max_memory: expected at least {(PROGRAM_BYTES + least) / 1e9:.2f} GB for {fine} cells "
+            f"max_memory: expected at least {np.ceil(least / 1e7) / 100:.2f} GB for {fine} cells "
             f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"
         )
     return plan
