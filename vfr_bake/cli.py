@@ -241,7 +241,7 @@ def _preview(options: Any, scene: Scene) -> Preview:
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
-    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, seconds_a_step
+    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
 
     last = None
     interrupted = False
@@ -265,7 +265,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                 if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
                     ends.append(last.seconds)
                 if trainer.next_step == EXPECTED_AT and len(ends) > 1:
-                    _expect(trainer, seconds_a_step(ends), bar)
+                    _expect(trainer, typical_step(ends), bar)
                 if preview is not None:
                     preview.update(trainer)
                 due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes

@@ -18,11 +18,11 @@ DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.3)}
 and of fox and can, from 400 steps to the end of 2 to 10 minutes."""
 
 
-def seconds_a_step(ends: list[float]) -> float:
-    """How long a step takes, by the seconds at which steps ended, two of them at least: the median, because
-    whatever is compiled in the first of them takes as long as hundreds.
+def typical_step(ends: list[float]) -> float:
+    """Seconds that a step takes, by the seconds at which steps ended, two of them at least: the median,
+    because whatever is compiled in the first of them takes as long as hundreds.
 
-    >>> round(seconds_a_step([10.0, 10.01, 14.0, 14.01, 14.02]), 6)
+    >>> round(typical_step([10.0, 10.01, 14.0, 14.01, 14.02]), 6)
     0.01
     """
     return statistics.median(after - before for before, after in pairwise(ends))
