@@ -3,8 +3,9 @@ taken apart so that it can be trained.
 
 Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
 densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
-x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. A training ray holds that map, by the player's own
-choice of samples. Where the densities are trained too, at every sample, it also holds where their codes are.
+x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. The fetches of training rays hold that map, by
+the player's own choice of samples. Where the densities are trained too, at every sample, they also hold where
+their codes are.
 
 With the field's own features in place of the stored codes, the same map tells what the grid loses by itself.
 """
