@@ -69,6 +69,13 @@ def keep(dispatcher: Any, *packages: Path) -> Any:
     return dispatcher
 
 
+def user_folder() -> Path:
+    """The user's folder of what is kept between runs: `$XDG_CACHE_HOME/vfr-bake`, on every system; where that
+    is not set, where the system has such folders."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return Path(root) / "vfr-bake" if root else Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir)
+
+
 @lru_cache(maxsize=8)
 def place(*packages: Path) -> Place:
     """Where code of the sources in `packages` is kept; its folder is made if it is not there."""
@@ -76,9 +83,8 @@ def place(*packages: Path) -> Place:
     if digest is None:
         return Place(None, "", None)
     told, beside = getattr(config, "CACHE_DIR", ""), packages[0] / "__pycache__"
-    of_user = Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir)
     refused = None
-    for root in (*([Path(told)] if told else []), beside, of_user):
+    for root in (*([Path(told)] if told else []), beside, user_folder()):
         folder = root / f"compiled-{digest[:16]}"
         try:
             _make(root)

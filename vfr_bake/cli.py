@@ -85,7 +85,7 @@ def _train(options: Any) -> int:
     if options.model is None:
         print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
         return 2
-    check_target(options.model, options.force)
+    check_target(options.model, options.force, is_file=True)
     config = options.config
     processes = Processes.from_environment()
     # The pictures of a ZIP or a video are looked at when they are there.
@@ -138,7 +138,7 @@ def _check(options: Any) -> int:
 
     page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
     ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
-    check_target(page, options.force or ours)
+    check_target(page, options.force or ours, is_file=True)
     with Bar("looking") as bar:
         check = check_data(options.data, working_size(options.config), progress=bar.count)
     write_bytes(page, check_page(check))
@@ -190,7 +190,7 @@ def _with_cameras(data: str) -> str:
     if not needs_cameras(data):
         return data
     with Bars() as bars:
-        report = estimate_cameras(Path(data), bars.count)
+        report = estimate_cameras(Path(data), bars.count, partial(_say, data))
     print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
     for name, reason in report.unplaced.items():
         print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
@@ -233,7 +233,7 @@ def _preview(options: Any, scene: Scene) -> Preview:
     from vfr_bake.training.preview import Preview, preview_path
 
     path = preview_path(options.model)
-    check_target(path, options.force or options.resume)
+    check_target(path, options.force or options.resume, is_file=True)
     print(f"vfr-train: look at {printable(str(path))}, new every minute", file=sys.stderr)
     return Preview(scene, path)
 
@@ -467,7 +467,7 @@ def _bench(options: Any) -> int:
     options.check()
     for target in (options.html, options.json):
         if target is not None and str(target) != "-":
-            check_target(target, options.force)
+            check_target(target, options.force, is_file=True)
     lpips = None if options.lpips is None else Lpips(options.lpips)
     with Bars() as bars:
         trade = measure_trade(options, lpips, bars.count)

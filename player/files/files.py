@@ -98,9 +98,11 @@ def _inside(path: Path, folder: Path) -> Path:
     return place
 
 
-def check_target(path: Path, force: bool = False) -> None:
+def check_target(path: Path, force: bool = False, is_file: bool = False) -> None:
     """Refuse a target that exists, unless `force`, or that cannot be written because it or its folder is
     read-only; called before long work, so that nobody waits for a refusal.
+
+    `is_file`: whether a file is to be written, which a folder is never replaced by.
 
     What a process that was killed has left in its folder is finished or removed first
     (`player.files.replace`).
@@ -109,6 +111,8 @@ def check_target(path: Path, force: bool = False) -> None:
     """
     try:
         clear_up(path.parent)
+        if is_file and path.is_dir():
+            raise OutputError(f"{path}: expected a file to write, got a folder: name a file in it")
         if path.exists() and not force:
             raise OutputError(f"{path}: already exists: add --force to replace it")
         if path.exists() and not os.access(path, os.W_OK):

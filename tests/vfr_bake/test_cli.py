@@ -256,6 +256,13 @@ def test_a_model_that_exists_is_kept_before_any_work(
     assert (tmp_path / "model.pt").read_bytes() == b"precious"
 
 
+def test_a_folder_as_model_is_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main([str(tmp_path / "nowhere"), str(tmp_path), "--force"]) == 1
+    one_error(capsys, str(tmp_path), "expected a file to write, got a folder")
+
+
 @pytest.mark.parametrize("command", [bake_main, eval_main])
 def test_a_file_that_is_no_model(command, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "model.pt").write_bytes(b"PK\x03\x04 but not really")
@@ -363,7 +370,7 @@ def test_photographs_without_cameras_have_them_estimated(
     one_error(capsys, str(photos))
     calls = []
 
-    def estimate(folder: Path, progress: object) -> object:
+    def estimate(folder: Path, progress: object, say: object) -> object:
         calls.append(folder)
         raise DataError("found none")
 

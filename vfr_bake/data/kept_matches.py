@@ -1,6 +1,7 @@
 """Features and matches of pictures whose cameras are not known yet, on disk until they are.
 
 An estimation that was interrupted goes on where it was, and one of more pictures begins with what is known.
+Where the disk refuses, nothing more is kept, and the estimation goes on without.
 
 Two files of records, one after the other, little-endian; a last record that is cut short does not count.
 
@@ -16,6 +17,8 @@ import shutil
 import struct
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -62,13 +65,22 @@ class KeptMatches:
     """The records of one set of pictures, in a folder of their own. Its methods may be called from several
     threads."""
 
-    def __init__(self, folder: Path) -> None:
-        """`folder`: made where it is missing; what cannot be read in it is cut off."""
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, folder: Path, say: Callable[[str], object] | None = None) -> None:
+        """`folder`: made where it is missing; what cannot be read in it is cut off. `say`: called once, with
+        a sentence, where the disk refuses to keep more."""
         self._folder = folder
+        self._say = say or (lambda text: None)
         self._lock = threading.Lock()
         self._looks: dict[bytes, int] = {}
         self._matches: dict[bytes, int] = {}
+        self._keeps = True
+        try:
+            self._open()
+        except OSError as error:
+            self._give_up(error)
+
+    def _open(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
         for path, header, index, n_bytes in (
             (self._looks_path, _LOOK, self._looks, lambda n: SIDE * SIDE + n * _BYTES_A_FEATURE),
             (self._matches_path, _MATCHES, self._matches, lambda n: n * _BYTES_A_MATCH),
@@ -85,14 +97,23 @@ class KeptMatches:
                         end = next_end
                     file.truncate(end)
 
+    def _give_up(self, error: OSError) -> None:
+        self._keeps = False
+        self._say(
+            f"{self._folder}: cannot write: {error.strerror or error}: no more features and matches are "
+            "kept: if the estimation of cameras is interrupted, it looks for them again"
+        )
+
     @classmethod
-    def of(cls, photos: Path, root: Path) -> KeptMatches:
+    def of(cls, photos: Path, root: Path, say: Callable[[str], object] | None = None) -> KeptMatches:
         """What is kept of the pictures in the folder `photos`, in a folder in `root`; others there that
         nothing was added to for a month are deleted."""
-        for path in root.glob("*/features.bin"):
-            if time.time() - path.stat().st_mtime > MOST_SECONDS:
-                shutil.rmtree(path.parent, ignore_errors=True)
-        return cls(root / hashlib.blake2b(str(photos.resolve()).encode(), digest_size=STAMP).hexdigest())
+        with suppress(OSError):  # of another user, or gone by now
+            for path in root.glob("*/features.bin"):
+                if time.time() - path.stat().st_mtime > MOST_SECONDS:
+                    shutil.rmtree(path.parent, ignore_errors=True)
+        name = hashlib.blake2b(str(photos.resolve()).encode(), digest_size=STAMP).hexdigest()
+        return cls(root / name, say)
 
     @property
     def _looks_path(self) -> Path:
@@ -139,9 +160,17 @@ class KeptMatches:
         self._append(self._matches_path, self._matches, a + b, record)
 
     def _append(self, path: Path, index: dict[bytes, int], key: bytes, record: bytes) -> None:
-        with self._lock, path.open("ab") as file:
-            index[key] = file.tell()
-            file.write(record)
+        with self._lock:
+            if not self._keeps:
+                return
+            try:
+                with path.open("ab") as file:
+                    at = file.tell()
+                    file.write(record)
+            except OSError as error:
+                self._give_up(error)
+                return
+            index[key] = at
 
     def remove(self) -> None:
         """Delete the folder."""

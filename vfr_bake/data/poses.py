@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba.misc.appdirs import AppDirs
 
-from player.cameras.colmap import MAX_FILE_BYTES
+from player.cameras.colmap import FOLDERS, MAX_FILE_BYTES, colmap_folder
 from player.cameras.rotations import OPENGL_FROM_OPENCV
-from player.errors import DataError, FormatError
-from player.files.files import new_folder, read_bytes
+from player.errors import DataError, FormatError, OutputError
+from player.files.files import check_target, new_folder, read_bytes
+from player.kept_code import user_folder
 from vfr_bake.data.features import Features, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
@@ -128,7 +128,9 @@ def has_pictures(folder: Path) -> bool:
     return bool(find_pictures(folder)[1])
 
 
-def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
+def estimate_cameras(
+    photos: Path, progress: Progress, say: Callable[[str], object] | None = None
+) -> PoseReport:
     """Estimate the camera of every picture, and keep the result as `sparse/0` beside the pictures.
 
     `photos`: a folder with pictures in `images/` or in itself, or in folders within these, or a video, whose
@@ -136,7 +138,7 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     left as it is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a
     video, then `features`, `matches`, `cameras`; where those of a handful are too few `cameras, attempt 2`
     and so on, where they are folded `walk`, `turns`, `cameras again`), how much of it is done and how much
-    there is.
+    there is. `say`: called with a sentence where what is known of the pictures cannot be kept until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -147,8 +149,8 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     order are not, unless their surroundings prevent it. Parts that share pictures are joined
     (`vfr_bake.data.models.joining`); of others the largest is taken.
 
-    Raises DataError (nothing that can be used; what to photograph differently), FormatError (a damaged
-    `sparse/0`), OutputError, MissingExtraError.
+    Raises DataError (nothing that can be used; what to photograph differently; a COLMAP model as text),
+    FormatError (a damaged `sparse/0`), OutputError (the folder is read-only), MissingExtraError.
     """
     if is_video(photos):
         photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of))
@@ -156,6 +158,7 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
         found = "a file of another kind" if photos.exists() else "nothing"
         raise DataError(f"{photos}: expected a folder of pictures or a video, got {found}")
     place, pictures = find_pictures(photos)
+    _refuse_text(photos)
     model = photos / "sparse" / "0"
     if model.exists():
         return _read_report(model, photos, len(pictures))
@@ -165,9 +168,13 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
             f"got {len(pictures)}{other_kinds(photos)}"
         )
     pycolmap_module()  # said at once if it is missing, not after minutes
+    try:
+        check_target(model)
+    except OutputError as error:
+        raise OutputError(f"{error}: copy the pictures to a folder that you can write to") from error
     names = [path.relative_to(place).as_posix() for path in pictures]
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
-    known = KeptMatches.of(photos, cache_root())
+    known = KeptMatches.of(photos, cache_root(), say)
     looks = look_at(masked, known, lambda done, of: progress("features", done, of))
     repeated = _repeated(photos, looks)
     kept = [number for number in range(len(names)) if number not in repeated]
@@ -201,9 +208,21 @@ def estimate_cameras(photos: Path, progress: Progress) -> PoseReport:
     return _read_report(model, photos, len(pictures))
 
 
+def _refuse_text(photos: Path) -> None:
+    """Raises DataError for a COLMAP model that is there as text alone."""
+    if colmap_folder(photos) is not None:
+        return
+    for model in (photos / name for name in FOLDERS):
+        if (model / "images.txt").exists():
+            raise DataError(
+                f"{model}: cameras: expected a COLMAP model in binary form, got one as text: convert it with "
+                "colmap model_converter --output_type BIN, or remove it to have the cameras estimated"
+            )
+
+
 def cache_root() -> Path:
     """The user's folder of what is kept of sets of pictures whose cameras are not known yet."""
-    return Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir) / "matches"
+    return user_folder() / "matches"
 
 
 def why_unplaced(

@@ -16,6 +16,7 @@ from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.files.masks import check_masked
+from vfr_bake.data.world import MOST_POINTS
 
 BORDER = 2
 """Pixels along a picture's edge that tell a plain background."""
@@ -147,6 +148,7 @@ def _near(cameras: list[Camera], points: np.ndarray | None, unit: float) -> floa
     """How near to a camera matter may begin, in units of `unit`."""
     if points is None or len(points) == 0:
         return NEAR_CAMERA
+    points = points[:: max(1, len(points) // MOST_POINTS)]
     depths = np.concatenate([(camera.c2w[:3, 3] - points) @ camera.c2w[:3, 2] for camera in cameras])
     ahead = depths[depths > 0]
     if len(ahead) == 0:

@@ -28,6 +28,7 @@ MIN_SHARE, MAX_BELOW = 0.2, 0.05
 THICKNESS = 0.01
 """Half the thickness of the ground, as a share of the median distance of the points from their middle."""
 MOST_POINTS = 5000
+"""About so many points of a scene are enough to tell of all."""
 
 
 def find_up(c2w: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -1,22 +1,27 @@
 """Checkpoints, from which `vfr-train --resume` goes on: all of a trainer's state, beside the model file until
 that is written.
 
-Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), state (`Trainer.state`).
-Tensors and plain values only; loads with `weights_only=True`.
+Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), pictures (names of the training
+views), cameras (of these, [n_views, 22]), state (`Trainer.state`). Tensors and plain values only; loads with
+`weights_only=True`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from player.errors import ConfigError, FormatError
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
 from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-checkpoint"
-VERSION = [1, 4]
+VERSION = [1, 5]
 LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that goes on."""
+SAME = 1e-4
+"""Numbers of cameras that differ by no more are the same: processors round differently."""
 
 
 def checkpoint_path(model: Path) -> Path:
@@ -34,6 +39,8 @@ def save_checkpoint(path: Path, trainer: Trainer) -> None:
         "format": FORMAT,
         "version": VERSION,
         "settings": trainer.settings,
+        "pictures": [camera.name for camera in trainer.cameras],
+        "cameras": _numbers(trainer),
         "state": trainer.state(),
     }
     write_tensors(path, content)
@@ -42,7 +49,8 @@ def save_checkpoint(path: Path, trainer: Trainer) -> None:
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
     """Put `trainer` where the checkpoint was.
 
-    Raises FormatError (not a checkpoint, cut short) or ConfigError (of a run with other settings).
+    Raises FormatError (not a checkpoint, cut short) or ConfigError (of a run with other settings or other
+    pictures).
     """
     content = read_tensors(path, "a checkpoint written by vfr-train")
     if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
@@ -57,6 +65,22 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
                 f"{path}: {name}: expected {then.get(name)} as in the interrupted run, got {now.get(name)}"
             )
     try:
-        trainer.restore(content["state"])
+        same = content["pictures"] == [camera.name for camera in trainer.cameras]
+        if same := same and torch.allclose(content["cameras"], _numbers(trainer), rtol=0, atol=SAME):
+            trainer.restore(content["state"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FormatError(f"{path}: state: does not fit this data set: {error}") from error
+    if not same:
+        raise ConfigError(
+            f"{path}: pictures: expected those of the interrupted run with their cameras, got others: name "
+            "that data set, or train without --resume"
+        )
+
+
+def _numbers(trainer: Trainer) -> torch.Tensor:
+    """Poses and intrinsics of the training views, [n_views, 22] float64, in the model frame."""
+    rows = [
+        [*camera.c2w.reshape(-1), camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+        for camera in trainer.cameras
+    ]
+    return torch.tensor(rows, dtype=torch.float64)

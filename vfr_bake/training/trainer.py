@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from player.cameras.camera import Camera
 from player.errors import ConfigError, TrainingError
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
@@ -183,6 +184,11 @@ class Trainer:
     def field(self) -> VfrField:
         """The field on the CPU: the one that is trained, or what a GPU's is now."""
         return self._field.copied_to_cpu()
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras of the training views, model frame."""
+        return self._views.cameras
 
     @property
     def settings(self) -> dict[str, Any]:

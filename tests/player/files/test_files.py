@@ -95,6 +95,12 @@ def test_a_target_that_exists_is_refused_unless_forced(tmp_path: Path, kind: str
     check_target(target, force=True)
 
 
+def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    for force in (False, True):
+        with pytest.raises(OutputError, match="expected a file to write, got a folder: name a file in it"):
+            check_target(tmp_path, force, is_file=True)
+
+
 # --- write_bytes ---
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 from pathlib import Path
 
@@ -83,6 +85,36 @@ def test_a_picture_that_changed_has_another_stamp(tmp_path: Path):
     assert stamp(path) == first and len(first) == 16
     os.utime(path, (1, 1))
     assert stamp(path) != first
+
+
+def test_a_folder_that_cannot_be_made_is_done_without(tmp_path: Path):
+    (tmp_path / "file").write_bytes(b"")
+    said: list[str] = []
+    kept = KeptMatches.of(tmp_path, tmp_path / "file", said.append)
+    kept.keep_look(A, made(0, 7))
+    kept.keep_matches(A, B, np.array([[6, 2]], np.uint32))
+    assert kept.look(A) is None and kept.matches(A, B, 7, 3) is None
+    assert len(said) == 1 and said[0].startswith(str(tmp_path / "file"))
+    kept.remove()
+
+
+def test_a_full_disk_ends_the_keeping_alone(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    class Full(io.FileIO):
+        def write(self, data) -> int:
+            super().write(data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    said: list[str] = []
+    kept = KeptMatches(folder, said.append)
+    with monkeypatch.context() as full:
+        full.setattr(Path, "open", lambda path, mode: Full(path, mode))
+        kept.keep_look(C, made(2, 3))
+        kept.keep_matches(B, C, np.zeros((4, 2)))
+    kept.keep_look(C, made(2, 3))
+    assert len(said) == 1 and os.strerror(errno.ENOSPC) in said[0]
+    for each in (kept, KeptMatches(folder)):
+        assert same(each.look(A), made(0, 7)) and each.matches(A, B, 7, 3) is not None
+        assert each.look(C) is None and each.matches(B, C, 9, 9) is None
 
 
 def test_what_nobody_came_back_to_is_deleted(tmp_path: Path):

@@ -14,7 +14,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from player.errors import DataError, FormatError, MissingExtraError
+from player.errors import DataError, FormatError, MissingExtraError, OutputError
 from vfr_bake.data import mapping, poses
 from vfr_bake.data.check.check import check_data
 from vfr_bake.data.features import find_features, match
@@ -137,6 +137,24 @@ def test_a_cut_model_is_named(can, tmp_path: Path):
         estimate_cameras(tmp_path / "a", quiet)
 
 
+@pytest.mark.parametrize("where", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_a_model_as_text_is_named(tmp_path: Path, where: str):
+    photos = save(tmp_path, [textured(seed) for seed in range(3)])
+    (photos / where).mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (photos / where / name).write_text("# a comment\n")
+    text = message(photos)
+    assert text.startswith(f"{photos / where}: cameras: expected a COLMAP model in binary form, got one as ")
+    assert "colmap model_converter --output_type BIN" in text
+
+
+def test_text_beside_a_model_does_not_matter(can, tmp_path: Path):
+    shutil.copytree(can[0], tmp_path / "a")
+    model = tmp_path / "a" / "sparse" / "0"
+    pycolmap.Reconstruction(model).write_text(model)
+    assert estimate_cameras(tmp_path / "a", quiet).n_registered == N_CAN
+
+
 @pytest.mark.parametrize("where", ["features", "matches", "cameras"])
 def test_interruption_leaves_nothing(can, tmp_path: Path, where: str):
     for path in sorted(can[0].glob("*.jpg"))[:4]:
@@ -197,6 +215,26 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
     assert estimate_cameras(photos, quiet).n_registered == 6
     assert (len(looked), len(matched)) == (1, 5)  # only what the new picture brings
     assert not list(kept.rglob("*.bin"))
+
+
+def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, monkeypatch):
+    """`os.access` answers as it does to anyone but root."""
+    photos = save(tmp_path / "photos", [textured(seed) for seed in range(3)])
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != photos)
+    stages: list[str] = []
+    with pytest.raises(OutputError, match="is read-only: copy the pictures to a folder that you can write"):
+        estimate_cameras(photos, lambda stage, *_: stages.append(stage))
+    assert not stages
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(can, tmp_path: Path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(poses, "cache_root", lambda: tmp_path / "file")
+    (tmp_path / "photos").mkdir()
+    photos = first_pictures(can, tmp_path / "photos", 3)
+    said: list[str] = []
+    assert estimate_cameras(photos, quiet, said.append).n_registered == 3
+    assert len(said) == 1 and "no more features and matches are kept" in said[0]
 
 
 def test_pictures_without_a_place_and_why(can, tmp_path: Path):

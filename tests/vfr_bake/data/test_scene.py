@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from player.errors import DataError, ShapeError
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
-from vfr_bake.data.scene import NEAR_CAMERA, build_scene
+from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, _near, build_scene
 from vfr_bake.data.store.working import WorkingSize
 
 
@@ -96,6 +97,19 @@ def test_an_unbounded_scene_has_its_cameras_in_the_unit_ball():
     points = np.stack([eye[:3, 3] - eye[:3, 2] * depth for depth in (0.2, 0.3)])
     near = build_scene(Capture("a", train, test, points=points), "unbounded").near
     assert 0.05 < near * scene.world_from_model[0, 0] < 0.2  # half of the least depths, 0.2 and 0.3
+
+
+def test_many_points_take_little_memory_and_tell_the_same():
+    cameras = demo_cameras(8, 100)
+    points = np.random.default_rng(0).uniform(-1, 1, (50_000, 3))
+    depths = [(camera.c2w[:3, 3] - points) @ camera.c2w[:3, 2] for camera in cameras]
+    expected = NEAR_SHARE * float(np.quantile(np.concatenate(depths), NEAR_QUANTILE)) / 50
+    tracemalloc.start()
+    found = _near(cameras, points, 50.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found == pytest.approx(expected, rel=0.02) and 0 < expected < 4 * NEAR_CAMERA
+    assert peak < 30e6, "all depths, of 8 bytes each, take 40 MB"
 
 
 def test_views_from_one_place_tell_no_depth():

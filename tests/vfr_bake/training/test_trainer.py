@@ -238,6 +238,13 @@ def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) ->
     load_checkpoint(tmp_path / "c", Trainer(scene, config(steps=9, eval_views=1)))  # a longer run may go on
     with pytest.raises(ConfigError, match=r"seed: expected 0 as in the interrupted run, got 1"):
         load_checkpoint(tmp_path / "c", Trainer(scene, config(seed=1)))
+    cameras = scene.train.cameras
+    moved = cameras[0].c2w.copy()
+    moved[0, 3] += 0.01
+    for changes in ({"name": "another"}, {"c2w": moved}, {"fx": cameras[0].fx + 0.1}):
+        views = PosedImages([replace(cameras[0], **changes), *cameras[1:]], scene.train.images)
+        with pytest.raises(ConfigError, match="pictures: expected those of the interrupted run"):
+            load_checkpoint(tmp_path / "c", Trainer(replace(scene, train=views), config(steps=3)))
     whole = (tmp_path / "c").read_bytes()
     for content in (b"", b"no", whole[: len(whole) // 2]):
         (tmp_path / "c").write_bytes(content)

@@ -134,7 +134,7 @@ def check_data(
         most: pictures to look at, at most.
 
     Raises DataError, FormatError: there is no such folder, or no picture in it. ConfigError: the built-in
-    scene has no pictures.
+    scene has no pictures. MissingExtraError: a package that reads pictures is missing.
     """
     begin = time.monotonic()
     pictures = _listed(data)
@@ -148,21 +148,24 @@ def check_data(
         why = look if isinstance(look, str) else _fault(seen[number], number in blurry, partners[number])
         if pictures.found[number] is False and why is None:
             why = pictures.why.get(name, "the estimation of cameras found no place for it")
-        picture_look = seen[number]
-        full = picture_look.size if picture_look else _size(pictures.paths[number])
+        if isinstance(look, str):
+            full = None  # its header may be whole where its pixels are not
+        else:
+            full = look.size if look else _size(pictures.paths[number])
         checked.append(
             CheckedPicture(
                 name,
                 full,
                 size.size(*full) if full else None,
-                picture_look,
+                seen[number],
                 partners[number],
                 pictures.found[number],
                 why,
             )
         )
     figures = _figures(checked, shared)
-    verdict, likely, advice = judged(figures, pictures.cameras)
+    unreadable = [picture.name for picture in checked if picture.size is None and picture.found is not False]
+    verdict, likely, advice = judged(figures, pictures.cameras, unreadable)
     return Check(
         *(data, pictures.kind, checked, pictures.cameras, figures, verdict, likely, advice),
         time.monotonic() - begin,

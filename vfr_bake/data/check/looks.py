@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from player.errors import VfrError
+from player.errors import DataError
 from vfr_bake.data.check.turning import MIN_MATCHES, OFF
 from vfr_bake.data.features import match
 from vfr_bake.data.files.pictures import (
@@ -127,7 +127,7 @@ def look_at(
 
     Pairs of neighbours are taken in an order that spreads them over all pictures, so that what is seen in the
     time is a sample of everything. Returns for each picture what was seen, why it cannot be read, or None
-    where the time was over.
+    where the time was over. Raises MissingExtraError.
     """
     end = time.monotonic() + seconds
     pairs = sorted(range((len(paths) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
@@ -138,7 +138,7 @@ def look_at(
             return number, None
         try:
             return number, look(paths[number])
-        except VfrError as error:
+        except DataError as error:
             return number, str(error)
 
     seen: list[Look | str | None] = [None] * len(paths)

@@ -23,11 +23,16 @@ TURNED, ALL_TURNED = 0.4, 0.8
 """Where the camera turned on the spot in so many steps, depth is weak, and cameras are hardly found."""
 GAP_DEGREES = 90.0
 """A wider gap in the walk around the subject is a side that nobody has seen."""
+NAMED = 3
+"""Pictures that cannot be read are named up to so many."""
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
-def judged(figures: dict[str, Any], cameras: Sequence[Camera]) -> tuple[str, list[str], list[str]]:
-    """Verdict, what is likely to come out, and what to photograph."""
+def judged(
+    figures: dict[str, Any], cameras: Sequence[Camera], unreadable: Sequence[str]
+) -> tuple[str, list[str], list[str]]:
+    """Verdict, what is likely to come out, and what to photograph; `unreadable`: the names of pictures at
+    which training stops."""
     n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
     likely, advice, bad, doubts = [], [], False, False
     turned = figures["share_turned_on_the_spot"] or 0.0
@@ -53,6 +58,13 @@ def judged(figures: dict[str, Any], cameras: Sequence[Camera]) -> tuple[str, lis
                 "take smaller steps, or keep more of textured surroundings in the picture: neighbours "
                 "share few features."
             )
+    if unreadable:
+        bad = True
+        others = f" and {len(unreadable) - NAMED} others" if len(unreadable) > NAMED else ""
+        advice.append(
+            f"copy {', '.join(unreadable[:NAMED])}{others} again, or leave them out: what cannot be read to "
+            "its end ends the training."
+        )
     if turned > TURNED:
         doubts = True
         bad |= all_turned

@@ -59,7 +59,8 @@ def unpack(archive: Path, progress: Progress) -> Path:
     complete; one that is there is taken as it is.
 
     Raises DataError: not a ZIP, damaged, with a password, nothing in it that is read, a name that leaves
-    the folder, a link, or more bytes than it may unpack to; OutputError: the disk is too full.
+    the folder or that not every system can write, a link, or more bytes than it may unpack to; OutputError:
+    the disk is too full.
     """
     folder = unpacked_folder(archive)
     if folder.is_dir():
@@ -71,7 +72,10 @@ def unpack(archive: Path, progress: Progress) -> Path:
                 for done, (entry, name) in enumerate(entries, start=1):
                     _unpack_one(archive, file, entry, new / name)
                     progress(done, len(entries))
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (
+        *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError),
+        UnicodeError,  # a name that is said to be UTF-8, and is not
+    ) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DataError(
             f"{archive}: ZIP: cannot be read to its end: {reason}: share or copy it again"
@@ -88,6 +92,11 @@ def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo
         name = _safe_name(archive, entry)
         kept = name.suffix.lower() in KEPT and not any(part.startswith((".", "__")) for part in name.parts)
         if kept and not entry.is_dir():
+            if ":" in str(name) or any(ord(character) < 32 for character in str(name)):
+                raise DataError(
+                    f"{archive}: ZIP: expected names without colons and control characters, got "
+                    f"{ascii(str(name))[:200]}: unpack it yourself, and name the folder"
+                )
             entries.append((entry, name))
     if any(entry.flag_bits & 1 for entry, _ in entries):
         raise DataError(f"{archive}: ZIP: expected one without a password: unpack it, and name the folder")
@@ -118,8 +127,7 @@ def _safe_name(archive: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
     """The name of an entry, which stays in the folder. Raises DataError."""
     name = PurePosixPath(_decoded(entry).replace("\\", "/"))
     on_windows = PureWindowsPath(str(name))
-    leaves = ".." in name.parts or name.is_absolute() or on_windows.drive or on_windows.root
-    if leaves or any(ord(character) < 32 for character in str(name)) or ":" in str(name):
+    if ".." in name.parts or name.is_absolute() or on_windows.drive or on_windows.root:
         raise DataError(
             f"{archive}: ZIP: expected names that stay in its folder, got {ascii(str(name))[:200]}"
         )

@@ -14,7 +14,7 @@ from player.errors import FormatError
 from vfr_bake.data import threads
 from vfr_bake.data.features import MAX_SIDE, Features, find_features
 from vfr_bake.data.files.masks import apply_mask
-from vfr_bake.data.files.opening import open_photograph
+from vfr_bake.data.files.opening import exif_of, open_photograph
 from vfr_bake.data.files.pictures import enough_for, opencv, picture_size, read_picture, sharpness
 from vfr_bake.data.kept_matches import SIDE, Found, KeptMatches, stamp
 from vfr_bake.data.mapping import Sensor
@@ -69,7 +69,7 @@ def sensor_of(path: Path, width: int, height: int) -> Sensor:
     """What took a picture, as EXIF has it; `width`, `height` of the picture upright."""
     try:
         with open_photograph(path) as file:
-            exif = file.getexif()
+            exif = exif_of(file)
             details = exif.get_ifd(0x8769)
     except (FormatError, struct.error, KeyError, IndexError):  # damaged EXIF is as good as none
         return Sensor(width, height, (), None)

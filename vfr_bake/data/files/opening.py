@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from player.errors import FormatError, MissingExtraError
 from player.files.files import open_file
@@ -56,6 +56,23 @@ def is_heic(path: Path) -> bool:
     n_bytes = min(int.from_bytes(head[:4], "big"), len(head))
     brands = [head[8:12], *(head[at : at + 4] for at in range(16, n_bytes, 4))]
     return any(brand in HEIF_BRANDS for brand in brands) and not any(b in AVIF_BRANDS for b in brands)
+
+
+def exif_of(picture: Image.Image) -> Image.Exif:
+    """EXIF of an opened photograph, whose pixels are not decoded for it.
+
+    Some programs write EXIF behind the pixels of a PNG, and Pillow decodes all of these to come to it. Here
+    they are stepped over.
+    """
+    if isinstance(picture, PngImagePlugin.PngImageFile) and "exif" not in picture.info and picture.fp:
+        place = picture.fp.tell()
+        picture.fp.seek(8)  # behind the signature
+        while (head := picture.fp.read(8)) and head[4:] not in (b"eXIf", b"IEND"):
+            picture.fp.seek(int.from_bytes(head[:4], "big") + 4, 1)  # the chunk and its checksum
+        if head[4:] == b"eXIf":
+            picture.info["exif"] = b"Exif\0\0" + picture.fp.read(int.from_bytes(head[:4], "big"))
+        picture.fp.seek(place)
+    return Image.Image.getexif(picture)
 
 
 def _read_heic_from_now_on(path: Path) -> None:

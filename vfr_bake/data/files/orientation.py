@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vfr_bake.data.files.opening import open_photograph
+from vfr_bake.data.files.opening import exif_of, open_photograph
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -62,7 +62,7 @@ def layout_of(picture: Image.Image) -> Layout:
         number = picture.info.get("original_orientation")  # the entry in EXIF is reset to 1
     else:
         try:
-            number = picture.getexif().get(TAG)
+            number = exif_of(picture).get(TAG)
         except (SyntaxError, ValueError, TypeError, KeyError, IndexError, OSError, struct.error):
             number = None  # damaged EXIF is as good as none
     number = number if isinstance(number, int) and 1 <= number <= 8 else 1

@@ -23,6 +23,7 @@ from player.cameras.camera import Camera
 from player.errors import FormatError, OutputError
 from player.files.files import new_folder
 from player.files.json_files import parse_json, read_json
+from player.kept_code import user_folder
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.store.stored import Layout, MappedImages, map_pictures
 from vfr_bake.data.store.working import WorkingSize
@@ -45,20 +46,17 @@ class Kept(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """The user's folder of cached pictures: `$XDG_CACHE_HOME/vfr-bake/pictures`, by default in `~/.cache`, on
-    Linux; where macOS and Windows have theirs."""
-    from numba.misc.appdirs import AppDirs
-
-    return Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir) / "pictures"
+    """The user's folder of cached pictures: `$XDG_CACHE_HOME/vfr-bake/pictures`, by default in `~/.cache` on
+    Linux, where macOS and Windows have theirs."""
+    return user_folder() / "pictures"
 
 
-def digest(described: Sequence[DescribedView], size: WorkingSize) -> str:
-    """The name of the set of these pictures at this size. Raises OSError: one is gone."""
-    total = hashlib.sha256(json.dumps([VERSION, asdict(size)]).encode())
-    for view in described:
-        for part in view:
-            total.update(repr(_described(part)).encode(errors="surrogateescape"))
-    return total.hexdigest()[:32]
+def digests(described: Sequence[DescribedView], sizes: Sequence[WorkingSize]) -> list[str]:
+    """The names of the sets of these pictures at each of the sizes. Raises OSError: one is gone."""
+    parts = [_described(part) for view in described for part in view]
+    told = "".join(map(repr, parts)).encode(errors="surrogateescape")
+    heads = [json.dumps([VERSION, asdict(size)]).encode() for size in sizes]
+    return [hashlib.sha256(head + told).hexdigest()[:32] for head in heads]
 
 
 def _described(part: object) -> object:

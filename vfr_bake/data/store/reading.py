@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import math
 import os
 import shutil
@@ -17,7 +18,7 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.errors import OutputError
 from player.files.memory import allowed_bytes
-from player.files.replace import PART
+from player.files.replace import PART, held
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView, viewed_size
 from vfr_bake.data.store import cache
@@ -32,6 +33,10 @@ DECODING_BYTES = 1_000_000_000
 """Memory for pictures that are being decoded: large ones are read by fewer threads."""
 LEAST_SIDE = 480
 """Pixels: the longest side is not made smaller than this for want of room."""
+STEP = 16
+"""Pixels: a side that is made smaller for want of room is a multiple of this."""
+OPAQUE = (".jpg", ".jpeg", ".heic", ".heif", ".hif")
+"""Photographs that end in one of these have no alpha: three channels are stored."""
 
 
 class _TransparentError(Exception):
@@ -76,24 +81,31 @@ class PictureReader:
         Raises DataError (a picture), OutputError (a disk without room for them; what is missing).
         """
         sizes = in_threads(viewed_size, described, None)
-        if not self._on_disk or self._n_bytes(sizes, 4) <= held_bytes():
+        if not self._on_disk or _n_bytes(sizes, self.size, 4) <= held_bytes():
             self._tell(sizes, "")
             return self._held(described, sizes, progress)
         root = cache.cache_folder()
-        folder = root / cache.digest(described, self.size)
+        candidates = [self.size, *self._smaller(sizes)]
+        folders = [root / name for name in cache.digests(described, candidates)]
         if not self._kept and self._model is not None:
-            shutil.rmtree(folder, ignore_errors=True)
-        found = cache.opened(folder, described)
+            for each in folders:
+                shutil.rmtree(each, ignore_errors=True)
+        n_channels, free = _n_channels(described), cache.free_bytes(root)
+        found, folder = None, folders[0]
+        # Where the disk has no room for larger ones, an earlier run may have kept smaller ones.
+        for size, folder in zip(candidates, folders, strict=True):
+            found = cache.opened(folder, described)
+            if found is not None:
+                self.size = size
+            if found is not None or _n_bytes(sizes, size, n_channels) <= free:
+                break
         if found is None:
-            n_channels = 3 if all(view.path.suffix.lower() in (".jpg", ".jpeg") for view in described) else 4
-            cache.remove_unused(root, self._n_bytes(sizes, n_channels), folder)
+            cache.remove_unused(root, _n_bytes(sizes, self.size, n_channels), folders[0])
             self._fit(sizes, root, n_channels)
-            if self._n_bytes(sizes, 4) <= held_bytes():
+            if _n_bytes(sizes, self.size, 4) <= held_bytes():
                 self._tell(sizes, "")
                 return self._held(described, sizes, progress)
-            folder = root / cache.digest(described, self.size)
-            found = cache.opened(folder, described)
-        if found is None:
+            folder = folders[candidates.index(self.size)]
             self._tell(sizes, f" on the disk ({'' if self._kept else 'for this run, '}in {root})")
             try:
                 found = self._stored(described, sizes, folder, 3, progress)
@@ -107,8 +119,15 @@ class PictureReader:
             cache.note_use(folder, self._model)
         return PosedImages(found.cameras, found.images)
 
-    def _n_bytes(self, sizes: Sequence[tuple[int, int]], n_channels: int) -> int:
-        return sum(math.prod(self.size.size(*size)) for size in sizes) * n_channels
+    def _longest(self, sizes: Sequence[tuple[int, int]]) -> int:
+        return max(max(self.size.size(*size)) for size in sizes)
+
+    def _smaller(self, sizes: Sequence[tuple[int, int]]) -> list[WorkingSize]:
+        """The working sizes that `_fit` may choose, the largest first."""
+        if not self._may_shrink:
+            return []
+        sides = range((self._longest(sizes) - 1) // STEP * STEP, LEAST_SIDE - 1, -STEP)
+        return [replace(self.size, max_side=side, downscale=None) for side in sides]
 
     def _tell(self, sizes: Sequence[tuple[int, int]], where: str) -> None:
         targets = [self.size.size(*size) for size in sizes]
@@ -133,11 +152,11 @@ class PictureReader:
 
     def _fit(self, sizes: Sequence[tuple[int, int]], root: Path, n_channels: int) -> None:
         """Make the working size smaller if the disk has too little room. Raises OutputError."""
-        free, needed = cache.free_bytes(root), self._n_bytes(sizes, n_channels)
+        free, needed = cache.free_bytes(root), _n_bytes(sizes, self.size, n_channels)
         if needed <= free:
             return
-        longest = max(max(self.size.size(*size)) for size in sizes)
-        side = int(longest * math.sqrt(free / needed)) // 16 * 16
+        longest = self._longest(sizes)
+        side = int(longest * math.sqrt(free / needed)) // STEP * STEP
         if not self._may_shrink or side < LEAST_SIDE:
             raise OutputError(_no_room(root, needed, free))
         self._say(
@@ -162,21 +181,26 @@ class PictureReader:
                     self._fill(new, layout, described, sizes, n_channels, progress)
                 return _whole(folder, described)
             folder.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            new = Path(tempfile.mkdtemp(prefix=".pictures.", suffix=PART, dir=folder.parent))
-            try:
-                self._fill(new, layout, described, sizes, n_channels, progress)
-                return _whole(new, described)
-            finally:
-                # What is mapped stays until the process ends, where systems have it so.
-                shutil.rmtree(new, ignore_errors=True)
-                if os.name == "nt":
-                    atexit.register(shutil.rmtree, new, ignore_errors=True)
+            with held(folder.parent):
+                new = Path(tempfile.mkdtemp(prefix=".pictures.", suffix=PART, dir=folder.parent))
+                try:
+                    self._fill(new, layout, described, sizes, n_channels, progress)
+                    return _whole(new, described)
+                finally:
+                    # What is mapped stays until the process ends, where systems have it so.
+                    shutil.rmtree(new, ignore_errors=True)
+                    if os.name == "nt":
+                        atexit.register(shutil.rmtree, new, ignore_errors=True)
         except OSError as error:
-            if isinstance(error, OutputError) and not isinstance(error.__cause__, OSError):
-                raise
             said = error.__cause__ if isinstance(error, OutputError) else error
+            if not isinstance(said, OSError):
+                raise
+            if said.errno in (errno.ENOSPC, errno.EDQUOT):
+                no_room = _no_room(folder.parent, n_bytes, cache.free_bytes(folder.parent))
+                raise OutputError(f"{no_room} ({said})") from error
             raise OutputError(
-                f"{_no_room(folder.parent, n_bytes, cache.free_bytes(folder.parent))} ({said})"
+                f"{folder.parent}: cannot keep the pictures: {said.strerror or said}: "
+                "set XDG_CACHE_HOME to a folder that you can write to"
             ) from error
 
     def _fill(
@@ -214,6 +238,17 @@ class PictureReader:
 def held_bytes() -> int:
     """Bytes of pictures that are held in memory."""
     return min(HELD_BYTES, allowed_bytes() // 4)
+
+
+def _n_bytes(sizes: Sequence[tuple[int, int]], size: WorkingSize, n_channels: int) -> int:
+    """Bytes that pictures of these sizes take at the working size."""
+    return sum(math.prod(size.size(*each)) for each in sizes) * n_channels
+
+
+def _n_channels(described: Sequence[DescribedView]) -> int:
+    """Channels that the pictures are likely to take, as far as their names and masks tell."""
+    opaque = all(view.mask is None and view.path.suffix.lower() in OPAQUE for view in described)
+    return 3 if opaque else 4
 
 
 def _whole(folder: Path, described: Sequence[DescribedView]) -> cache.Kept:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from PIL import Image, ImageFilter
 
 from player.cameras.camera import Camera, world_up
 from player.cameras.transforms import write_cameras
-from player.errors import ConfigError, DataError
+from player.errors import ConfigError, DataError, MissingExtraError
+from tests.vfr_bake.data.test_colmap import write_model
 from vfr_bake.cli import train_main
 from vfr_bake.data.check.check import Check, check_data
 from vfr_bake.data.check.page import check_page
@@ -105,6 +107,43 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
     (broken,) = (picture for picture in check.pictures if picture.size is None)
     assert broken.name == "p03.jpg" and "p03.jpg" in str(broken.why)
     assert json.dumps(check.document())
+
+
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-2000])
+
+
+def test_pictures_that_are_cut_short_are_bad_and_named(tmp_path: Path) -> None:
+    """Their headers tell their size, and training would stop at them."""
+    folder = walk(tmp_path / "walk", 24)
+    cut_short(folder / "p03.jpg")
+    check = checked(folder)
+    assert check.verdict == BAD and check.figures["n_unreadable"] == 1
+    assert any("copy p03.jpg again" in line for line in check.advice)
+    for number in (5, 9, 12, 20):
+        cut_short(folder / f"p{number:02d}.jpg")
+    check = checked(folder)
+    assert check.figures["n_unreadable"] == 5 and check.figures["sizes"] == {"480x400": 19}
+    assert any("copy p03.jpg, p05.jpg, p09.jpg and 2 others again" in line for line in check.advice)
+
+
+def test_a_picture_without_a_camera_is_not_read_by_training(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "toy", demo_cameras(24, 10))
+    walk(folder / "images", 1)
+    cut_short(folder / "images" / "p00.jpg")
+    check = checked(folder)
+    assert check.verdict != BAD and check.figures["n_unreadable"] == 1
+    assert not any("p00.jpg" in line for line in check.advice)
+
+
+def test_a_package_that_is_missing_is_no_fault_of_the_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk(tmp_path / "walk", 1)
+    (tmp_path / "walk" / "a.heic").write_bytes(b"\0\0\0\x14ftypheic\0\0\0\0heic")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(MissingExtraError, match="expected pillow-heif"):
+        checked(tmp_path / "walk")
 
 
 def test_time_that_is_over_leaves_a_sample(tmp_path: Path) -> None:

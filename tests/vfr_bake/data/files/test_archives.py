@@ -65,6 +65,13 @@ def test_a_zip_of_a_data_set(small_data: Path, tmp_path: Path) -> None:
     assert len(load_scene(pack(tmp_path / "a.zip", files)).train.images) == 12
 
 
+def test_names_of_what_stays_packed_do_not_matter(tmp_path: Path) -> None:
+    """macOS keeps a folder's picture in a file whose name ends in a carriage return."""
+    files = dict.fromkeys(["IMG_1.png", "Icon\r", "notes 12:30.txt", "__MACOSX/a 12:30.png"], picture())
+    folder = unpack(pack(tmp_path / "a.zip", files), quiet)
+    assert [path.name for path in folder.iterdir()] == ["IMG_1.png"]
+
+
 def link(path: Path) -> None:
     entry = zipfile.ZipInfo("a.png")
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
@@ -84,6 +91,10 @@ def cut_short(path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
 
 
+def with_a_name_that_is_no_utf8(path: Path) -> None:
+    path.write_bytes(pack(path, {"\u00fc.png": picture()}).read_bytes().replace(b"\xc3\xbc", b"\xff\xff"))
+
+
 def damaged(path: Path) -> None:
     data = bytearray(pack(path, {"a.png": bytes(5000)}).read_bytes())
     data[1000] ^= 255
@@ -97,11 +108,15 @@ def damaged(path: Path) -> None:
         (lambda path: pack(path, {"/tmp/a.png": picture()}), "expected names that stay in its folder"),
         (lambda path: pack(path, {"a\\..\\..\\b.png": picture()}), "expected names that stay in its folder"),
         (lambda path: pack(path, {"C:/a.png": picture()}), "expected names that stay in its folder"),
+        (lambda path: pack(path, {"b.png": picture(), "../a.txt": b"x"}), "expected names that stay in its"),
+        (lambda path: pack(path, {"at 12:30.png": picture()}), "expected names without colons and control"),
+        (lambda path: pack(path, {"a\rb.png": picture()}), "expected names without colons and control"),
         (lambda path: pack(path, {"a.png": b"", "A.PNG": b""}), "expected different names, got a.png twice"),
         (lambda path: pack(path, {"a.txt": b"x"}), r"expected pictures \(\.png"),
         (link, "expected files, got a link"),
         (with_a_password, "expected one without a password"),
         (cut_short, "cannot be read to its end"),
+        (with_a_name_that_is_no_utf8, "cannot be read to its end: 'utf-8' codec"),
         (damaged, "cannot be read to its end"),
         (lambda path: path.write_bytes(b"no zip"), "cannot be read to its end"),
     ],

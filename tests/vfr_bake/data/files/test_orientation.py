@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, PngImagePlugin
 
 from player.cameras.transforms import write_cameras
 from player.errors import DataError
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
-from vfr_bake.data.files.orientation import TAG, as_stored, turned_upright
+from vfr_bake.data.files.looks import sensor_of
+from vfr_bake.data.files.orientation import TAG, as_stored, read_layout, turned_upright
 from vfr_bake.data.files.pictures import read_picture
 
 pillow_heif.register_heif_opener()
@@ -64,6 +65,32 @@ def test_every_format_is_turned_once(kind: str, number: int, tmp_path: Path) -> 
         assert read.shape == (*expected.shape[:2], 4) and (read[..., 3] == 255).all()
         off = np.abs(read[..., :3].astype(int) - expected)
         assert off.max() == 0 if kind in LOSSLESS else off.mean() < 6
+
+
+@pytest.mark.parametrize("where", ["none", "before", "behind"])
+def test_no_pixel_of_a_png_is_decoded_for_its_exif(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """EXIF may lie before the pixels or behind them."""
+
+    def never(*_: object) -> None:
+        raise AssertionError("decoded")
+
+    path = tmp_path / "a.png"
+    stored = save_turned(corners(), path, 6)
+    data = path.read_bytes()
+    begin = data.index(b"eXIf") - 4
+    end = begin + 12 + int.from_bytes(data[begin : begin + 4], "big")
+    if where != "before":
+        data, exif = data[:begin] + data[end:], data[begin:end]
+        path.write_bytes(data[:-12] + (exif if where == "behind" else b"") + data[-12:])
+    with monkeypatch.context() as without:
+        without.setattr(PngImagePlugin.PngImageFile, "load", never)
+        layout = read_layout(path)
+        sensor_of(path, *layout.upright_size)
+    assert layout.size == (48, 32) and layout.number == (1 if where == "none" else 6)
+    expected = stored if where == "none" else corners()
+    np.testing.assert_array_equal(read_picture(path, upright=True)[..., :3], expected)
 
 
 @pytest.mark.parametrize("n_bytes", [1, 200, 3000])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 
 from player.cameras.transforms import write_cameras
 from player.errors import OutputError
+from player.files.replace import clear_up
 from vfr_bake.data import PosedImages, load_scene
 from vfr_bake.data.capture import StoredImages
 from vfr_bake.data.demo import demo_cameras
@@ -259,3 +261,69 @@ def test_a_disk_that_is_full_in_the_middle(
         with pytest.raises(OutputError, match=r"free disk for the pictures.*No space left"):
             load(folder, tmp_path / "model.pt", kept=kept)
         assert n_sets(root) == 0
+
+
+def test_pictures_that_are_being_written_are_not_cleared_up(
+    folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever comes to the cache meanwhile removes what nobody holds."""
+
+    def write(*arguments: Any) -> None:
+        clear_up(root)
+        write_picture(*arguments)
+
+    monkeypatch.setattr(reading, "write_picture", write)
+    for kept in (True, False):
+        views, _ = load(folder, tmp_path / "model.pt", kept=kept)
+        assert views.images[0].shape == (32, 32, 4)
+
+
+def test_a_cache_that_cannot_be_written(
+    folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(13, "Permission denied")
+
+    monkeypatch.setattr(cache, "reserve", refused)
+    for kept in (True, False):
+        with pytest.raises(OutputError, match="cannot keep the pictures: Permission denied: set XDG_CACHE"):
+            load(folder, tmp_path / "model.pt", kept=kept)
+        assert n_sets(root) == 0
+
+
+def test_pictures_that_were_made_smaller_are_found_again(
+    folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tmp_path / "model.pt"
+    monkeypatch.setattr(reading, "LEAST_SIDE", 16)
+    monkeypatch.setattr(reading, "STEP", 8)
+    free = {"bytes": 10 * 20 * 20 * 3}
+    monkeypatch.setattr(cache, "free_bytes", lambda place: free["bytes"])
+    views, _ = load(folder, model, kept=True, may_shrink=True)
+    assert views.images[0].shape == (16, 16, 4)
+    free["bytes"] = 0  # the set that is there has taken the room
+    views, said = load(folder, model, kept=True, may_shrink=True)
+    assert views.images[0].shape == (16, 16, 4) and "reduced to 16x16 as they were kept in" in said[0]
+    for n_bytes, side in ((10 * 24 * 24 * 3, 24), (10 * 32 * 32 * 3, 32)):  # more room, more detail
+        free["bytes"] = n_bytes
+        views, _ = load(folder, model, kept=True, may_shrink=True)
+        assert views.images[0].shape == (side, side, 4)
+    assert n_sets(root) == 3
+    load(folder, model, kept=False, may_shrink=True)
+    assert n_sets(root) == 0
+
+
+def test_room_is_wanted_for_as_many_channels_as_are_stored(
+    folder: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "free_bytes", lambda place: 10 * 32 * 32 * 3)
+    load(folder)
+    for path in folder.glob("*.jpg"):
+        path.rename(path.with_suffix(".heic"))  # what it is follows from its content
+    load(folder)
+    (folder / "masks").mkdir()
+    Image.new("L", (48, 48)).save(folder / "masks" / "r_3.png")
+    with pytest.raises(OutputError, match="free disk"):
+        load(folder)
+    monkeypatch.setattr(cache, "free_bytes", lambda place: 10 * 32 * 32 * 4)
+    assert isinstance(load(folder)[0].images, StoredImages)
