@@ -32,7 +32,7 @@ def export_page(
         `bytes`, `viewer_bytes`, `gpu_bytes`, for `exporters.export.export_asset`.
 
     Raises:
-        ConfigError: more graphics memory than it may take.
+        ConfigError: more graphics memory than it may take, or more channels than browsers can draw.
         FormatError: a file of the asset is broken.
         OutputError: the target cannot be written.
         ParityError: what was to be written does not hold the asset's data.

@@ -25,6 +25,9 @@ LINES_A_LAYER = 256
 MOST_ROWS = 2**24
 TILE = 256
 """Pixels along a side of what is drawn at a time."""
+MOST_CHANNELS = 40
+"""Channels that a page can draw: eight in a draw buffer, of which browsers have six at least, and one is for
+the opacity."""
 
 
 def gpu_bytes(asset: Asset) -> int:

@@ -102,14 +102,14 @@ def _as_function(source: str, name: str) -> str:
 
 
 def without_comments(source: str) -> str:
-    """A module or a shader without lines that are comments alone, without indents and without empty lines.
+    """A module or a shader without comments, without indents and without empty lines.
 
-    Comments are `// ...` lines, and `/* ... */` that begins and ends lines of its own; templates and strings
+    Comments are `// ...` lines, ` // ...` at the end of a line if no quote is in it, and `/* ... */` that begins and ends lines of its own; templates and strings
     of several lines keep what they hold only if no line of theirs begins like one.
 
     >>> without_comments("// What it is.\\nconst a = 1; // one\\n\\n  /* more\\n  text */\\n  f(a);\\n")
     'const a = 1; // one\\nf(a);\\n'
     """
     source = re.sub(r"^[ \t]*/\*.*?\*/[ \t]*$", "", source, flags=re.MULTILINE | re.DOTALL)
-    lines = (line.strip() for line in source.splitlines())
+    lines = (re.sub(r"\s// [^\"'`]*$", "", line).strip() for line in source.splitlines())
     return "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))

@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 from player.asset.asset import Asset
 from player.errors import ConfigError
-from player.page.gpu_memory import gpu_bytes
+from player.page.gpu_memory import MOST_CHANNELS, gpu_bytes
 from player.page.modules import joined, without_comments
 from player.page.poster import poster_bytes
 from player.page.scene_files import MANIFEST, scene_files
@@ -72,7 +72,8 @@ def page(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -
         max_gpu_mb: megabytes of graphics memory that it may take.
 
     Raises:
-        ConfigError: it takes more graphics memory, or was opened with fewer parts.
+        ConfigError: it takes more graphics memory, has more channels than browsers can draw, or was opened
+            with fewer parts.
         FormatError: a file of the asset is broken, or a part is missing.
 
     >>> page(Asset.open("out/"))[:15]
@@ -103,9 +104,8 @@ def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = M
         "poster": f"data:image/jpeg;base64,{poster}",
         "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
         f'<script type="module">{boot}</script>',
-        "data": "{{data}}",
     }
-    before, behind = map(_ascii_html, _filled(sources[INDEX], filled).split("{{data}}"))
+    before, behind = (_ascii_html(_filled(half, filled)) for half in sources[INDEX].split("{{data}}"))
     content = before + data_elements(scene_files(asset)) + behind
     return WebPage({INDEX: content}, len(before) + len(behind) - len(poster), n_gpu)
 
@@ -147,6 +147,12 @@ def is_site_file(name: str) -> bool:
 
 
 def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
+    n_channels = asset.manifest.n_channels
+    if n_channels > MOST_CHANNELS:
+        raise ConfigError(
+            f"{asset.folder}: channels: expected at most {MOST_CHANNELS}, which browsers can draw, got "
+            f"{n_channels}: bake it with fewer (vfr-bake --n-channels)"
+        )
     found = gpu_bytes(asset)
     if found > max_gpu_mb * 1_000_000:
         raise ConfigError(

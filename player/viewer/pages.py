@@ -2,7 +2,7 @@
 do but to send it.
 
 A page is made when it is first asked for, once, and sent in small pieces as fast as each visitor takes them,
-so that it is in memory once, whoever asks.
+so that it is in memory once, whoever asks. One that cannot be made is tried again when it is next asked for.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Pages:
     def __init__(self, makers: Sequence[Callable[[], bytes]]) -> None:
         """`makers`: each makes the page of one asset, or raises VfrError where that has none."""
         self._makers = {page_path(index): maker for index, maker in enumerate(makers)}
-        self._made: dict[str, asyncio.Future[Answer]] = {}
+        self._made: dict[str, asyncio.Future[bytes]] = {}
         self._downloads: set[asyncio.Task[Any]] = set()
 
     def close(self) -> None:
@@ -68,11 +68,23 @@ class Pages:
             self._downloads.discard(task)
 
     async def _answer(self, path: str) -> Answer:
-        made = self._made.get(path)
-        if made is None:
-            made = asyncio.ensure_future(asyncio.to_thread(_answer_of, self._makers[path]))
-            self._made[path] = made
-        return await asyncio.shield(made)  # whoever asked first may go: the others still wait for it
+        if path not in self._made:
+            self._made[path] = asyncio.ensure_future(self._make(path))
+        try:
+            # whoever asked first may go: the others still wait for it
+            body = await asyncio.shield(self._made[path])
+        except VfrError as error:
+            return _refused(printable(str(error)))
+        return Answer("200 OK", "text/html; charset=utf-8", body)
+
+    async def _make(self, path: str) -> bytes:
+        """Make a page. One that cannot be made is forgotten, so that whoever asks next has it tried again: an
+        asset may be whole by then."""
+        try:
+            return await asyncio.to_thread(self._makers[path])
+        except BaseException:
+            del self._made[path]
+            raise
 
 
 NO_PAGES = Pages(())
@@ -85,13 +97,6 @@ def page_path(index: int) -> str:
     ('/page', '/page/2')
     """
     return f"{PATH}/{index}" if index else PATH
-
-
-def _answer_of(maker: Callable[[], bytes]) -> Answer:
-    try:
-        return Answer("200 OK", "text/html; charset=utf-8", maker())
-    except VfrError as error:
-        return _refused(printable(str(error)))
 
 
 def _refused(why: str) -> Answer:

@@ -11,6 +11,8 @@ import { Viewer } from "./viewer.js";
 const INSTEAD = "Open this page in a current Chrome, Edge, Firefox or Safari, with hardware acceleration switched on "
   + "in its settings, or on a device with more graphics memory.";
 const ANEW = "What arrived is not whole: load the page again, or ask for it anew.";
+const RESET = "The graphics card was reset. If the picture does not come back by itself, "
+  + "load the page again.";
 
 // Shows the scene; the renderer, when all of it is there.
 async function show() {
@@ -18,12 +20,22 @@ async function show() {
   const panel = new Panel(options);
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   let renderer = null, viewer = null, problem = null, advice = ANEW;
-  panel.say("Loading…");
+  let said = "Loading…"; // below the picture, while the graphics card is there
+  panel.say(said);
+  canvas.addEventListener("webglcontextlost", () => panel.say(RESET));
   try {
     for await (const scene of loadScene(({ done, total }) => panel.progress(done / total))) {
       problem = scene.problem;
       advice = INSTEAD;
-      renderer ??= await Renderer.create(canvas, scene); // its shaders are compiled while the scene is unpacked
+      if (!renderer) {
+        // its shaders are compiled while the scene is unpacked
+        renderer = await Renderer.create(canvas, scene);
+        renderer.onrestored = () => {
+          viewer?.restored();
+          panel.say(said);
+        };
+        panel.say(said); // what was lost meanwhile is back
+      }
       if (scene.grid) renderer.replace(scene);
       advice = ANEW;
       if (!scene.grid) continue;
@@ -33,23 +45,17 @@ async function show() {
       }
       viewer = new Viewer(canvas, renderer, scene.cameras, options, calm, scene.manifest.background);
       panel.connect(viewer, new Controls(viewer), scene.cameras);
-      renderer.onlost = () => {
-        viewer.loseContext(true);
-        panel.say("The graphics card was reset. If the picture does not come back by itself, load the page again.");
-      };
-      renderer.onrestored = () => {
-        viewer.loseContext(false);
-        panel.say("");
-      };
     }
   } catch (error) {
-    if (viewer) panel.say(error.message);
+    if (viewer) problem = `This scene cannot be shown whole here: ${error.message}. ${advice}`;
     else panel.fail(`This scene cannot be shown here: ${error.message}. ${advice}`);
     throw error;
+  } finally {
+    said = problem ?? "";
+    panel.progress(1);
+    if (!renderer?.lost) panel.say(said);
+    viewer?.uncover();
   }
-  panel.progress(1);
-  panel.say(problem ?? "");
-  viewer.uncover();
   return renderer;
 }
 

@@ -17,9 +17,9 @@ export class Panel {
     card.addEventListener("click", (event) => event.target === card && card.close()); // beside the card
   }
 
-  // A line below the picture; "" takes it away.
+  // A line below the picture; "" takes it away. What `fail` said stays.
   say(text) {
-    element("status").textContent = text;
+    if (!document.body.classList.contains("failed")) element("status").textContent = text;
   }
 
   // How much of the scene is there, 0..1; 1 takes the bar of progress away.
@@ -30,9 +30,9 @@ export class Panel {
 
   // The scene cannot be shown: the poster stays, and a sentence says what to do.
   fail(text) {
-    document.body.classList.add("failed");
     this.progress(1);
     this.say(text);
+    document.body.classList.add("failed");
   }
 
   // Connect the buttons with a viewer.
@@ -53,13 +53,14 @@ export class Panel {
         viewer.turn(on);
       },
       fly: () => press("fly", (controls.flies = !controls.flies)),
-      save: () => this.save(),
+      save: () => this.save().catch((error) => this.say(error.message)),
       full: () => this.fullScreen(),
       help: () => element("card").showModal(),
     };
     const keys = {
       Home: actions.home, " ": actions.turn, g: actions.fly, p: actions.save, f: actions.full, "?": actions.help,
       "[": () => views.go(-1), "]": () => views.go(1),
+      c: () => viewer.turnAround(viewer.canvas.clientWidth / 2, viewer.canvas.clientHeight / 2),
     };
     LAYERS.forEach((_, index) => (keys[index + 1] = () => show(index)));
     for (const id in actions) element(id).addEventListener("click", actions[id]);
@@ -70,7 +71,9 @@ export class Panel {
     window.addEventListener("keydown", (event) => {
       const action = keys[event.key.length > 1 ? event.key : event.key.toLowerCase()];
       const taken = event.target.closest?.(`select, input, dialog[open]${event.key === " " ? ", button" : ""}`);
-      if (!action || taken || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+      const bracket = event.altKey && "[]".includes(event.key); // behind AltGr or Option
+      if (!action || taken || event.repeat || event.metaKey) return;
+      if (!bracket && (event.ctrlKey || event.altKey)) return; // it is the browser's
       event.preventDefault();
       action();
     });

@@ -9,11 +9,14 @@ import { raysOf } from "./camera.js";
 import { NO_GRID } from "./grid.js";
 import { multiplyAdds } from "./head.js";
 import { compositeSource, foundTextures, headSource, marchSource, Program } from "./program.js";
-import { deleteFramebuffer, framebufferOf, gpuBytes, TILE, uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
+import { checkMemory, deleteFramebuffer, framebufferOf, gpuBytes, TILE } from "./textures.js";
+import { uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
 
 const OPAQUE_DEPTH = Math.log(1000);
 
 const LOST = "WebGL2: expected a context, got one that was lost";
+
+const pictureOf = ({ width, height }) => `a picture of ${width}x${height}`;
 
 const MEAN = `#version 300 es
 precision highp float;
@@ -27,32 +30,39 @@ void main() {
 
 export class Renderer {
   // A renderer of a scene, whose grid may be null: its shaders are compiled meanwhile. Throws an Error whose message says
-  // what is missing.
+  // what is missing. Waits where the context is lost, until it is back.
   static async create(canvas, scene) {
     const renderer = new Renderer(canvas, scene);
-    await renderer.warmUp();
-    return renderer;
+    for (;;) {
+      try {
+        await renderer.warmUp();
+        return renderer;
+      } catch (error) {
+        if (error.message !== LOST) throw error;
+        const isBack = (go) => canvas.addEventListener("webglcontextrestored", go, { once: true });
+        if (renderer.lost) await new Promise(isBack);
+      }
+    }
   }
 
   constructor(canvas, scene) {
     const settings = { alpha: true, antialias: false, depth: false, stencil: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", settings);
     if (!gl) throw new Error("WebGL2: expected a browser that has it switched on, got none");
-    Object.assign(this, { canvas, gl, scene, onlost: null, onrestored: null, lost: false });
+    Object.assign(this, { canvas, gl, scene, onrestored: null });
     this.listeners = {
-      webglcontextlost: (event) => {
-        event.preventDefault();
-        this.lost = true;
-        this.onlost?.();
-      },
+      webglcontextlost: (event) => event.preventDefault(), // else it would not come back
       webglcontextrestored: () => {
-        this.lost = false;
         this.setUp();
         this.onrestored?.();
       },
     };
     for (const [name, listener] of Object.entries(this.listeners)) canvas.addEventListener(name, listener);
     this.setUp();
+  }
+
+  get lost() {
+    return this.gl.isContextLost();
   }
 
   get info() {
@@ -65,11 +75,12 @@ export class Renderer {
   }
 
   setUp() {
+    if (this.lost) return; // it is done when the context is back
     const { gl } = this;
     const debug = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = String(gl.getParameter(debug ? debug.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     this.sums = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
-    this.sum = this.target = null;
+    this.sum = null;
     this.nSummed = 0;
     this.programs = new Map(); // by their sources
     this.layers = new Map(); // programs by what they draw
@@ -90,8 +101,9 @@ export class Renderer {
     const c2w = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
     const view = { c2w, fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
     await this.done(); // the page is not held up while they are compiled
-    this.paint(view, null, { upwards: true, premultiplied: true });
     await this.read(view);
+    this.paint(view, null, { upwards: true, premultiplied: true });
+    await this.done();
   }
 
   show(scene) {
@@ -100,14 +112,23 @@ export class Renderer {
     this.gpuBytes = gpuBytes(grid, manifest.n_channels);
     this.textures = uploadGrid(gl, grid, manifest.n_channels);
     this.constant = this.constantUniforms(grid);
-    if (scene.grid && gl.getError() === gl.OUT_OF_MEMORY) throw new Error("memory of the GPU: expected more of it, got too little for this scene");
+    if (scene.grid) checkMemory(gl, "this scene");
   }
 
-  // Shows a finer scene from now on.
+  // Shows a finer scene from now on. Where it does not fit, throws an Error, and shows the one before again.
   replace(scene) {
+    const before = this.scene;
+    this.scene = scene;
+    if (this.lost) return; // it is shown when the context is back
     this.forget();
     this.nSummed = 0;
-    this.show(scene);
+    try {
+      this.show(scene);
+    } catch (error) {
+      this.forget();
+      this.show(before);
+      throw error;
+    }
   }
 
   forget() {
@@ -212,7 +233,12 @@ export class Renderer {
       this.paint(view, null, { upwards: true, premultiplied: true });
       return;
     }
-    this.sum = this.sized(this.sum, view.width, view.height, gl.RGBA16F);
+    if (this.sum?.width !== view.width || this.sum.height !== view.height) {
+      if (this.sum) deleteFramebuffer(gl, this.sum);
+      this.sum = framebufferOf(gl, view.width, view.height, [gl.RGBA16F]);
+      this.nSummed = 0;
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.sum.framebuffer);
     if (this.nSummed === 0) gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
     gl.blendFunc(gl.ONE, gl.ONE);
     this.paint(view, this.sum.framebuffer, { upwards: true, premultiplied: true, summed: true });
@@ -223,39 +249,41 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // A bound framebuffer of this size: `before`, or a new one in its place.
-  sized(before, width, height, format) {
-    const { gl } = this;
-    if (before?.width === width && before.height === height) {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, before.framebuffer);
-      return before;
-    }
-    if (before) deleteFramebuffer(gl, before);
-    if (before === this.sum) this.nSummed = 0;
-    return framebufferOf(gl, width, height, [format]);
-  }
-
   // The bytes [4 n] of a part of a view, [left, top, width, height] of it, top row first, straight alpha.
   async read(view, part = [0, 0, view.width, view.height], counting = false) {
     const { gl } = this;
     if (this.lost) throw new Error(LOST);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (view.width > most || view.height > most) throw new Error(`size: expected at most ${most}x${most}, got ${view.width}x${view.height}`);
-    this.target = this.sized(this.target, view.width, view.height, gl.RGBA8);
-    this.paint(view, this.target.framebuffer, { upwards: false, premultiplied: false, counting, part });
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
     const bytes = new Uint8Array(4 * part[2] * part[3]), buffer = gl.createBuffer();
-    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
-    gl.bufferData(gl.PIXEL_PACK_BUFFER, bytes.length, gl.STREAM_READ);
-    gl.readPixels(...part, gl.RGBA, gl.UNSIGNED_BYTE, 0);
-    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    await this.done();
-    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
-    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, bytes);
-    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
-    gl.deleteBuffer(buffer);
+    try {
+      this.paintTo(buffer, bytes.length, view, part, counting);
+      await this.done();
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+      gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, bytes);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+      checkMemory(gl, pictureOf(view)); // some drivers take the memory late
+    } finally {
+      gl.deleteBuffer(buffer);
+    }
     return new Uint8ClampedArray(bytes.buffer);
+  }
+
+  // Draws a part of a view, and has its bytes copied to a buffer.
+  paintTo(buffer, length, view, part, counting) {
+    const { gl } = this, target = framebufferOf(gl, view.width, view.height, [gl.RGBA8]);
+    try {
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+      gl.bufferData(gl.PIXEL_PACK_BUFFER, length, gl.STREAM_READ);
+      checkMemory(gl, pictureOf(view));
+      this.paint(view, target.framebuffer, { upwards: false, premultiplied: false, counting, part });
+      gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+      gl.readPixels(...part, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    } finally {
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      deleteFramebuffer(gl, target);
+    }
   }
 
   // Waits until the GPU has done what it was told, without holding up the page.
@@ -263,8 +291,9 @@ export class Renderer {
     const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     for (;;) {
-      if (this.lost || gl.isContextLost()) throw new Error(LOST);
+      if (this.lost) throw new Error(LOST);
       const state = gl.clientWaitSync(fence, 0, 0);
+      if (state === gl.WAIT_FAILED) throw new Error(LOST); // the fence was lost, and the context is back
       if (state === gl.ALREADY_SIGNALED || state === gl.CONDITION_SATISFIED) break;
       await new Promise((resolve) => setTimeout(resolve, 2));
     }
@@ -295,6 +324,6 @@ export class Renderer {
     this.forget();
     for (const { texture } of Object.values(this.tables)) if (texture) gl.deleteTexture(texture);
     for (const program of this.programs.values()) program.dispose();
-    for (const target of [this.found, this.colours, this.sum, this.target]) if (target) deleteFramebuffer(gl, target);
+    for (const target of [this.found, this.colours, this.sum]) if (target) deleteFramebuffer(gl, target);
   }
 }

@@ -22,13 +22,35 @@ export function gpuBytes({ nb, nf, density, indices, nRows }, nChannels) {
 }
 
 export function uploadGrid(gl, { nb, nf, nSlots, nHeld, nRows, ...grid }, nChannels) {
-  return {
-    uTable: texture3D(gl, gl.TEXTURE_3D, [nb, nb, nb], [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], grid.table),
-    uDensity: texture3D(gl, gl.TEXTURE_3D, blockOf(nSlots, DENSITY_BRICK).size, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], grid.density),
-    uOwners: texture3D(gl, gl.TEXTURE_3D, [nf, nf, nf], [gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT], grid.owners),
-    uIndices: texture3D(gl, gl.TEXTURE_3D, blockOf(nHeld, INDEX_BRICK).size, [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT], grid.indices),
-    uFeatures: texture3D(gl, gl.TEXTURE_2D_ARRAY, featureSize(nRows, nChannels), [gl.RGBA8_SNORM, gl.RGBA, gl.BYTE], grid.features),
+  const { TEXTURE_3D, TEXTURE_2D_ARRAY } = gl;
+  const density = blockOf(nSlots, DENSITY_BRICK).size, indices = blockOf(nHeld, INDEX_BRICK).size;
+  const features = featureSize(nRows, nChannels);
+  const made = {
+    uTable: [TEXTURE_3D, [nb, nb, nb], [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], grid.table],
+    uDensity: [TEXTURE_3D, density, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], grid.density],
+    uOwners: [TEXTURE_3D, [nf, nf, nf], [gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT], grid.owners],
+    uIndices: [TEXTURE_3D, indices, [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT], grid.indices],
+    uFeatures: [TEXTURE_2D_ARRAY, features, [gl.RGBA8_SNORM, gl.RGBA, gl.BYTE], grid.features],
   };
+  for (const [target, size] of Object.values(made)) checkSize(gl, target, size); // before any takes memory
+  return Object.fromEntries(Object.entries(made).map(([name, given]) => [name, texture3D(gl, ...given)]));
+}
+
+function checkSize(gl, target, [width, height, depth]) {
+  const most = gl.getParameter(target === gl.TEXTURE_3D ? gl.MAX_3D_TEXTURE_SIZE : gl.MAX_TEXTURE_SIZE);
+  const largest = Math.max(width, height, target === gl.TEXTURE_3D ? depth : 0);
+  if (largest <= most) return;
+  throw new Error(`memory of the GPU: expected textures of ${largest} texels a side, got at most ${most}`);
+}
+
+// Throws an Error where memory of the GPU was too little for `what`: it has run out since this was called
+// last, or the bound framebuffer is not whole.
+export function checkMemory(gl, what) {
+  const errors = [];
+  for (let error = gl.getError(); error !== gl.NO_ERROR; error = gl.getError()) errors.push(error);
+  const isWhole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
+  if (gl.isContextLost() || (isWhole && !errors.includes(gl.OUT_OF_MEMORY))) return;
+  throw new Error(`memory of the GPU: expected enough for ${what}, got too little`);
 }
 
 function fresh(gl, target) {
@@ -41,10 +63,6 @@ function fresh(gl, target) {
 
 // A texture of some size [3], formats [inside, format, type], filled with `values` line by line as far as these go.
 function texture3D(gl, target, [width, height, depth], [inside, format, type], values) {
-  const most = gl.getParameter(target === gl.TEXTURE_3D ? gl.MAX_3D_TEXTURE_SIZE : gl.MAX_TEXTURE_SIZE), largest = Math.max(width, height);
-  if (largest > most || (target === gl.TEXTURE_3D && depth > most)) {
-    throw new Error(`memory of the GPU: expected textures of ${Math.max(largest, depth)} texels a side, got at most ${most}`);
-  }
   const found = fresh(gl, target), line = 4 * width;
   gl.texStorage3D(target, 1, inside, width, height, depth);
   const put = (x, y, z, w, h, d, from) => {

@@ -44,7 +44,6 @@ export class Viewer {
     this.background = options.background ?? background;
     this.layer = "colour";
     this.pace = new Pace();
-    this.lost = false;
     this.covered = this.pose === pose; // whether the poster, which shows this pose, stays until the scene is all there
     this.touchedAt = this.before = performance.now();
     this.asked = 0; // the request for the next tick
@@ -147,7 +146,7 @@ export class Viewer {
   tick(now) {
     const seconds = Math.min(Math.max((now - this.before) / 1000, 0), 0.1);
     this.before = now;
-    if (this.lost || this.covered) return;
+    if (this.renderer.lost || this.covered) return;
     if (this.fence && !this.finished()) return this.wake();
     const moves = this.advance(now, seconds);
     if (moves) {
@@ -221,10 +220,9 @@ export class Viewer {
     return true;
   }
 
-  // The graphics card has dropped everything, and whether it is back.
-  loseContext(lost) {
-    this.lost = lost;
+  // The graphics card is back, and has dropped everything.
+  restored() {
     this.fence = null;
-    if (!lost) this.refresh();
+    this.refresh();
   }
 }

@@ -19,6 +19,7 @@ export class Views {
       if (index >= 0) this.last = index;
     };
     this.last = -1;
+    viewer.onview(viewer.views.indexOf(viewer.pose)); // that of the address
   }
 
   // Fly `steps` views further in the list, from the one that was chosen last; behind the last one it begins again.

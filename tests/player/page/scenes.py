@@ -89,15 +89,16 @@ def fog(folder: Path, thickness: float = 2.0) -> Asset:
     return write(folder, manifest, arrays, head_of(8, False))
 
 
-def empty(folder: Path) -> Asset:
+def empty(folder: Path, n_channels: int = 4) -> Asset:
     """Nothing to see: no density anywhere."""
     none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
     densities = PyramidValues(Pyramid(24, (none,)), (np.zeros((0, 1), np.uint8),))
     manifest = Manifest(
         generator="tests", resolution=24, feature_resolution=8, step=0.05, density_range=(-3.0, 1.0),
-        n_channels=4, view_size=(48, 40),
+        n_channels=n_channels, view_size=(48, 40),
     )  # fmt: skip
-    return write(folder, manifest, GridArrays(densities, dense(8, 4, 120, np.int8, 1)), head_bytes())
+    features = dense(8, n_channels, 120, np.int8, 1)
+    return write(folder, manifest, GridArrays(densities, features), head_bytes(n_channels))
 
 
 def camera(name: str, c2w: np.ndarray, focal: float = 55.0, cx: float | None = None) -> Camera:

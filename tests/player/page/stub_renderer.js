@@ -9,11 +9,12 @@ export class Renderer {
     const gl = canvas.getContext("webgl2");
     if (!gl) throw new Error("expected WebGL 2, got none");
     Object.assign(this, { canvas, gl, scene });
-    canvas.addEventListener("webglcontextlost", (event) => {
-      event.preventDefault();
-      this.onlost?.();
-    });
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => this.onrestored?.());
+  }
+
+  get lost() {
+    return this.gl.isContextLost();
   }
 
   resize(width, height) {

@@ -20,12 +20,14 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError, FormatError
 from player.page import page
+from player.page.gpu_memory import MOST_CHANNELS
 from player.page.modules import joined
 from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.rest import rest_camera
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
 from tests.player.conftest import look_at
+from tests.player.page import scenes
 
 SECONDS = 120
 MOST_VIEWER = 60_000
@@ -157,6 +159,12 @@ def test_a_page_is_plain_and_names_what_runs(asset: Asset, shells_folder: Path) 
     assert len(html) < 1.35 * (data + made.viewer_bytes + 50_000)
 
 
+def test_a_title_may_hold_what_the_page_fills_in(asset: Asset) -> None:
+    title = "{{data}} of {{title}}"
+    for make in (page_of_one_file, page_of_many_files):
+        assert f"<title>{title}</title>".encode() in make(asset, title).files["index.html"]
+
+
 def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
     """Without what no page needs: the mesh, reports and the settings of the bake."""
     files = scene_files(asset)
@@ -172,6 +180,19 @@ def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Pat
     with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
         export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
     assert not list(tmp_path.iterdir())
+
+
+def test_more_channels_than_browsers_draw_are_refused(chromium: Browser, tmp_path: Path) -> None:
+    """The most that are not refused are drawn: the browser of these tests has the draw buffers that most
+    have."""
+    path = tmp_path / "scene.html"
+    path.write_bytes(page(scenes.empty(tmp_path / "most", MOST_CHANNELS)))
+    with opened(chromium, path.as_uri()) as found:
+        assert found.page.evaluate("() => vfr.ready.then(() => vfr.info.n_channels)") == MOST_CHANNELS == 40
+    asset = scenes.empty(tmp_path / "more", MOST_CHANNELS + 1)
+    for make in (page_of_one_file, page_of_many_files):
+        with pytest.raises(ConfigError, match=r"channels: expected at most 40, .*, got 41: bake it with"):
+            make(asset)
 
 
 def test_an_asset_that_lacks_a_part_is_refused(broken_folder: Path, tmp_path: Path) -> None:

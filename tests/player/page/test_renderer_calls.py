@@ -34,6 +34,28 @@ CANVAS = """([view, jitters]) => {
   return btoa(String.fromCharCode(...bytes));
 }"""
 
+LOST_AND_BACK = """
+const pause = (ms) => new Promise((go) => { setTimeout(go, ms); });
+const heard = (canvas, name) => new Promise((go) => canvas.addEventListener(name, go, { once: true }));
+const lostAndBack = async (canvas, meanwhile) => {
+  const lose = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+  const lost = heard(canvas, "webglcontextlost");
+  lose.loseContext();
+  await meanwhile(lost);
+  await lost;
+  await pause(50); // not while it is told
+  const restored = heard(canvas, "webglcontextrestored");
+  lose.restoreContext();
+  await restored;
+};
+"""
+"""`lostAndBack(canvas, meanwhile)`: the context is lost, and comes back after `meanwhile`."""
+NEGATED = """
+const { scene } = renderer;
+const negated = { ...scene, grid: { ...scene.grid, features: scene.grid.features.map((x) => -x) } };
+"""
+"""`negated`: the scene with other colours."""
+
 
 @pytest.fixture(scope="module")
 def page(chromium: Browser, asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RenderPage]:
@@ -109,39 +131,157 @@ def test_a_lost_context_comes_back(page: RenderPage, asset: Asset) -> None:
     camera = scenes.cameras(asset)["inside"]
     before = page.picture(camera, quality="exact")
     page.page.evaluate(
-        """async () => {
-          const lose = renderer.gl.getExtension("WEBGL_lose_context");
-          const lost = new Promise((resolve) => { renderer.onlost = resolve; });
-          lose.loseContext();
-          await lost;
-          renderer.draw({ c2w: new Array(16).fill(0), fx: 1, fy: 1, cx: 1, cy: 1, width: 2, height: 2 });
-          globalThis.refused = await renderer.render({}).catch((error) => error.message);
-          await new Promise((resolve) => { setTimeout(resolve, 50); }); // not while it is told
-          const restored = new Promise((resolve) => { renderer.onrestored = resolve; });
-          lose.restoreContext();
-          await restored;
-        }"""
+        f"""async () => {{
+          {LOST_AND_BACK}
+          await lostAndBack(renderer.canvas, async (lost) => {{
+            await lost;
+            renderer.draw({{ c2w: new Array(16).fill(0), fx: 1, fy: 1, cx: 1, cy: 1, width: 2, height: 2 }});
+            globalThis.refused = await renderer.render({{}}).catch((error) => error.message);
+          }});
+        }}"""
     )
     assert "expected a context, got one that was lost" in page.page.evaluate("() => refused")
     assert (page.picture(camera, quality="exact") == before).all()
+
+
+def test_a_scene_that_comes_while_the_context_is_lost_is_shown_when_it_is_back(
+    page: RenderPage, asset: Asset
+) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    before = page.picture(camera)
+    page.page.evaluate(
+        f"""async () => {{
+          {LOST_AND_BACK} {NEGATED}
+          globalThis.first = scene;
+          await lostAndBack(renderer.canvas, async () => renderer.replace(negated));
+        }}"""
+    )
+    assert differs(page.picture(camera), before)
+    page.page.evaluate("() => renderer.replace(first)")
+    assert (page.picture(camera) == before).all()
+
+
+def test_a_renderer_waits_for_a_context_that_is_lost_while_its_shaders_are_compiled(
+    page: RenderPage, asset: Asset
+) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    found = page.page.evaluate(
+        f"""async (view) => {{
+          {LOST_AND_BACK}
+          const canvas = document.createElement("canvas"), {{ scene }} = renderer;
+          const making = renderer.constructor.create(canvas, {{ ...scene, grid: null }});
+          const [made] = await Promise.all([making, lostAndBack(canvas, async () => {{}})]);
+          made.replace(scene);
+          const {{ rgba }} = await made.render(view);
+          made.dispose();
+          return [...rgba];
+        }}""",
+        view_of(camera),
+    )
+    assert (np.reshape(found, (camera.height, camera.width, 4)) == page.picture(camera)).all()
+
+
+def test_nobody_waits_for_what_was_drawn_before_a_context_was_lost_and_came_back(page: RenderPage) -> None:
+    told = page.page.evaluate(
+        f"""async () => {{
+          {LOST_AND_BACK}
+          const {{ gl }} = renderer, real = setTimeout, held = [];
+          gl.clientWaitSync = () => (delete gl.clientWaitSync, gl.TIMEOUT_EXPIRED);
+          globalThis.setTimeout = (go) => held.push(go); // it asks again only when the context is back
+          const told = renderer.done().then(() => "done", (error) => error.message);
+          globalThis.setTimeout = real;
+          await lostAndBack(renderer.canvas, async () => {{}});
+          for (const go of held) go();
+          return [held.length, await Promise.race([told, pause(3000)])];
+        }}"""
+    )
+    assert told == [1, "WebGL2: expected a context, got one that was lost"]
+
+
+def differs(one: np.ndarray, two: np.ndarray) -> bool:
+    return bool((np.abs(one.astype(int) - two).max(axis=-1) > 10).mean() > 0.1)
 
 
 def test_another_scene_takes_its_place(page: RenderPage, asset: Asset) -> None:
     """The same with fewer features: negated, and back again."""
     camera = scenes.cameras(asset)["outside"]
     before = page.picture(camera)
-    page.page.evaluate(
-        """() => {
-          const { scene } = renderer;
-          globalThis.first = scene;
-          const features = scene.grid.features.map((x) => -x);
-          renderer.replace({ ...scene, grid: { ...scene.grid, features } });
-        }"""
-    )
-    other = page.picture(camera)
-    assert (np.abs(other.astype(int) - before).max(axis=-1) > 10).mean() > 0.1
+    page.page.evaluate(f"() => {{ {NEGATED} globalThis.first = scene; renderer.replace(negated); }}")
+    assert differs(page.picture(camera), before)
     page.page.evaluate("() => renderer.replace(first)")
     assert (page.picture(camera) == before).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("negated.grid.nb = 100000;", "memory of the GPU: expected textures of 100000 texels a side, got at"),
+        (
+            "gl.getError = () => (delete gl.getError, gl.OUT_OF_MEMORY);",
+            "memory of the GPU: expected enough for this scene, got too little",
+        ),
+    ],
+    ids=["size", "memory"],
+)
+def test_a_scene_that_does_not_fit_leaves_the_one_before(
+    page: RenderPage, asset: Asset, change: str, message: str
+) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    before = page.picture(camera)
+    told = page.page.evaluate(
+        f"""() => {{
+          {NEGATED}
+          const {{ gl }} = renderer;
+          {change}
+          try {{
+            renderer.replace(negated);
+          }} catch (error) {{
+            return error.message;
+          }}
+        }}"""
+    )
+    assert message in told
+    assert (page.picture(camera) == before).all()
+
+
+@pytest.mark.parametrize(
+    "fails",
+    [
+        "gl.texStorage2D = () => {};",
+        "gl.bufferData = () => {}; gl.getError = () => (delete gl.getError, gl.OUT_OF_MEMORY);",
+        "let n = 0; gl.getError = () => (n++ ? (delete gl.getError, gl.OUT_OF_MEMORY) : gl.NO_ERROR);",
+    ],
+    ids=["target", "buffer", "late"],
+)
+def test_a_picture_for_which_memory_is_short_is_refused(page: RenderPage, asset: Asset, fails: str) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    before = page.picture(camera)
+    told = page.page.evaluate(
+        f"""async (view) => {{
+          const {{ gl }} = renderer;
+          {fails}
+          const told = await vfr.render(view).then(() => "a picture", (error) => error.message);
+          for (const name of ["texStorage2D", "bufferData", "getError"]) delete gl[name];
+          return told;
+        }}""",
+        view_of(camera) | {"width": 67, "height": 51},
+    )
+    assert told == "memory of the GPU: expected enough for a picture of 67x51, got too little"
+    assert (page.picture(camera) == before).all()
+
+
+def test_a_picture_keeps_no_memory(page: RenderPage, asset: Asset) -> None:
+    found = page.page.evaluate(
+        """async (view) => {
+          const { gl } = renderer, made = [], real = gl.createTexture;
+          gl.createTexture = () => made[made.push(real.call(gl)) - 1];
+          await vfr.render(view);
+          delete gl.createTexture;
+          return [made.length, made.filter((texture) => gl.isTexture(texture)).length];
+        }""",
+        view_of(scenes.cameras(asset)["outside"]) | {"width": 69, "height": 53},
+    )
+    assert found == [1, 0]
 
 
 def test_coarser_qualities_fetch_less_and_look_alike(page: RenderPage, asset: Asset) -> None:

@@ -69,6 +69,13 @@ def test_the_picture_as_a_file(chromium: Browser) -> None:
             assert picture.format == "PNG" and picture.size == (1280, 2 * height(page))
 
 
+def test_a_picture_that_cannot_be_made_is_told(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        page.evaluate("() => { renderer.render = async () => { throw new Error('no memory'); }; }")
+        page.keyboard.press("p")
+        wait_for(page, lambda: page.locator("#status").text_content() == "no memory")
+
+
 def test_full_screen(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         page.get_by_role("button", name="Full screen").click()
@@ -106,6 +113,28 @@ def test_options_in_the_address(chromium: Browser) -> None:
     with opened(chromium, FILES, "#view=99&turn=off&background=transparent") as (page, *_):
         view = still(page)
         assert not any(matches(view, camera) for camera in VIEWS) and view["background"] == "transparent"
+
+
+def test_the_list_knows_the_view_of_the_address(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#view=2&turn=off") as (page, *_):
+        assert page.locator("#views").evaluate("e => e.selectedIndex") == 3, "the first line is no view"
+        page.keyboard.press("]")
+        wait_for(page, lambda: matches(page.evaluate("() => drawn.at(-1)"), VIEWS[3]))
+
+
+def test_brackets_of_keyboards_that_have_them_behind_other_keys(chromium: Browser) -> None:
+    """AltGr is Ctrl and Alt for some systems, Option is Alt; Ctrl or Cmd and a bracket are the browser's."""
+    with opened(chromium, FILES, "#view=0&turn=off", reduced_motion="reduce") as (page, *_):
+        for held, view in (("ctrlKey altKey", 1), ("altKey", 2), ("ctrlKey", 2), ("metaKey", 2)):
+            page.evaluate(
+                """([names, key]) => {
+                  const held = Object.fromEntries(names.map((name) => [name, true]));
+                  document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, ...held }));
+                }""",
+                [held.split(), "]"],
+            )
+            assert page.locator("#views").evaluate("e => e.selectedIndex") == view + 1
+            assert matches(still(page), VIEWS[view])
 
 
 def turns(page: Page) -> bool:

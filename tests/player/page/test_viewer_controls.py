@@ -62,20 +62,19 @@ def test_the_wheel_goes_nearer(chromium: Browser) -> None:
         assert distance(still(page)) == pytest.approx(distance(before))
 
 
+def hit_at(view: dict[str, Any], x: float, y: float) -> np.ndarray:
+    """[3] the point that is 3 units away at a pixel of a view, as the renderer of these tests says."""
+    ray = c2w(view)[:3, :3] @ [(x - view["cx"]) / view["fx"], (view["cy"] - y) / view["fy"], -1]
+    return c2w(view)[:3, 3] + 3 * ray / np.linalg.norm(ray)
+
+
 def test_a_double_click_turns_around_what_was_hit(chromium: Browser) -> None:
-    """The renderer of these tests says that it is 3 units away."""
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         before = still(page)
         page.mouse.dblclick(400, 150)
         wait_for(page, lambda: page.evaluate("() => asked.length") == 1)
         after = still(page)
-        place = c2w(before)[:3, 3]
-        ray = c2w(before)[:3, :3] @ [
-            (400 - before["cx"]) / before["fx"],
-            (before["cy"] - 150) / before["fy"],
-            -1,
-        ]
-        hit = place + 3 * ray / np.linalg.norm(ray)
+        place, hit = c2w(before)[:3, 3], hit_at(before, 400, 150)
         np.testing.assert_allclose(pixel(after, hit), [after["cx"], after["cy"]], atol=1e-6)
         np.testing.assert_allclose(c2w(after)[:3, 3], place, atol=1e-9)
         drag(page, 60, 0)
@@ -85,6 +84,18 @@ def test_a_double_click_turns_around_what_was_hit(chromium: Browser) -> None:
         wait_for(page, lambda: page.evaluate("() => asked.length") == 2)
         page.wait_for_timeout(300)
         assert page.evaluate("() => drawn.length") == n, "nothing was hit there, so nothing moves"
+
+
+def test_a_key_turns_around_what_is_in_the_middle(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        page.keyboard.press("c")
+        wait_for(page, lambda: page.evaluate("() => asked.length") == 1)
+        after, hit = still(page), hit_at(before, before["width"] / 2, before["height"] / 2)
+        np.testing.assert_allclose(pixel(after, hit), [after["cx"], after["cy"]], atol=1e-6)
+        np.testing.assert_allclose(c2w(after)[:3, 3], c2w(before)[:3, 3], atol=1e-9)
+        drag(page, 60, 0)
+        np.testing.assert_allclose(pixel(still(page), hit), [after["cx"], after["cy"]], atol=1e-6)
 
 
 def test_two_clicks_far_apart_are_no_double_click(chromium: Browser) -> None:

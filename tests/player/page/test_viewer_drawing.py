@@ -133,13 +133,20 @@ def test_the_poster_is_there_before_the_scene_is(chromium: Browser) -> None:
         page.wait_for_selector("#canvas[data-shown]")
 
 
-def test_a_scene_that_comes_in_parts_keeps_its_poster_until_it_is_touched_or_whole(chromium: Browser) -> None:
+def loader_of_parts(first: str = "{}") -> str:
+    """A loader that yields a scene whose grid is `first`, and, after `go()`, a finer one."""
     loader = stub_loader(as_json(VIEWS))
     scene = loader[loader.index("yield") :].partition(";")[0]
+    begun = scene.replace('"grid": {}', f'"grid": {first}')
+    finer = scene.replace('"grid"', '"isFiner": true, "grid"')
     wait = "await new Promise((go) => (globalThis.go = go));"
-    loader = loader.replace(scene, f"{scene}; {wait} {scene}")
+    return loader.replace(scene, f"{begun}; {wait} {finer}")
+
+
+def test_a_scene_that_comes_in_parts_keeps_its_poster_until_it_is_touched_or_whole(chromium: Browser) -> None:
+    files = page_files(loader_of_parts())
     for touched in (False, True):
-        with opened(chromium, page_files(loader), "#turn=off", wait=False) as (page, *_):
+        with opened(chromium, files, "#turn=off", wait=False) as (page, *_):
             page.wait_for_function("() => globalThis.go")
             page.wait_for_timeout(300)
             assert page.evaluate("() => drawn.length") == 0 and page.locator("#progress").is_visible()
@@ -153,3 +160,35 @@ def test_a_scene_that_comes_in_parts_keeps_its_poster_until_it_is_touched_or_who
             assert not page.locator("#progress").is_visible()
             if touched:
                 np.testing.assert_allclose(c2w(after), c2w(turned), atol=1e-12)
+
+
+def test_a_finer_scene_that_does_not_fit_leaves_the_coarse_one(chromium: Browser) -> None:
+    files = page_files(loader_of_parts())
+    stub, why = files["real_renderer.js"], "memory of the GPU: expected enough for this scene, got too little"
+    fails = f"if (scene.isFiner) throw new Error('{why}');".encode()
+    files["real_renderer.js"] = stub.replace(b"this.scene = scene;", fails + b" this.scene = scene;")
+    with opened(chromium, files, "#turn=off", wait=False) as (page, *_):
+        page.wait_for_function("() => globalThis.go")
+        page.evaluate("() => go()")
+        page.wait_for_selector("#canvas[data-done]")
+        said = page.locator("#status").text_content() or ""
+        assert said.startswith(f"This scene cannot be shown whole here: {why}. Open this page in a current")
+        assert page.locator("#bar").is_visible() and not page.locator("#progress").is_visible()
+        assert page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)") == why
+
+
+@pytest.mark.parametrize("first", ["{}", "null"], ids=["after the first part", "before the first part"])
+def test_a_context_that_is_lost_while_the_scene_arrives(chromium: Browser, first: str) -> None:
+    with opened(chromium, page_files(loader_of_parts(first)), "#turn=off", wait=False) as (page, *_):
+        page.wait_for_function("() => globalThis.go && globalThis.renderer")
+        page.evaluate(
+            "() => { globalThis.gl = renderer.gl.getExtension('WEBGL_lose_context'); gl.loseContext(); }"
+        )
+        page.wait_for_function("() => document.getElementById('status').textContent.includes('come back')")
+        page.evaluate("async () => { go(); await vfr.ready; }")
+        page.wait_for_timeout(200)
+        assert "come back" in (page.locator("#status").text_content() or "")
+        assert page.evaluate("() => drawn.length") == 0
+        page.evaluate("() => gl.restoreContext()")
+        page.wait_for_selector("#canvas[data-done]")
+        assert page.locator("#status").text_content() == ""

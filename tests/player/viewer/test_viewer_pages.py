@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from player.errors import ConfigError
+from player.errors import ConfigError, FormatError
 from player.viewer import pages
 from player.viewer.server import free_port, guarded_server
 from tests.player.page.viewer_page import chromium
@@ -116,6 +116,27 @@ def test_the_page_of_each_asset_and_one_that_has_none() -> None:
             assert headers["content-type"] == "text/plain; charset=utf-8"
         assert [got(port, path)[0] for path in ("/page/3", "/page/0", "/pages", "/page/")] == [404] * 4
         assert got(port, "/")[0] == 200
+
+
+@pytest.mark.parametrize("error", [FormatError("part_1.bin: cut short"), MemoryError()], ids=["503", "bug"])
+def test_a_page_that_could_not_be_made_is_tried_again(error: Exception) -> None:
+    """The asset was still being copied, for example."""
+    n_made = []
+
+    def make() -> bytes:
+        n_made.append(1)
+        if len(n_made) == 1:
+            raise error
+        return b"page"
+
+    with serving(make) as port:
+        if isinstance(error, FormatError):
+            assert got(port)[::2] == (503, b"page: part_1.bin: cut short\n")
+        else:
+            with pytest.raises(ConnectionError):
+                got(port)
+        assert [got(port)[2] for _ in range(2)] == [b"page"] * 2
+    assert len(n_made) == 2
 
 
 @pytest.mark.parametrize(
