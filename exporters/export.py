@@ -67,7 +67,8 @@ def export_asset(
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
-            asset that takes more memory than it may, or a page more graphics memory.
+            asset that takes more memory than it may, a page that takes more graphics memory or has more
+            channels than browsers can draw, or two files of one name.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.

@@ -25,6 +25,7 @@ from exporters.surface.asset_surface import AssetSurface
 from exporters.surface.depth_views import FEW_PIXELS, SMALL_PIXELS
 from exporters.surface.few_faces import few_faces
 from player.asset.asset import Asset
+from player.errors import ConfigError
 from player.files.files import write_together
 
 _SECONDS = 300.0
@@ -33,6 +34,8 @@ _SECONDS = 300.0
 
 def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Path]]:
     """The files of each level of detail, the finest first; the first of each level is the mesh.
+
+    Raises ConfigError: two of them have one name, where the target does not end as its format does.
 
     >>> [[path.name for path in level] for level in mesh_paths(Path("a.glb"), ExportOptions(lods=3), "glb")]
     [['a.glb'], ['a.lod1.glb'], ['a.lod2.glb']]
@@ -44,7 +47,13 @@ def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Pat
         levels.append(target.with_name(f"{target.stem}.lod{number}{target.suffix}"))
     if options.texture is None or name != "obj":
         return [[path] for path in levels]
-    return [[path, path.with_suffix(".mtl"), path.with_suffix(".png")] for path in levels]
+    found = [[path, path.with_suffix(".mtl"), path.with_suffix(".png")] for path in levels]
+    if len({str(path).lower() for paths in found for path in paths}) < 3 * len(found):
+        raise ConfigError(
+            f"{target}: name: expected another than those of the MTL and the PNG beside the OBJ, got "
+            f"{target.name}: end it in .obj"
+        )
+    return found
 
 
 def export_mesh(

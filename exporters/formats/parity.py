@@ -69,7 +69,8 @@ def check_textured_obj(files: dict[str, bytes], mesh: TriangleMesh, texture: Tex
     """Raises ParityError if the `.obj`, `.mtl` and `.png` in `files` do not hold `mesh` and `texture`."""
     data = files[".obj"]
     named = [line[7:] for line in files[".mtl"].decode().splitlines() if line.startswith("map_Kd ")]
-    stem = data[data.index(b"mtllib ") + 7 : data.index(b".mtl")].decode()
+    start = data.index(b"mtllib ") + 7
+    stem = data[start : data.index(b"\n", start)].decode().removesuffix(".mtl")
     if named != [f"{stem}.png"]:
         raise ParityError(f"{where}: map_Kd: expected {stem}.png, got {named}")
     check_mesh_bytes(".obj", data, mesh, where, texture)

@@ -60,7 +60,7 @@ def cut_surface(
     """Where a grid's density equals `level`, roughly: `settled` makes the surface of it.
 
     Args:
-        grid: the sparse grid, of one level and cubic voxels.
+        grid: the sparse grid, of one level.
         level: density in 1/model unit; None is `half_opaque`, or the middle of what is stored if
             nothing is that dense.
         progress: called with the share done in (0, 1] after each block.
@@ -94,14 +94,16 @@ def cut_surface(
 
 def settled(grid: SparseGrid, cut: Cut) -> Surface:
     """The surface of a cut, in the model frame: its vertices on the level to a hundredth of a voxel where the
-    density has a slope there, its normals along the falling density."""
+    density has a slope there, its normals along the falling density; where it does not fall, the mean of the
+    faces around, by area."""
     g = onto_level(grid, cut.g, cut.code_level, cut.stride)
     vertices = grid.aabb_min.astype(np.float64) + g / grid.cells_per_unit.astype(np.float64)
-    return Surface(vertices, cut.faces, _normals(grid, g, cut.faces, cut.code_level))
+    normals = unit_normals(_slopes(grid, g, cut.code_level), vertices, cut.faces, 0.1)
+    return Surface(vertices, cut.faces, normals)
 
 
 def voxel_size(grid: SparseGrid) -> float:
-    """Edge of a voxel, model units."""
+    """Edge of a voxel along x, model units."""
     return 1 / float(grid.cells_per_unit[0])
 
 
@@ -232,14 +234,15 @@ def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return g[first], triangles[has_three_corners(triangles)].astype(np.int32)
 
 
-def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: float) -> np.ndarray:
-    """Unit normals [n, 3] at points `g` [n, 3] along the falling code.
+def _slopes(grid: SparseGrid, g: np.ndarray, code_level: float) -> np.ndarray:
+    """How the code falls along the axes of the model frame [n, 3] at points `g` [n, 3], in codes over the
+    shortest edge of a voxel.
 
     They are differences of the clipped code over half a voxel to both sides, or to the one side that is
-    stored; where the differences vanish, the mean of the faces around, by area.
+    stored.
     """
     limit = _CLIP / float(grid.density_slope)
-    normals = np.zeros_like(g)
+    slopes = np.zeros_like(g)
     for start in range(0, len(g), _AT_ONCE):
         rows = slice(start, start + _AT_ONCE)
         here = np.clip(code_and_slope(grid, g[rows])[0] - code_level, -limit, limit)
@@ -250,5 +253,6 @@ def _normals(grid: SparseGrid, g: np.ndarray, faces: np.ndarray, code_level: flo
                 rise = sign * (np.clip(codes - code_level, -limit, limit) - here)
                 sides.append(np.where(known, rise, np.nan))
             n_known = np.isfinite(sides).sum(axis=0)
-            normals[rows, axis] = -np.nansum(sides, axis=0) / np.maximum(n_known, 1)
-    return unit_normals(normals, g, faces, 0.1)
+            slopes[rows, axis] = -np.nansum(sides, axis=0) / np.maximum(n_known, 1)
+    per_unit = grid.cells_per_unit.astype(np.float64)
+    return slopes * (per_unit / per_unit.max())

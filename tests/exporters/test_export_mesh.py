@@ -113,6 +113,8 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
         ("a.glb --texture 64 --time-limit 0", "--time-limit: expected seconds > 0, got 0"),
         ("a.glb --texture 64 --time-limit 0.001", "--texture: laying out"),
         ("a b.obj --texture 64", "OBJ: name: expected one without spaces"),
+        ("x.png --format obj --texture 64", "x.png: name: expected another than those of the MTL and"),
+        ("x --format obj --texture 64 --lods 2", "x: name: expected another than those of the MTL and"),
         ("a.json --method tsdf", "--method does nothing for json"),
     ],
 )

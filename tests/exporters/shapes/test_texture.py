@@ -91,6 +91,7 @@ def test_parity_of_textured_files() -> None:
     glb, obj = glb_bytes(mesh, texture), textured_obj_files(mesh, texture, "a")
     check_mesh_bytes(".glb", glb, mesh, "a.glb", texture)
     check_textured_obj(obj, mesh, texture, "a.obj")
+    check_textured_obj(textured_obj_files(mesh, texture, "a.mtl"), mesh, texture, "a.mtl.obj")
     moved = Texture(texture.uvs + np.float32(1e-3), texture.image)
     image = texture.image.copy()
     image[3, 4, 1] ^= 1

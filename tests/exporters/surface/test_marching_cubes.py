@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,25 @@ def test_a_box_keeps_its_place_and_size(cube_asset: Asset) -> None:
     np.testing.assert_allclose(vertices.min(0), np.array(CUBE_LOW) - offset, rtol=0, atol=0.1 * 2 / 48)
     np.testing.assert_allclose(vertices.max(0), np.array(CUBE_HIGH) + offset, rtol=0, atol=0.1 * 2 / 48)
     assert len(vertices) - len(faces) / 2 == 2
+
+
+@pytest.mark.parametrize("by_faces", [False, True])
+def test_normals_are_right_in_a_box_that_is_no_cube(
+    ball_asset: Asset, by_faces: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ball becomes an ellipsoid, twice as long along y."""
+    grid, stretch = ball_asset.grid, np.array([1.0, 2.0, 1.0])
+    low, per_unit = (-stretch).astype(np.float32), (36 / stretch).astype(np.float32)
+    long = replace(grid, aabb_min=low, cells_per_unit=per_unit)
+    cut = cut_surface(long)
+    if by_faces:
+        monkeypatch.setattr(asset_surface, "_CLIP", 0.0)  # the code has no slope anywhere
+    vertices, _, normals = settled(long, cut)
+    outward = vertices / stretch - BALL_CENTRE
+    assert np.linalg.norm(outward, axis=-1).mean() == pytest.approx(BALL_RADIUS, abs=0.05)
+    along = outward / stretch
+    cosines = (normals * along).sum(-1) / np.linalg.norm(along, axis=-1)
+    assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < 6, "twice that of a ball; unstretched 19"
 
 
 def test_code_and_slope_are_those_of_the_player(ball_asset: Asset) -> None:
