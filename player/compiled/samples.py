@@ -3,6 +3,7 @@ compiled twin of `player.march.march.sample_rays`."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -43,9 +44,32 @@ class _Met(NamedTuple):
     points: np.ndarray
 
 
-def sample_rays(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> PlacedSamples:
-    """`player.march.march.sample_rays`, compiled: same result to float32 rounding, and the samples' points as
-    `Path.at` has them."""
+def sample_rays(
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_threads: int = 1
+) -> PlacedSamples:
+    """`player.march.march.sample_rays`, compiled: same result to float32 rounding, whatever the number of
+    threads, and the samples' points as `Path.at` has them."""
+    n_packets = -(-len(rays_o) // LANES)
+    size = max(-(-n_packets // n_threads), 1) * LANES  # whole packets, as one thread has them
+    firsts = range(0, max(len(rays_o), 1), size)
+    rays = [(rays_o[first : first + size], rays_d[first : first + size]) for first in firsts]
+    if len(rays) == 1:
+        parts = [_sample(grid, *rays[0])]
+    else:
+        with ThreadPoolExecutor(n_threads) as pool:
+            parts = list(pool.map(lambda some: _sample(grid, *some), rays))
+    for first, (met, *_) in zip(firsts, parts, strict=True):
+        met.ray[:] += first
+    met, tau, counts = zip(*parts, strict=True)
+    ray, s, weights, ways, points = map(np.concatenate, zip(*met, strict=True))
+    path = path_of(grid, rays_o, rays_d)
+    return PlacedSamples(
+        path, Samples(ray, s, weights), ways, np.concatenate(tau), np.concatenate(counts), points
+    )
+
+
+def _sample(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[_Met, np.ndarray, np.ndarray]:
+    """What n rays meet, their optical depths [n] and numbers of density samples [n]."""
     lookup, steps, packets, most_samples = enter(grid, rays_o, rays_d)
     n_rays, room = len(rays_o), max(MOST_AT_ONCE, most_samples * LANES)
     samples, sums = scratch((3, most_samples, LANES), F32), scratch((SUMS, LANES), F32)
@@ -58,12 +82,8 @@ def sample_rays(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> Pla
         n, number = _sample_packets(lookup, steps, packets, number, work, met, tau, counts)
         parts.append([column[:n].copy() for column in met])
     check_scratch(packets, *work, tau, counts, met)
-    ray, s, weights, ways, points = (
-        (np.concatenate(column) for column in zip(*parts, strict=True))
-        if parts
-        else (column[:0] for column in met)
-    )
-    return PlacedSamples(path_of(grid, rays_o, rays_d), Samples(ray, s, weights), ways, tau, counts, points)
+    columns = map(np.concatenate, zip(*parts, strict=True)) if parts else (column[:0] for column in met)
+    return _Met(*columns), tau, counts
 
 
 @compiled

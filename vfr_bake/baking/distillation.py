@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import get_num_threads
 
 from player.asset.grid import SparseGrid, VertexRows
 from player.cameras.camera import Camera
@@ -186,7 +187,7 @@ def collect_training_rays(
     meets = np.zeros(len(teacher.opacity), bool)
     for first in range(0, len(meets), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        sampled = sample_rays(grid, teacher.rays_o[rows], teacher.rays_d[rows])
+        sampled = sample_rays(grid, teacher.rays_o[rows], teacher.rays_d[rows], get_num_threads())
         meets[rows] = -np.expm1(-sampled.tau) > MIN_OPACITY
     if not meets.any():
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
@@ -214,7 +215,7 @@ class PlayerFetches(NamedTuple):
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
     `player.march.march` composes them with k = `n_fetches`."""
-    entries, samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d)
+    entries, samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)

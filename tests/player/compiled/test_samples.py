@@ -66,3 +66,14 @@ def test_more_samples_than_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> 
     parts = compiled.sample_rays(grid, *some)
     for a, b in zip((*parts.samples, parts.points), (*whole.samples, whole.points), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 17, 1000])
+@pytest.mark.parametrize("name", ["box", "space"])
+def test_any_number_of_threads_finds_the_same(name: str, n_rays: int) -> None:
+    grid, (rays_o, rays_d) = GRIDS[name](), rays(1000, seed=3)
+    alone = compiled.sample_rays(grid, rays_o[:n_rays], rays_d[:n_rays])
+    for n_threads in (2, 3, 7):
+        found = compiled.sample_rays(grid, rays_o[:n_rays], rays_d[:n_rays], n_threads)
+        for a, b in zip((*found.samples, *found[2:]), (*alone.samples, *alone[2:]), strict=True):
+            assert a.dtype == b.dtype and a.tobytes() == b.tobytes()
