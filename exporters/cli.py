@@ -11,7 +11,7 @@ from typing import Any
 
 from exporters.options import FOLDERS, FORMATS, POINTS, ExportOptions
 from player.app.commands import run
-from player.app.option_types import gigabytes, number, part, size, whole
+from player.app.option_types import gigabytes, joined_negatives, number, part, size, whole
 from player.app.options import MAX_MEMORY
 
 _DESCRIPTION = """\
@@ -80,7 +80,8 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    return run("vfr-export", lambda: _export(_joined_negatives(sys.argv[1:] if argv is None else argv)))
+    words = joined_negatives(sys.argv[1:] if argv is None else argv, "--crop", "--views")
+    return run("vfr-export", lambda: _export(words))
 
 
 def _export(argv: list[str]) -> int:
@@ -137,20 +138,6 @@ def make_parser() -> argparse.ArgumentParser:
     value("--max-memory", "GB", MAX_MEMORY, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
     return parser
-
-
-def _joined_negatives(argv: list[str]) -> list[str]:
-    """`--crop -1,0,...` as one word: argparse takes what begins with a minus for an option.
-
-    >>> _joined_negatives(["out", "--crop", "-.5,0,0,1,1,1", "a.ply", "--views", "-3:", "--force"])
-    ['out', '--crop=-.5,0,0,1,1,1', 'a.ply', '--views=-3:', '--force']
-    """
-    words = list(argv)
-    for index in range(len(words) - 2, -1, -1):
-        value = words[index + 1]
-        if words[index] in ("--crop", "--views") and value[:1] == "-" and value[1:2] in set(".0123456789"):
-            words[index : index + 2] = [f"{words[index]}={value}"]
-    return words
 
 
 def _bar(stage: str, done: int, total: int) -> None:

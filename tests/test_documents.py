@@ -23,6 +23,7 @@ from exporters import cli as exporters_cli
 from exporters.formats.ply import ply_bytes
 from exporters.options import check_options
 from player import Asset
+from player.app.option_types import joined_negatives
 from player.app.options import parse as parse_play
 from player.asset.asset import GridArrays, write_asset
 from player.asset.manifest import FILES, Manifest
@@ -180,7 +181,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 
 def _export(words: list[str]) -> None:
-    arguments = exporters_cli.make_parser().parse_args(exporters_cli._joined_negatives(words))
+    arguments = exporters_cli.make_parser().parse_args(joined_negatives(words, "--crop", "--views"))
     check_options(arguments.file, exporters_cli._options(arguments))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 DEMO = Path(__file__).parent / "demo"
@@ -28,6 +28,21 @@ def asset_folder(text: str) -> Path:
     ('out', True, False)
     """
     return DEMO if text == DEMO.name else Path(text)
+
+
+def joined_negatives(argv: Sequence[str], *options: str) -> list[str]:
+    """`--crop -1,0,...` as one word, for these `options`: argparse takes what begins with a minus for an
+    option of its own.
+
+    >>> joined_negatives(["out", "--crop", "-.5,0,0,1,1,1", "a.ply", "--views", "-3:"], "--crop", "--views")
+    ['out', '--crop=-.5,0,0,1,1,1', 'a.ply', '--views=-3:']
+    """
+    words = list(argv)
+    for index in range(len(words) - 2, -1, -1):
+        value = words[index + 1]
+        if words[index] in options and value[:1] == "-" and value[1:2] in set(".0123456789"):
+            words[index : index + 2] = [f"{words[index]}={value}"]
+    return words
 
 
 def whole(least: int | None = None, most: int | None = None, example: int = 10) -> Callable[[str], int]:

@@ -118,7 +118,11 @@ def _matrix(values: Any, where: str) -> np.ndarray:
 
 
 def _placement(path: Path) -> np.ndarray | None:
-    """[4, 4] from the path's frame to the world's, out of a `dataparser_transforms.json`, if there is one."""
+    """[4, 4] from the path's frame to the world's, out of a `dataparser_transforms.json`, if there is one.
+
+    That has what nerfstudio has done to the cameras as COLMAP had found them, `applied_transform` of the data
+    set's `transforms.json` included; the world is that of `transforms.json`, in which it is done already.
+    """
     if not path.exists():
         return None
     document = parse_json(read_json(path, "nerfstudio's placement of the scene"), str(path))
@@ -131,4 +135,20 @@ def _placement(path: Path) -> np.ndarray | None:
     matrix = _matrix([*rows, [0, 0, 0, 1]], str(path))
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3):
         raise FormatError(f"{path}: transform: expected a rotation and a translation, got {brief(rows)}")
-    return np.linalg.inv(np.diag([factor] * 3 + [1]) @ matrix)
+    applied, applied_factor = _applied(path.with_name("transforms.json"))
+    return applied @ np.linalg.inv(np.diag([factor / applied_factor] * 3 + [1]) @ matrix)
+
+
+def _applied(path: Path) -> tuple[np.ndarray, float]:
+    """The `applied_transform` [4, 4] and `applied_scale` of a `transforms.json`; of none the identity."""
+    document = parse_json(read_json(path, "nerfstudio's cameras"), str(path)) if path.exists() else {}
+    if not isinstance(document, dict):
+        raise FormatError(f"{path}: expected nerfstudio's cameras, got {brief(document)}")
+    rows, factor = document.get("applied_transform"), as_float(document.get("applied_scale", 1.0))
+    if factor is None or factor <= 0:
+        raise FormatError(f"{path}: applied_scale: expected more than 0, got {brief(document)}")
+    if rows is None:
+        return np.eye(4), factor
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise FormatError(f"{path}: applied_transform: expected 3 rows, got {brief(rows)}")
+    return _matrix([*rows, [0, 0, 0, 1]], f"{path}: applied_transform"), factor

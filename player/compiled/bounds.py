@@ -23,13 +23,15 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     near, far = np.full(shape, np.inf, F32), np.full(shape, -np.inf, F32)
     bricks = seen_bricks(grid, camera)
     lens = (camera.cx, camera.cy, camera.fx, camera.fy)
-    _bounds(bricks.firsts, bricks.steps, float(np.linalg.norm(bricks.steps)) / 2, lens, near, far)
+    radius = float(np.linalg.norm(bricks.steps)) / 2
+    _bounds(bricks.firsts, bricks.steps, radius, bricks.units, lens, near, far)
     return near, far
 
 
 @compiled
-def _bounds(firsts, steps, radius, lens, near, far):
+def _bounds(firsts, steps, radius, units, lens, near, far):
     cx, cy, fx, fy = lens
+    least, most = units
     rows, columns = near.shape
     for brick in range(len(firsts)):
         first = firsts[brick]
@@ -47,8 +49,8 @@ def _bounds(firsts, steps, radius, lens, near, far):
             left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
         if farthest < 0:
             continue
-        start = F32(max(math.sqrt(squares) - radius * 1.001, 0.0))
-        end = F32(math.sqrt(squares) + radius * 1.001)
+        start = F32(max(math.sqrt(squares) - radius * 1.001, 0.0) * least)
+        end = F32((math.sqrt(squares) + radius * 1.001) * most)
         if nearest > 1e-6 * radius:
             first_row, last_row = _range(top, bottom, rows)
             first_column, last_column = _range(left, right, columns)
@@ -63,6 +65,7 @@ def _bounds(firsts, steps, radius, lens, near, far):
 @compiled
 def _range(least, most, n_blocks):
     """The first block, and the one after the last, whose pixel centres can lie between two coordinates."""
-    low = math.floor((least - 0.5 - MARGIN_PX) / BLOCK)
-    high = math.floor((most - 0.5 + MARGIN_PX) / BLOCK) + 1
-    return int(min(max(low, 0.0), float(n_blocks))), int(min(max(high, 0.0), float(n_blocks)))
+    # Within the picture before they are rounded: `math.floor` gives int64 here.
+    low = min(max((least - 0.5 - MARGIN_PX) / BLOCK, 0.0), float(n_blocks))
+    high = min(max((most - 0.5 + MARGIN_PX) / BLOCK, -1.0), float(n_blocks))
+    return math.floor(low), min(math.floor(high) + 1, n_blocks)

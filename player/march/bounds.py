@@ -30,6 +30,9 @@ class Bricks(NamedTuple):
     """[n, 3] float64, the lowest corner of each, model units."""
     steps: np.ndarray
     """[3, 3] float64: what a brick is along the x, y and z of the grid."""
+    units: tuple[float, float]
+    """Model units in a unit of the camera's, along the direction that has the fewest and along that with the
+    most: 1 but for what a camera's turn, which is checked to a thousandth, is off."""
 
 
 def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
@@ -37,7 +40,9 @@ def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
     edge = BRICK / grid.cells_per_unit.astype(np.float64)
     w2c = np.linalg.inv(camera.c2w)
     steps = (w2c[:3, :3] * edge).T
-    return Bricks(grid.places @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3]), steps)
+    most, _, least = np.linalg.svd(camera.c2w[:3, :3], compute_uv=False)
+    firsts = grid.places @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
+    return Bricks(firsts, steps, (float(least), float(most)))
 
 
 def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -53,10 +58,10 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     """
     shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
     near, far = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
-    first, steps = seen_bricks(grid, camera)
+    first, steps, (least, most) = seen_bricks(grid, camera)
     radius = float(np.linalg.norm(steps)) / 2
     distance = np.linalg.norm(first + steps.sum(axis=0) / 2, axis=1)
-    starts, ends = np.maximum(distance - radius * 1.001, 0), distance + radius * 1.001
+    starts, ends = np.maximum(distance - radius * 1.001, 0) * least, (distance + radius * 1.001) * most
     corners = np.array(list(np.ndindex(2, 2, 2))) @ steps
     depths = -(first[:, 2] + corners[:, 2, None])  # [8, n]
     ahead, behind = (depths > 1e-6 * radius).all(axis=0), (depths < 0).all(axis=0)

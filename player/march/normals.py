@@ -43,9 +43,10 @@ def composited_normals(
 
 
 def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
-    """Gradient [3, n] float32 of the interpolated density code, codes a cell, at points of live cells.
+    """Gradient [3, n] float32 of the interpolated density code, codes a cell; 0 outside of live cells.
 
-    `g` [3, n] float32: grid coordinates (cells), each in a live cell, as samples of the march are.
+    `g` [3, n] float32: grid coordinates (cells). Samples of the march lie in live cells, but in contracted
+    space their places, found again, may be rounded to beyond the faces.
     """
     found = grid.find(g)
     at = found.corners
@@ -56,4 +57,4 @@ def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
         slopes[0] += (2 * x - 1) * code * share[1][y] * share[2][z]
         slopes[1] += (2 * y - 1) * code * share[0][x] * share[2][z]
         slopes[2] += (2 * z - 1) * code * share[0][x] * share[1][y]
-    return slopes * CELLS_OF_LEVELS.take(found.entries & 7)
+    return np.where(found.live, slopes * CELLS_OF_LEVELS.take(found.entries & 7), np.float32(0))

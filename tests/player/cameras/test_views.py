@@ -70,6 +70,27 @@ def test_nerfstudios_placement_of_the_scene_is_undone(tmp_path: Path) -> None:
             read_views(path)
 
 
+def test_what_nerfstudio_had_done_to_the_cameras_before_is_not_undone(tmp_path: Path) -> None:
+    """`ns-process-data` turns COLMAP's frame before it writes transforms.json; the placement has that in it,
+    as the dataparser does: transform = orientation @ applied_transform, scale times applied_scale."""
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    orientation = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
+    applied = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 0]])
+    placed = np.eye(4)
+    placed[:3] = orientation @ POSE  # of a pose as transforms.json has it
+    placed[:3, 3] *= 0.25
+    path = write(tmp_path, path_document(camera_to_world=placed.reshape(-1).tolist()))
+    whole = orientation @ np.concatenate([applied, [[0, 0, 0, 1]]])
+    write(tmp_path, {"transform": whole.tolist(), "scale": 0.25 * 3}, "dataparser_transforms.json")
+    data = {"frames": [], "applied_transform": applied.tolist(), "applied_scale": 3.0}
+    write(tmp_path, data, "transforms.json")
+    np.testing.assert_allclose(read_views(path)[0].c2w, POSE, atol=1e-12)
+    for broken in ({"applied_transform": [1]}, {"applied_scale": 0}, []):
+        write(tmp_path, broken, "transforms.json")
+        with pytest.raises(FormatError, match=r"transforms\.json: "):
+            read_views(path)
+
+
 def test_our_own_path_comes_back(tmp_path: Path) -> None:
     camera = Camera("a", POSE, 64, 48, 70.0, 70.0, 32.0, 24.0)
     path = tmp_path / "p.json"
