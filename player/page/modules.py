@@ -104,8 +104,9 @@ def _as_function(source: str, name: str) -> str:
 def without_comments(source: str) -> str:
     """A module or a shader without comments, without indents and without empty lines.
 
-    Comments are `// ...` lines, ` // ...` at the end of a line if no quote is in it, and `/* ... */` that begins and ends lines of its own; templates and strings
-    of several lines keep what they hold only if no line of theirs begins like one.
+    Comments are `// ...` lines, ` // ...` at the end of a line if no quote is in it, and `/* ... */` that
+    begins and ends lines of its own; templates and strings of several lines keep what they hold only if none
+    of their lines has what looks like one.
 
     >>> without_comments("// What it is.\\nconst a = 1; // one\\n\\n  /* more\\n  text */\\n  f(a);\\n")
     'const a = 1; // one\\nf(a);\\n'
