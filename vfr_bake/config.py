@@ -327,9 +327,11 @@ class BakeConfig:
     lose no more than the preset allows."""
     refine_steps: int | None = None
     """Steps of each round in which head and stored values are adapted to each other, the full model being the
-    teacher; 0: none. If not given, the preset's, or as many as there is time for."""
+    teacher; 0: none, with the model's own head. If not given, the preset's, or as many as there is time
+    for."""
     mesh_resolution: int | None = None
-    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
+    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0: as many as its
+    bytes allow, a tenth of the asset's."""
     max_loss_db: float | None = None
     """Fail, and write nothing, if the written files lose more than this against photographs."""
     max_mb: float | None = None
@@ -363,6 +365,8 @@ class BakeConfig:
         check(choice, "n_channels", 1 <= choice.n_channels <= 64, "1 to 64")
         check(choice, "code_levels", 7 <= choice.code_levels <= 127, "7 to 127")
         check(choice, "head_width", choice.head_width == 0 or 8 <= choice.head_width <= 256, "0 or 8 to 256")
+        learns = self.refine_steps != 0 or not self.head_width
+        check(self, "head_width", learns, "0 with --refine-steps 0, because a smaller head has to learn")
         check(choice, "refine_steps", 0 <= choice.refine_steps <= 1_000_000, "0 to 1,000,000")
         check(choice, "head_bits", choice.head_bits in (8, 32), "8 or 32")
         fits = choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024
@@ -383,7 +387,8 @@ class BakeConfig:
             preset = replace(preset, **UNBOUNDED[self.preset])
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_fetches"] = None if self.k == "auto" else self.k
-        return replace(preset, **{name: value for name, value in given.items() if value is not None})
+        choice = replace(preset, **{name: value for name, value in given.items() if value is not None})
+        return choice if choice.refine_steps else replace(choice, head_width=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,8 @@ class BakeChoice:
     """Wall-clock minutes of a bake, roughly: refinement takes fewer steps where the machine is too slow for
     all of them, unless their number was asked for."""
     mesh_resolution: int
-    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0 leaves it all."""
+    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0: as many as its
+    bytes allow."""
     target_loss_db: float
     """Loss that the preset aims at, dB."""
 

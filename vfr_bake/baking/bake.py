@@ -153,7 +153,7 @@ class _Bake:
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
-        most_db = self._allowed(self.choice.culled_loss_db, self.held_out.stages[-1])
+        most_db = self._allowed(self.choice.culled_loss_db, tuning.kept)
         played = runner(stored.head, tuning.ranges)
         detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
         with self._part("detail"):
@@ -163,11 +163,11 @@ class _Bake:
         del stored, again  # they hold the features, and the cells that hardly anything sees
         with self._part("codes"):
             arrays = self._spend(weights, needed, teacher, tuning.ranges, len(head))
-            level_steps = detail.level_steps(layout.played(arrays))
+            level_steps = detail.level_steps(layout.played(arrays), self.config.max_loss_db)
         manifest = self._manifest(layout, arrays, {}, level_steps)
         del teacher, needed, layout  # what is written is played and meshed in their room
         with self._part("agreement"):
-            manifest = replace(manifest, agreement=self._agreement(manifest, arrays, head))
+            manifest = replace(manifest, agreement=self._agreement(manifest, arrays, head, tuning.kept))
         figures: dict[str, Any] = {
             "n_vertices": int(arrays.densities.first_rows[-1]),
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
@@ -178,7 +178,7 @@ class _Bake:
         def finish(new: Path) -> dict[str, bytes]:
             """The mesh, which may take a part of the bytes that the other files take, and the report.
             `figures` are in the manifest, which is written again after this."""
-            asset = Asset.open(new, verify=True)
+            asset = Asset.open(new, verify=True, max_memory=self.config.max_memory)
             mesh, removed = self._mesh(asset, file_sizes(new))
             figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
             data = small_ply_bytes(mesh)
@@ -231,12 +231,10 @@ class _Bake:
         most = mesh_bytes(sum(sizes.values()) - sizes["mesh.ply"], self.config.max_mb)
         resolution = self.choice.mesh_resolution or asset.manifest.resolution
         with self._part("mesh"):
-            mesh, removed = bake_mesh(asset, resolution, most, self._report)
-        if not len(mesh.faces):
-            self.left_out["mesh"] = "all of it: nowhere is the field dense enough for a surface"
-        elif asset.manifest.contracted:
-            self.left_out["mesh"] = "all surfaces outside the unit ball of the model frame"
-        return mesh, removed
+            baked = bake_mesh(asset, resolution, most, self.config.max_memory, self._report)
+        if baked.left_out is not None:
+            self.left_out["mesh"] = baked.left_out
+        return baked.mesh, baked.removed
 
     def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays, Callable[[], Parts]]:
         """Projected, scaled codes at every vertex, and the head that takes them, as the field has them; what
@@ -349,10 +347,12 @@ class _Bake:
             _, price = turning_point(is_too_large, RAISED * price)
         return kept[price] if price in kept else prices.at(price).arrays
 
-    def _agreement(self, manifest: Manifest, arrays: GridArrays, head: bytes) -> tuple[float, float]:
+    def _agreement(
+        self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage
+    ) -> tuple[float, float]:
         """How nearly pixels have to agree in `high` and `fast` pictures of the asset."""
         views = compared_views(self.model, self.config.check_views)
-        error = self.held_out.model_error * 10 ** (self.held_out.stages[-1].loss.db / 10)
+        error = self.held_out.model_error * 10 ** (refined.loss.db / 10)
         with TemporaryDirectory() as folder:
             asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head})
             return fitting_agreement(asset, views, error)
@@ -383,8 +383,8 @@ class _Bake:
                 asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head(width)})
                 return frame_ms(asset, self.model.cameras[0], n_fetches)
 
-        fixed = self.config.head_width is not None, self.config.k != "auto"
-        return keep_to_time(self.choice, target_ms, measure, *fixed)
+        same_head = self.config.head_width is not None or not self.choice.refine_steps
+        return keep_to_time(self.choice, target_ms, measure, same_head, self.config.k != "auto")
 
     def _manifest(
         self, layout: Layout, arrays: GridArrays, figures: dict[str, Any], level_steps: tuple[int, ...]

@@ -3,6 +3,8 @@ small part of the asset."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from exporters.progress import Report
@@ -22,25 +24,44 @@ FEWEST_BYTES = 43_000
 """A mesh of about 2,000 faces, which every asset may have."""
 
 
-def bake_mesh(asset: Asset, resolution: int, max_bytes: int, report: Report) -> tuple[TriangleMesh, Removed]:
-    """The mesh in the WORLD frame, and what was removed of it.
+class BakedMesh(NamedTuple):
+    """The mesh of an asset."""
 
-    In an unbounded scene it covers the inner region; an even fog, which has no surface, has an empty mesh.
+    mesh: TriangleMesh
+    """WORLD frame."""
+    removed: Removed
+    left_out: str | None
+    """What is not in it, and why."""
+
+
+def bake_mesh(asset: Asset, resolution: int, max_bytes: int, max_memory: float, report: Report) -> BakedMesh:
+    """The mesh of an asset; an empty one where there is no surface, as in an even fog.
+
+    In an unbounded scene it covers the inner region.
 
     Args:
         asset: complete but for its mesh; it is played.
         resolution: the mesh has at most the faces that a grid of so many voxels along the box would give it.
         max_bytes: the most bytes of the mesh as it is written.
+        max_memory: gigabytes that the densities may take on one level.
         report: called with (stage, done, of).
     """
+    none = np.zeros((0, 3))
+    empty = TriangleMesh(none, none.astype(np.int32), none, np.zeros((0, 4), np.uint8)), Removed(0, 0, 0, 0)
     try:
-        surface = AssetSurface(inner_region(asset), report, FEW_PIXELS, VIEWS)
+        inner = inner_region(asset, max_memory)
+    except ConfigError:
+        why = f"on one level the densities take more than {max_memory:g} GB of memory"
+        return BakedMesh(*empty, f"all of it: {why}: vfr-export --max-memory makes it of the asset")
+    except DataError:
+        return BakedMesh(*empty, "all of it: there is nothing in the unit ball of the model frame")
+    try:
+        surface = AssetSurface(inner, report, FEW_PIXELS, VIEWS)
         mesh, removed = few_faces(surface, resolution, max_bytes)
     except (ConfigError, DataError):  # nowhere as dense as a level, everywhere, or seen by nobody
-        none = np.zeros((0, 3))
-        empty = TriangleMesh(none, none.astype(np.int32), none, np.zeros((0, 4), np.uint8))
-        return empty, Removed(0, 0, 0, 0)
-    return surface.painted(mesh), removed
+        return BakedMesh(*empty, "all of it: nowhere is the field dense enough for a surface")
+    outside = "all surfaces outside the unit ball of the model frame" if asset.manifest.contracted else None
+    return BakedMesh(surface.painted(mesh), removed, outside)
 
 
 def mesh_bytes(others: int, max_mb: float | None) -> int:

@@ -134,7 +134,8 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(
             f"max_memory: expected at least {np.ceil(least / 1e7) / 100:.2f} GB for {fine} cells "
-            f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution"
+            f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution and "
+            "--feature-resolution"
         )
     return plan
 
@@ -148,10 +149,13 @@ def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
     room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
+    most = int(np.cbrt(room / _marks_bytes(model, config)))  # cells of the features' grid along an axis
     if not config.resolution:
-        resolution = min(resolution, int(np.cbrt(room / _marks_bytes(model, config)) / choice.feature_share))
+        resolution = min(resolution, int(most / choice.feature_share))
     resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
     coarse = config.feature_resolution or round(choice.feature_share * resolution)
+    if not (config.resolution or config.feature_resolution):
+        coarse = min(coarse, most)  # rounding may have gone beyond it
     coarse = int(np.clip(coarse, 8, min(field.max_resolution, resolution)))
     return Resolutions(resolution, coarse - coarse % BLOCK if field.unbounded else coarse)
 

@@ -72,7 +72,9 @@ DIRECTION_SHARE = 0.1
 """A small head leaves the direction out where that loses no more than this share of the loss that the preset
 aims at."""
 ROUNDING_LEFT = 0.5
-"""Share of what a head loses by 8 bits that is left after it was tuned with them (docs/bake.md)."""
+"""Share of what a head loses by 8 bits that is left after it was tuned with them, as far as that helps."""
+BITS_SHARE = 0.5
+"""Share of the loss that the preset aims at which a head in 8 bits may lose by them after it was tuned."""
 WORTH_A_ROUND = 0.03
 """Loss in dB by fewer lookups and a head in 8 bits for which the head is trained with them."""
 WORTH_FEATURES = 0.15
@@ -112,6 +114,11 @@ def head_steps(choice: BakeChoice) -> int:
 class Tuning:
     """What the rounds of refinement share, and what they find out."""
 
+    kept: Stage
+    """What the asset loses as `run` leaves it: a round that gained nothing is measured, but not kept."""
+    _in_float32: Stage
+    """What it would lose with a head in float32."""
+
     def __init__(
         self,
         config: BakeConfig,
@@ -139,7 +146,7 @@ class Tuning:
         choice = self._choice
         grid = layout.grid(stored.density, stored.features)
         if choice.refine_steps == 0:
-            self._choose_lookups_and_bits(stored, grid, teacher)
+            self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
             return stored
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
@@ -174,17 +181,27 @@ class Tuning:
                 del grid
                 grid = layout.grid(stored.density, stored.features)
         every = self._held_out.look("all", grid, runner(stored.head), 0)
-        before = self._choose_lookups_and_bits(stored, grid, teacher)
-        lost = self._held_out.lost(every.shown, before.shown).most
+        self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
+        lost = self._held_out.lost(every.shown, self.kept.shown).most
         if self.n_fetches and lost > WORTH_FEATURES:
-            return self._refined_at_k(stored, grid, teacher, before, AT_K * head_rate, code_rate)
+            return self._refined_at_k(stored, grid, teacher, AT_K * head_rate, code_rate)
         if lost > WORTH_A_ROUND:
             rays = collect_training_rays(teacher.some(N_HEAD), grid, self.n_fetches)
             with self._steps("head at k", min(LAST_STEPS, choice.refine_steps)) as steps:
                 head = train_head(stored, rays, steps, AT_K * head_rate, self.ranges)
             after = self._held_out.measure("head at k", grid, runner(head, self.ranges), self.n_fetches)
-            if self._gained("head at k", before, after):
-                return replace(stored, head=head)
+            if self._gained("head at k", self.kept, after):
+                self.kept = after
+                return self._in_enough_bits(stored, replace(stored, head=head))
+        return self._in_enough_bits(stored, stored)
+
+    def _in_enough_bits(self, stored: Stored, tuned: Stored) -> Stored:
+        """`tuned`; but `stored`, with its head in float32, where 8 bits lose too much all the same."""
+        lost = self._held_out.lost(self._in_float32.shown, self.kept.shown)
+        if self.ranges is None or lost.most <= BITS_SHARE * self._choice.target_loss_db:
+            return tuned
+        self.ranges, self.kept = None, self._in_float32
+        self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost}"
         return stored
 
     def _refined_at_k(
@@ -192,7 +209,6 @@ class Tuning:
         stored: Stored,
         grid: SparseGrid,
         teacher: TeacherRays,
-        before: Stage,
         head_rate: float,
         code_rate: float,
     ) -> Stored:
@@ -205,7 +221,8 @@ class Tuning:
         played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
         head = runner(tuned.head, self.ranges)
         after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
-        if self._gained("refinement at k", before, after):
+        if self._gained("refinement at k", self.kept, after):
+            self.kept = after
             return tuned
         move_towards(stored.features, unrounded(played, left), 1.0)
         return stored
@@ -241,7 +258,7 @@ class Tuning:
     def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, teacher: TeacherRays) -> Stage:
         """Set `n_fetches`, and also `ranges`, unless a head in 8 bits would lose more than the preset allows
         even after it was tuned. Returns what the asset loses then."""
-        before = self._choose_lookups(grid, stored.head)
+        before = self._in_float32 = self._choose_lookups(grid, stored.head)
         if self._choice.head_bits == 32:
             return before
         rays = collect_training_rays(teacher.some(N_CALIBRATION), grid, self.n_fetches)

@@ -242,6 +242,26 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
     np.testing.assert_array_equal(encode_features(left.features), encode_features(features))
     assert np.abs(left.features - features).max() < 0.005, "a 256th of a code, and float32"
     assert left.head is stored.head
+    assert tuning.kept.name == "k", "not a round that was given up"
+
+
+@pytest.mark.parametrize("share", [-1e9, 1e9])
+def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
+    share: float, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=8, k=4, refine_steps=20)
+    work = _Bake(model, config, quiet)
+    layout, _ = work._cells()
+    stored, teacher, again = work._store(layout, 20_000)
+    monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)
+    monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", 0.0)  # 8 bits are tried
+    monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", np.inf)
+    monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: True)
+    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    tuning.run(stored, layout, teacher, again)
+    assert (tuning.ranges is None) == (share < 0)
+    assert (tuning.kept.name == "k") == (share < 0)
+    assert ("none" in tuning.left_out["head bits"]) == (share < 0)
 
 
 def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:

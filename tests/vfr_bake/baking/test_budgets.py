@@ -13,27 +13,31 @@ import pytest
 
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
-from player.errors import TrainingError
+from player.errors import ConfigError, TrainingError
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import bake
+from vfr_bake.baking.cells import FLOORS
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
     FEWEST_RAYS,
+    HEAD_COST,
     N_RAYS,
+    OWN_HEAD,
     OWN_REST_COST,
     PROGRAM_BYTES,
     RAYS_OF_CELL,
+    STEP_COST,
     UNBOUNDED_RAYS,
     VERTEX_COST,
     expected_seconds,
     make_plan,
 )
-from vfr_bake.baking.refinement import Stored
+from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, Stored
 from vfr_bake.config import BakeConfig
-from vfr_bake.presets import PRESETS
+from vfr_bake.presets import PRESETS, Preset
 from vfr_bake.training.model_file import Model
 
 SMALL: dict[str, Any] = {
@@ -142,6 +146,35 @@ def test_what_was_refined_is_gone_when_the_mesh_is_made(
     assert len(alive) <= len(before), alive
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_grid_that_memory_limits_is_not_refused(
+    preset: Preset, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limit is one of the features' grid, whose resolution is rounded from that of the densities."""
+    monkeypatch.setattr("vfr_bake.baking.plan.FEWEST_RAYS", 1)
+    wanted = make_plan(model, BakeConfig(preset=preset)).resolutions
+    for n_cells in np.linspace(10, wanted.features - 1, 80):
+        gigabytes = (PROGRAM_BYTES + (4 + len(FLOORS)) * n_cells**3) / 1e9
+        plan = make_plan(model, BakeConfig(preset=preset, max_memory=gigabytes))
+        assert plan.resolutions.features <= n_cells and plan.resolutions.densities < wanted.densities
+
+
+def test_a_mesh_that_takes_too_much_memory_is_left_out(model: Model, tmp_path: Path) -> None:
+    bake(model, tmp_path / "asset", BakeConfig(**SMALL), quiet)
+    asset = Asset.open(tmp_path / "asset")
+    assert len(asset.arrays.densities.pyramid.levels) > 1
+    baked = bake_mesh(asset, 16, 100_000, 1e-6, quiet)
+    assert not len(baked.mesh.faces) and "more than 1e-06 GB of memory" in (baked.left_out or "")
+    assert bake_mesh(asset, 16, 100_000, 1.0, quiet).left_out is None
+
+
+def test_without_refinement_the_head_stays_the_models_own() -> None:
+    """A smaller one would not have learned anything."""
+    assert BakeConfig(refine_steps=0).choice().head_width == 0
+    with pytest.raises(ConfigError, match="head_width: expected 0 with --refine-steps 0"):
+        BakeConfig(refine_steps=0, head_width=32)
+
+
 @pytest.mark.parametrize("steps", [0, 5000])
 def test_the_expected_time_follows_from_that_of_the_models_own_rays(
     steps: int, model: Model, monkeypatch: pytest.MonkeyPatch
@@ -194,9 +227,12 @@ def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     )
     n_vertices = 2 * N_RAYS / RAYS_OF_CELL  # as many of densities as of features
     assert many - few == pytest.approx((VERTEX_COST[False] + CHOSEN_COST[False]) * n_vertices, rel=1e-6)
-    own = expected_seconds(model, replace(config, head_width=0), plan)
-    small = expected_seconds(model, config, plan)
-    assert own - small == pytest.approx(OWN_REST_COST[False], rel=1e-6)
+    one_step = replace(config, refine_steps=1)
+    own = expected_seconds(model, replace(one_step, head_width=0), plan)
+    small = expected_seconds(model, one_step, plan)
+    step, alone = BATCH * STEP_COST[False], HEAD_BATCH * HEAD_COST[False]
+    steps = OWN_HEAD * (step + alone) - (step + 2 * alone)  # a small head is also trained before refinement
+    assert own - small == pytest.approx(OWN_REST_COST[False] + steps, rel=1e-6)
 
 
 def test_more_work_is_expected_to_take_longer(model: Model) -> None:

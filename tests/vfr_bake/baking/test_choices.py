@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ from player.asset.asset import Asset
 from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import _Bake, bake
+from vfr_bake.baking.detail.detail import Detail
 from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
@@ -94,6 +96,29 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
     )
     assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
     assert set(tuning.lookups.values()) == {0.0}
+
+
+@pytest.mark.parametrize(("max_loss_db", "steps"), [(None, (1, 2, 4)), (0.5, (1, 2, 2)), (0.4, (1, 1, 1))])
+def test_longer_steps_keep_to_the_loss_that_was_asked_for(
+    max_loss_db: float | None, steps: tuple[int, ...]
+) -> None:
+    """Steps of 2 lose 0.01 dB more than the 0.48 that are lost anyway, those of 4 lose 0.03."""
+
+    @dataclass
+    class Grid:
+        level_steps: np.ndarray
+        n_levels: int = 3
+
+    class Seen:
+        def look(self, name: str, grid: Grid, head: Any, n_fetches: int) -> Any:
+            lost = 0.48 + 0.01 * (int(max(grid.level_steps)) - 1)
+            return SimpleNamespace(loss=Loss(lost, 0.0), shown=lost)
+
+        def lost(self, before: float, after: float) -> Loss:
+            return Loss(after - before, 0.0)
+
+    detail = Detail(Seen(), None, 0, 0.1, quiet)  # type: ignore[arg-type]
+    assert detail.level_steps(Grid(np.ones(3)), max_loss_db) == steps  # type: ignore[arg-type]
 
 
 def test_an_asset_that_has_lost_what_is_aimed_at_gives_up_less(models: dict[str, Model]) -> None:

@@ -36,7 +36,7 @@ from vfr_bake.baking.detail.shown import (
 )
 from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout, encode_features
-from vfr_bake.baking.held_out import Head, HeldOut, Shown
+from vfr_bake.baking.held_out import Head, HeldOut, Shown, Stage
 from vfr_bake.training.length.witness_loss import Loss
 
 N_SEEING = 4_000_000
@@ -132,20 +132,25 @@ class Detail:
         densities, grid = self._densities(layout, density, grid, rays)
         return Needed(layout, density, features, densities, self._features(layout, features, grid, rays))
 
-    def level_steps(self, grid: SparseGrid) -> tuple[int, ...]:
+    def level_steps(self, grid: SparseGrid, max_loss_db: float | None) -> tuple[int, ...]:
         """For each level of the densities of `grid`, which is that of what is stored, for how many base steps
-        a sample in it stands: the longest steps that lose little enough. Coarser bricks lie also where
-        nothing is shown, and a long step from there may end in finer ones."""
+        a sample in it stands: the longest steps that lose little enough, and with which the asset loses no
+        more than `max_loss_db`, if that was asked for. Coarser bricks lie also where nothing is shown, and a
+        long step from there may end in finer ones."""
         before = self._look(replace(grid, level_steps=np.ones(grid.n_levels, np.int32)))
         for longest in LONGEST_STEPS:
             steps = np.minimum(1 << np.arange(grid.n_levels), longest).astype(np.int32)
-            lost = self.held_out.lost(before, self._look(replace(grid, level_steps=steps)))
-            if lost.most <= STEP_LOSS * self.most_db:
+            after = self._stage(replace(grid, level_steps=steps))
+            fits = max_loss_db is None or after.loss.db <= max_loss_db
+            if fits and self.held_out.lost(before, after.shown).most <= STEP_LOSS * self.most_db:
                 return tuple(steps.tolist())
         return (1,) * grid.n_levels
 
     def _look(self, grid: SparseGrid) -> Shown:
-        return self.held_out.look("detail", grid, self.head, self.n_fetches).shown
+        return self._stage(grid).shown
+
+    def _stage(self, grid: SparseGrid) -> Stage:
+        return self.held_out.look("detail", grid, self.head, self.n_fetches)
 
     def _without_unseen(
         self,

@@ -29,8 +29,6 @@ from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, Vertices
 from vfr_bake.kernels.sample_weights import BLOCKS, add_sample_weights
 
-N_RAYS = 4_000_000
-"""Rays whose weights are summed, roughly, where the views have as many pixels."""
 RAYS_AT_ONCE = 1 << 16
 BRICKS_AT_ONCE = 1 << 12
 
