@@ -38,9 +38,8 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
     from player.render import render
 
     camera = asset_cameras(asset)[0]
-    columns = min(
-        round(2 * ROWS * camera.width / camera.height), os.get_terminal_size(stream.fileno()).columns
-    )
+    width = os.get_terminal_size(stream.fileno()).columns or 80  # 0 where the terminal does not tell
+    columns = max(min(round(2 * ROWS * camera.width / camera.height), width), 1)
     small = camera.resized(2 * columns, 4 * ROWS)
     frame = render(asset, small, march="numpy")  # nothing to compile: 64 rows take a moment
     halves = frame.to_uint8().reshape(2 * ROWS, 2, columns, 2, 3).mean(axis=(1, 3))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from player.app.commands import run, write_result
 from player.app.option_types import DEMO
 from player.app.options import PlaySettings, parse, settings_of
-from player.errors import ConfigError, VfrError
+from player.errors import ConfigError, FormatError, VfrError
 from player.progress import Bar, duration
 from player.terminal import picture_lines, printable
 
@@ -190,13 +190,20 @@ def _check(arguments: argparse.Namespace) -> int:
         if arguments.json != "-":
             found = "" if error is None else f"  {printable(str(error))}"
             print(f"{'ok    ' if error is None else 'FAILED'}  {name}{found}")
-    failed = sum(result != "ok" for result in results.values())
-    write_result(arguments.json, {"ok": not failed, "files": results}, None)
-    if failed:
-        raise VfrError(f"{arguments.asset}: {failed} of {len(results)} files failed")
-    # the checksums hold; now the content
-    asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
-    read_head_file(asset.path("head.onnx"), manifest.n_channels)
+    error = None
+    if failed := sum(result != "ok" for result in results.values()):
+        error = VfrError(f"{arguments.asset}: {failed} of {len(results)} files failed")
+    else:  # the checksums hold; now the content
+        try:
+            asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
+            if asset.missing is not None:
+                raise FormatError(asset.missing)
+            read_head_file(asset.path("head.onnx"), manifest.n_channels)
+        except VfrError as found:
+            error = found
+    write_result(arguments.json, {"ok": error is None, "files": results}, None)
+    if error is not None:
+        raise error
     return 0
 
 

@@ -6,6 +6,7 @@ same place. That it is the same asset is checked on the worker, so that no frame
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
@@ -64,7 +65,7 @@ def render_on_cluster(
         while pending:
             try:
                 ready: Any = distributed.wait(pending, timeout=POLL_SECONDS, return_when="FIRST_COMPLETED")
-            except TimeoutError:
+            except (TimeoutError, asyncio.TimeoutError):  # two classes before Python 3.11
                 alone = 0 if client.scheduler_info()["workers"] else alone + 1
                 if alone == PATIENCE:
                     raise VfrError(f"--dask: {address}: expected workers, got none for a minute") from None

@@ -7,6 +7,8 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from player.app.frame_files import Target, frame_key, unfinished
@@ -160,7 +162,11 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
 
 
 def peak_rss_mb() -> float | None:
-    """Most memory that this process has had, in MB; None where the system does not tell."""
+    """Most memory that this process has had, in MB; None where the system does not tell. `ru_maxrss` is
+    inherited from the process that started this one; on Linux there is a figure that is not."""
+    with suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:"))
     try:
         import resource
     except ImportError:

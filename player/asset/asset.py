@@ -107,9 +107,9 @@ class Asset:
 
         Args:
             folder: the asset's folder; its files are regular ones inside it.
-            verify: compare every checksum first, which reads every byte. Otherwise only those of the parts
-                are compared, and a part behind the first that is not there, cut short or another one is no
-                error: `asset.missing` tells.
+            verify: compare every checksum first, which reads every byte, and refuse a part that cannot be
+                decoded. Otherwise only the checksums of the parts are compared, and a part behind the first
+                that is not there, cut short or another one is no error: `asset.missing` tells.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching; half of what
                 the machine has if None.
             parts: how many of the parts to read, 1 or more: the fewer, the coarser and the sooner. All if
@@ -209,6 +209,7 @@ class _Opening:
 
     def __init__(self, folder: Path, verify: bool, max_memory: float | None) -> None:
         self._folder, self._allowed = folder, allowed_bytes(max_memory)
+        self._verify = verify
         self.manifest = read_manifest(folder)
         may_lack = set() if verify else {part.file for part in self.manifest.parts[1:]}
         needed = {name: entry for name, entry in self.manifest.files.items() if name not in may_lack}
@@ -227,7 +228,7 @@ class _Opening:
         try:
             parts.read(n_parts)
         except FormatError as error:
-            if not parts.n_read:
+            if self._verify or not parts.n_read:
                 raise
             missing = f"{error}: shown as the first {parts.n_read} of {len(manifest.parts)} parts have it"
         arrays = GridArrays(parts.values("densities"), parts.values("features"))

@@ -44,7 +44,7 @@ def test_half_blocks_come_back() -> None:
 
 def test_the_picture_is_the_first_view(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLORTERM", "truecolor")
-    for width, columns in ((80, 38), (20, 20)):
+    for width, columns in ((80, 38), (20, 20), (0, 38)):
         monkeypatch.setattr(os, "get_terminal_size", lambda fd, w=width: os.terminal_size((w, 24)))
         lines = picture_lines(asset, Terminal())
         assert lines[-1] == "" and len(lines) == ROWS + 1

@@ -19,6 +19,7 @@ from player import compiling
 from player.app import cli
 from player.files import files
 from player.render import Renderer
+from tests.player.asset.test_parts import vouch
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -62,7 +63,8 @@ def test_json_on_stdout_and_slices(
         options = [
             "--output",
             str(out),
-            "--frames=" + text,
+            "--frames",
+            text,
             "--march",
             "numpy",
             "--json",
@@ -133,6 +135,14 @@ def test_output_that_is_not_empty(
     assert "expected a folder for the pictures, got a file" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a figure that is not inherited")
+def test_the_peak_of_memory_is_that_of_the_process_alone() -> None:
+    np.ones(300_000_000, np.uint8)  # what the one that starts it has had does not count
+    code = "from player.app.play import peak_rss_mb; print(peak_rss_mb())"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert 10 < float(done.stdout) < 250
+
+
 def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(shells_folder), "--info"]) == 0
     page = capsys.readouterr().out
@@ -161,6 +171,17 @@ def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.err == f"vfr-play: error: {broken_folder}: 2 of 4 files failed\n"
     assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
     assert json.loads(capsys.readouterr().out)["files"]["head.onnx"] == "ok"
+
+
+@pytest.mark.parametrize("name", ["part_0.bin", "head.onnx"])
+def test_check_looks_into_files_whose_checksums_hold(
+    name: str, broken_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = (broken_folder / name).read_bytes()
+    vouch(broken_folder, name, data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    assert cli.main([str(broken_folder), "--check", "--json", "-"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert set(found["files"].values()) == {"ok"} and not found["ok"]
 
 
 @pytest.mark.parametrize(

@@ -220,6 +220,8 @@ def test_a_vouched_part_that_breaks_the_format_leaves_those_before_it(broken: Pa
     assert asset.n_parts == len(manifest.parts) - 1 and asset.missing is not None
     assert ", level " in asset.missing
     assert same(asset.arrays.features, wanted.arrays.features)
+    with pytest.raises(FormatError, match=", level "):
+        Asset.open(broken, verify=True)
 
 
 def structures(document: dict[str, Any]) -> list[dict[str, Any]]:
