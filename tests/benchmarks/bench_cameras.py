@@ -185,7 +185,7 @@ def compare(data: Path) -> dict[str, Any]:
             "seconds": time.perf_counter() - start,
             "processor_seconds": time.process_time(),
         }
-        found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
         print(f"all: {found['seconds']:.0f} s, {found['processor_seconds']:.0f} s of processor time")
         print(f"peak memory: {found['peak_mb'] / 1000:.2f} GB")
         print(report.summary())

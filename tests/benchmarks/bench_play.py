@@ -1,9 +1,9 @@
 """Milliseconds a frame of an asset: march, lookups, head and the rest, beside what the machine could do.
 
-    python tests/benchmarks/bench_play.py out/ --cameras transforms_test.json --size 800x800
-    python tests/benchmarks/bench_play.py fidelity/ balanced/ fast/ --curves
-    python tests/benchmarks/bench_play.py lego/ fox/ --against CHECKOUT --march numba numpy --frames 60
-    python tests/benchmarks/bench_play.py out/ --against CHECKOUT ITS_ASSET
+    python -m tests.benchmarks.bench_play out/ --cameras transforms_test.json --size 800x800
+    python -m tests.benchmarks.bench_play fidelity/ balanced/ fast/ --curves
+    python -m tests.benchmarks.bench_play lego/ fox/ --against CHECKOUT --march numba numpy --frames 60
+    python -m tests.benchmarks.bench_play out/ --against CHECKOUT ITS_ASSET
 
 Parts are processor time of all threads, divided by their number: what they take of a frame when all are busy.
 What is left of the wall's clock is waiting, for another program or for the last task. Lookups cannot be

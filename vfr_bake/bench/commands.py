@@ -10,8 +10,9 @@ from player.march.interpolation import Quality
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 
-GIVEN = ("resolution", "max_mb", "max_loss_db")
-"""Settings of `vfr-bake` that change the asset and that no preset decides."""
+GIVEN = ("resolution", "feature_resolution", "weight_floor", "max_mb", "max_loss_db", "target_ms")
+"""Settings of `vfr-bake` that change the asset and that no preset decides; `max_memory`, which has a number
+of its own, is another."""
 
 
 def bake_command(folder: str, asset: Asset) -> str:
@@ -22,6 +23,8 @@ def bake_command(folder: str, asset: Asset) -> str:
     if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
         return ""
     chosen: dict[str, Any] = {name: settings.get(name) for name in GIVEN}
+    if settings.get("max_memory", BakeConfig.max_memory) != BakeConfig.max_memory:
+        chosen["max_memory"] = settings["max_memory"]
     usual = BakeConfig(preset=preset).choice(asset.manifest.contracted)
     for name in BakeConfig.__dataclass_fields__:
         if hasattr(usual, name) and settings.get(name, getattr(usual, name)) != getattr(usual, name):

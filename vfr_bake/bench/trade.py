@@ -171,6 +171,7 @@ class _Run:
     def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
         """The full model's row and its pictures, one a view."""
         n_views = len(self._views.cameras)
+        own = [(camera.width, camera.height) for camera in self._views.cameras]
         frames = [(sizes[0], view) for view in range(n_views)]
         frames += [(size, turn % n_views) for size in sizes[1:] for turn in range(MODEL_FRAMES)]
         answers: dict[Size, list[dict[str, Any]]] = {size: [] for size in sizes}
@@ -178,8 +179,9 @@ class _Run:
         with Process("model", str(path), str(self._cameras), self._threads) as process:
             process.ask(view=0, size=[32, 32], rgb=None)
             for done, (size, view) in enumerate(frames, start=1):
-                kept = str(self._picture) if size == sizes[0] else None
-                answers[size].append(process.ask(view=view, size=size, rgb=kept))
+                compared = done <= n_views
+                kept = str(self._picture) if compared else None
+                answers[size].append(process.ask(view=view, size=own[view] if compared else size, rgb=kept))
                 if kept is not None:
                     pictures.append(np.load(kept))
                 self._progress("full model", done, len(frames))

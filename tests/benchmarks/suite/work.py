@@ -89,7 +89,7 @@ class Work:
         if process.returncode:
             raise PartError(f"{self.part}: {name} ended with {process.returncode}")
         used = usage.ru_utime + usage.ru_stime
-        return Usage(time.monotonic() - start, used, usage.ru_maxrss / 1000)
+        return Usage(time.monotonic() - start, used, usage.ru_maxrss * 1024 / 1e6)
 
     def told(self, name: str, words: list[str]) -> str:
         """The command as a reader types it: no folder of this machine is in it."""
