@@ -180,4 +180,4 @@ $(VENV)/.torch: $(BIN)/python $(CONSTRAINTS)
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 to 3.13 expected, got " + sys.version if not (3, 10) <= sys.version_info < (3, 14) else 0)'
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
