@@ -109,7 +109,7 @@ def without_comments(source: str) -> str:
     of their lines has what looks like one.
 
     >>> without_comments("// What it is.\\nconst a = 1; // one\\n\\n  /* more\\n  text */\\n  f(a);\\n")
-    'const a = 1; // one\\nf(a);\\n'
+    'const a = 1;\\nf(a);\\n'
     """
     source = re.sub(r"^[ \t]*/\*.*?\*/[ \t]*$", "", source, flags=re.MULTILINE | re.DOTALL)
     lines = (re.sub(r"\s// [^\"'`]*$", "", line).strip() for line in source.splitlines())
