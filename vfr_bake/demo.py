@@ -49,7 +49,7 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     from vfr_bake.cli import bake_main, train_main
     from vfr_bake.data import load_scene
 
-    check_target(output / "model.pt", force)
+    check_target(output / "model.pt", force, is_file=True)
     begin = time.monotonic()
     scene = load_scene("demo")
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]

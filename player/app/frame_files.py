@@ -82,9 +82,7 @@ class Target:
         video without PyAV."""
         allowed = settings.force or settings.resume
         if self.is_picture or self.is_video:
-            check_target(self.path, allowed)
-            if self.path.is_dir():
-                raise OutputError(f"{self.path}: expected a file to write, got a folder")
+            check_target(self.path, allowed, is_file=True)
         if self.is_video:
             load_av()
         if not self.is_picture:

@@ -65,8 +65,11 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
                 f"{path}: {name}: expected {then.get(name)} as in the interrupted run, got {now.get(name)}"
             )
     try:
-        same = content["pictures"] == [camera.name for camera in trainer.cameras]
-        if same := same and torch.allclose(content["cameras"], _numbers(trainer), rtol=0, atol=SAME):
+        names = [camera.name for camera in trainer.cameras]
+        same = content["pictures"] == names and torch.allclose(
+            content["cameras"], _numbers(trainer), rtol=0, atol=SAME
+        )
+        if same:
             trainer.restore(content["state"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FormatError(f"{path}: state: does not fit this data set: {error}") from error

@@ -30,6 +30,8 @@ are compressed already."""
 FREE = 0.9
 """Share of the free disk that is taken at most."""
 _AT_ONCE = 1 << 20
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeError)
+"""What a damaged ZIP raises; the last one where a name is said to be UTF-8, and is not."""
 
 
 def is_archive(path: Path) -> bool:
@@ -72,10 +74,7 @@ def unpack(archive: Path, progress: Progress) -> Path:
                 for done, (entry, name) in enumerate(entries, start=1):
                     _unpack_one(archive, file, entry, new / name)
                     progress(done, len(entries))
-    except (
-        *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError),
-        UnicodeError,  # a name that is said to be UTF-8, and is not
-    ) as error:
+    except _DAMAGED as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DataError(
             f"{archive}: ZIP: cannot be read to its end: {reason}: share or copy it again"
