@@ -265,7 +265,7 @@ class Tuning:
         ranges = activation_ranges(stored.head, rays.composed(stored.features)[0], rays.teacher.rays_d)
         after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_fetches)
         lost = self._held_out.lost(before.shown, after.shown)
-        if lost.most * ROUNDING_LEFT > self._choice.target_loss_db:
+        if lost.most * ROUNDING_LEFT > BITS_SHARE * self._choice.target_loss_db:
             self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost}"
             return before
         self.ranges = ranges

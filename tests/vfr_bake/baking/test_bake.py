@@ -254,7 +254,7 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
     monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)
-    monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", 0.0)  # 8 bits are tried
+    monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", -np.inf)  # 8 bits are tried
     monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", np.inf)
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: True)
     tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
