@@ -164,7 +164,7 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
 def peak_rss_mb() -> float | None:
     """Most memory that this process has had, in MB; None where the system does not tell. `ru_maxrss` is
     inherited from the process that started this one; on Linux there is a figure that is not."""
-    with suppress(OSError, ValueError, IndexError):
+    with suppress(OSError, ValueError, IndexError, StopIteration):
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:"))
     try:

@@ -26,8 +26,8 @@ MOST_ROWS = 2**24
 TILE = 256
 """Pixels along a side of what is drawn at a time."""
 MOST_CHANNELS = 40
-"""Channels that a page can draw: eight in a draw buffer, of which browsers have six at least, and one is for
-the opacity."""
+"""Channels that a page can draw: eight in a draw buffer, and one buffer is for the opacity. WebGL2 promises
+four buffers, graphics cards have eight, and the renderer of Chromium for machines without one has six."""
 
 
 def gpu_bytes(asset: Asset) -> int:

@@ -10,9 +10,11 @@ from player.march.interpolation import Quality
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 
-GIVEN = ("resolution", "feature_resolution", "weight_floor", "max_mb", "max_loss_db", "target_ms")
-"""Settings of `vfr-bake` that change the asset and that no preset decides; `max_memory`, which has a number
-of its own, is another."""
+GIVEN = (
+    *("resolution", "feature_resolution", "weight_floor"),
+    *("max_mb", "max_loss_db", "target_ms", "max_memory"),
+)
+"""Settings of `vfr-bake` that change the asset and that no preset decides."""
 
 
 def bake_command(folder: str, asset: Asset) -> str:
@@ -22,9 +24,9 @@ def bake_command(folder: str, asset: Asset) -> str:
     preset = settings.get("preset") if isinstance(settings, dict) else None
     if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
         return ""
-    chosen: dict[str, Any] = {name: settings.get(name) for name in GIVEN}
-    if settings.get("max_memory", BakeConfig.max_memory) != BakeConfig.max_memory:
-        chosen["max_memory"] = settings["max_memory"]
+    chosen: dict[str, Any] = {
+        name: settings[name] for name in GIVEN if settings.get(name) not in (None, getattr(BakeConfig, name))
+    }
     usual = BakeConfig(preset=preset).choice(asset.manifest.contracted)
     for name in BakeConfig.__dataclass_fields__:
         if hasattr(usual, name) and settings.get(name, getattr(usual, name)) != getattr(usual, name):

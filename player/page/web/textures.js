@@ -39,7 +39,7 @@ export function uploadGrid(gl, { nb, nf, nSlots, nHeld, nRows, ...grid }, nChann
 function checkSize(gl, target, [width, height, depth]) {
   const most = gl.getParameter(target === gl.TEXTURE_3D ? gl.MAX_3D_TEXTURE_SIZE : gl.MAX_TEXTURE_SIZE);
   const largest = Math.max(width, height, target === gl.TEXTURE_3D ? depth : 0);
-  if (largest <= most) return;
+  if (most === null || largest <= most) return; // null where the context is lost
   throw new Error(`memory of the GPU: expected textures of ${largest} texels a side, got at most ${most}`);
 }
 
