@@ -16,11 +16,12 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tests.benchmarks.pages.documents import BLOCK, BLOCKS, DOCUMENTS, prose, rendered, rendered_files
+from tests.benchmarks.pages.beside import beside
+from tests.benchmarks.pages.documents import BESIDE, BLOCK, BLOCKS, DOCUMENTS, prose, rendered, rendered_files
 from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.suite import conditions
 from tests.benchmarks.suite.parts import LONGEST_CORE, LONGEST_PART, PARTS
-from tests.benchmarks.suite.results import KEYS, RESULTS, read_results, write_results
+from tests.benchmarks.suite.results import KEYS, RESULTS, RESULTS_AVX2, read_results, write_results
 from tests.benchmarks.suite.runner import Runner, Settings
 from tests.benchmarks.suite.work import Part, PartError, Work
 
@@ -34,7 +35,7 @@ MEASURED = re.compile(r"\d\s?(?:dB\b|[MG]B\b|ms\b|s\b|min\b|%|frames|fps|seconds
 
 
 def test_documents_and_plots_are_what_the_results_give() -> None:
-    files = rendered_files(read_results())
+    files = rendered_files(read_results(), read_results(RESULTS_AVX2))
     wrong = [path.name for path, data in files.items() if not path.is_file() or path.read_bytes() != data]
     assert wrong == [], "run: python -m tests.benchmarks render"
     plots = {path.name for path in (REPOSITORY / "docs").glob("trade_*.svg")}
@@ -47,7 +48,7 @@ def test_every_block_is_shown_once_and_known() -> None:
         for name in DOCUMENTS
         for found in BLOCK.finditer((REPOSITORY / name).read_text(encoding="utf-8"))
     ]
-    assert sorted(shown) == sorted(BLOCKS)
+    assert sorted(shown) == sorted([*BLOCKS, *BESIDE])
     others = [path for path in (REPOSITORY / "docs").rglob("*.md")
               if path.relative_to(REPOSITORY).as_posix() not in DOCUMENTS]  # fmt: skip
     assert [path.name for path in others if "<!-- benchmarks:" in path.read_text(encoding="utf-8")] == []
@@ -78,7 +79,7 @@ def test_a_figure_that_was_typed_in_is_found() -> None:
 
 def test_a_page_without_results_names_the_commands() -> None:
     for name in DOCUMENTS:
-        text = rendered((REPOSITORY / name).read_text(encoding="utf-8"), {})
+        text = rendered((REPOSITORY / name).read_text(encoding="utf-8"), {}, {})
         for found in BLOCK.finditer(text):
             assert re.search(r"`make benchmarks`|`python -m tests.benchmarks --only [\w ]+`", found[0]), (
                 found[2]
@@ -150,6 +151,18 @@ def test_a_row_tells_machine_commit_and_what_ran_beside() -> None:
     assert len(BLOCKS["machines"](results)) == 4
 
 
+def test_two_processors_stand_side_by_side() -> None:
+    baked = {"seconds": 192.0, "n_bytes": 4.94e6, "loss_db": 0.104, "loss_db_spread": 0.04}
+    first = {"bake_lego_fast": result(baked), "page_lego_fast": result({"first_picture_s": 2.0})}
+    other = MACHINE | {"processor": "another"}
+    second = {"bake_lego_fast": result(baked | {"seconds": 480.0}, machine=other)}
+    assert beside(first, second) == [
+        "| what | one, 2 cores; 0a1b2c3 | another, 2 cores; 0a1b2c3 |",
+        "|---|---|---|",
+        "| lego, fast: bake | 192 s, 4.9 MB, loses 0.10 ± 0.04 dB | 8.0 min, 4.9 MB, loses 0.10 ± 0.04 dB |",
+    ]
+
+
 def test_the_readme_tells_what_the_parts_found() -> None:
     baked = {"seconds": 192.0, "n_bytes": 4.94e6, "loss_db": 0.104, "loss_db_spread": 0.04}
     rows = [
@@ -205,10 +218,11 @@ def test_plots_have_a_mark_for_every_setting() -> None:
 # Results ------------------------------------------------------------------------------------------
 
 
-def test_the_committed_results_are_of_parts_that_there_are() -> None:
-    parts = read_results()
+@pytest.mark.parametrize("path", [RESULTS, RESULTS_AVX2])
+def test_the_committed_results_are_of_parts_that_there_are(path: Path) -> None:
+    parts = read_results(path)
     assert set(parts) <= set(PARTS)
-    text = RESULTS.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8")
     assert not re.search(r'"/|~/|\\\\', text), "folders of a machine"
     assert all(part["seconds"] <= 60 * LONGEST_PART for part in parts.values())
     assert sum(parts[name]["seconds"] for name in parts if PARTS[name].core) <= 60 * LONGEST_CORE

@@ -5,9 +5,10 @@
     python -m tests.benchmarks --list                 # all parts, and which of them are there
     python -m tests.benchmarks render                 # the pages alone
 
-Each part is recorded in docs/benchmarks.json when it has ended, so that an interrupted run goes on where it
-was. Models and assets lie in build/benchmarks. Before each part the machine has to be quiet: a part waits for
-that. Data sets lie in the folder that VFR_DATA names. Linux alone.
+Each part is recorded in docs/benchmarks.json when it has ended, or in docs/benchmarks_avx2.json where the
+processor has no AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
+build/benchmarks. Before each part the machine has to be quiet: a part waits for that. Data sets lie in the
+folder that VFR_DATA names. Linux alone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tests.benchmarks.pages.documents import render_all
 from tests.benchmarks.suite import conditions
 from tests.benchmarks.suite.little import write_data_sets
 from tests.benchmarks.suite.parts import PARTS
-from tests.benchmarks.suite.results import RESULTS, read_results
+from tests.benchmarks.suite.results import RESULTS, RESULTS_AVX2, read_results, results_path
 from tests.benchmarks.suite.runner import Runner, Settings
 
 BUILD = conditions.REPOSITORY / "build"
@@ -50,6 +51,7 @@ def main() -> int:
     commit, machine = conditions.commit(), conditions.machine()
     folder = BUILD / ("benchmarks-quick" if arguments.quick else "benchmarks")
     settings = Settings(folder / commit, Path(os.environ.get("VFR_DATA", DATA)).resolve())
+    settings.results = results_path(machine)
     settings.wait, settings.busy_anyway = arguments.wait, arguments.busy_anyway
     settings.again, settings.quick = arguments.again, arguments.quick
     if arguments.quick:
@@ -91,7 +93,7 @@ def _list(missing: set[str]) -> int:
 
 
 def _render() -> int:
-    for path in render_all(read_results(RESULTS)):
+    for path in render_all(read_results(RESULTS), read_results(RESULTS_AVX2)):
         print(path.relative_to(conditions.REPOSITORY))
     return 0
 

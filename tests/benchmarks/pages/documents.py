@@ -1,7 +1,7 @@
 """The documents that have figures of the benchmarks: each between two comments, and made from the results.
 
 <!-- benchmarks: NAME -->
-what `BLOCKS[NAME]` makes of the results
+what `BLOCKS[NAME]` makes of the results, or `BESIDE[NAME]` of those of two processors
 <!-- /benchmarks -->
 """
 
@@ -12,20 +12,26 @@ from pathlib import Path
 
 from player.files.files import write_bytes
 from tests.benchmarks.pages import tables, trade
+from tests.benchmarks.pages.beside import beside
 from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.suite.conditions import REPOSITORY
 from tests.benchmarks.suite.results import Results
 
 BLOCKS = tables.BLOCKS | trade.BLOCKS
+BESIDE = {"beside": beside}
 DOCUMENTS = ("README.md", "docs/bake.md", "docs/benchmarks.md", "docs/trade.md")
 BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)", re.DOTALL)
 
 
-def rendered(text: str, results: Results) -> str:
-    """A document with its blocks made anew. Raises KeyError for a block that nobody knows."""
+def rendered(text: str, results: Results, second: Results) -> str:
+    """A document with its blocks made anew. Raises KeyError for a block that nobody knows.
+
+    `results`: of a processor with AVX-512; `second`: of one without.
+    """
 
     def block(found: re.Match[str]) -> str:
-        lines = BLOCKS[found[2]](results)
+        name = found[2]
+        lines = BESIDE[name](results, second) if name in BESIDE else BLOCKS[name](results)
         return "\n".join([found[1], *lines, "", found[3]])
 
     return BLOCK.sub(block, text)
@@ -36,21 +42,21 @@ def prose(text: str) -> str:
     return BLOCK.sub("", text)
 
 
-def rendered_files(results: Results) -> dict[Path, bytes]:
+def rendered_files(results: Results, second: Results) -> dict[Path, bytes]:
     """What each file is, documents and plots."""
     files = {}
     for name in DOCUMENTS:
         path = REPOSITORY / name
-        files[path] = rendered(path.read_text(encoding="utf-8"), results).encode()
+        files[path] = rendered(path.read_text(encoding="utf-8"), results, second).encode()
     for name, picture in plots(results).items():
         files[REPOSITORY / "docs" / name] = picture.encode()
     return files
 
 
-def render_all(results: Results) -> list[Path]:
+def render_all(results: Results, second: Results) -> list[Path]:
     """Write what is not yet so; returns it."""
     written = []
-    for path, data in rendered_files(results).items():
+    for path, data in rendered_files(results, second).items():
         if not path.is_file() or path.read_bytes() != data:
             write_bytes(path, data)
             written.append(path)

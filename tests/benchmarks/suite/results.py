@@ -11,7 +11,9 @@ from player.files.files import write_bytes
 from tests.benchmarks.suite.conditions import REPOSITORY
 
 RESULTS = REPOSITORY / "docs" / "benchmarks.json"
-"""Beside the pages that are rendered from it, so that the source package has both."""
+RESULTS_AVX2 = REPOSITORY / "docs" / "benchmarks_avx2.json"
+"""Beside the pages that are rendered from them, so that the source package has all; the first is of
+processors with AVX-512, the second of those without."""
 KEYS = {
     *("commit", "date", "machine", "load_before", "load_after", "others_before", "others", "libraries"),
     *("seeds", "commands", "seconds", "figures"),
@@ -20,6 +22,15 @@ KEYS = {
 took before it and during it."""
 
 Results = dict[str, dict[str, Any]]
+
+
+def results_path(machine: dict[str, Any]) -> Path:
+    """The file for what is measured on such a machine.
+
+    >>> results_path({"features": ["avx2", "avx512f"]}).name, results_path({"features": ["avx2"]}).name
+    ('benchmarks.json', 'benchmarks_avx2.json')
+    """
+    return RESULTS if "avx512f" in machine["features"] else RESULTS_AVX2
 
 
 def read_results(path: Path = RESULTS) -> Results:
