@@ -116,6 +116,9 @@ def _train(options: Any) -> int:
     figures = _train_steps(trainer, checkpoint, preview)
     interrupted = figures.pop("interrupted")
     figures["blurred"] = blurred
+    witnesses = trainer.witness_psnr() if processes.first and not interrupted else None
+    if witnesses is not None:
+        figures["witness_psnr"] = {"single": witnesses.single, "whole": witnesses.whole}
     if processes.first:
         model = trained_model(trainer, scene, figures)
         save_model(options.model, model)
@@ -124,7 +127,7 @@ def _train(options: Any) -> int:
             figures |= _test_figures(model, scene, n_views)
             save_model(options.model, replace(model, figures=figures))
         checkpoint.unlink(missing_ok=True)
-        for line in trainer.effects.described():
+        for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
             print(f"vfr-train: {line}", file=sys.stderr)
         _report_training(options, figures, interrupted)
     processes.leave()
@@ -297,7 +300,7 @@ def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
     if psnr is not None:
         bar.close()
         unbounded = trainer.field.config.unbounded
-        text = expectation(psnr, seconds_a_step, trainer.pace.steps, trainer.minutes, unbounded)
+        text = expectation(psnr.every, seconds_a_step, trainer.pace.steps, trainer.minutes, unbounded)
         print(f"vfr-train: {text}", file=sys.stderr)
 
 

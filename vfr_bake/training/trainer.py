@@ -46,6 +46,7 @@ from vfr_bake.training.optimiser import (
 )
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import Batch, DevicePixelSampler, PixelSampler
+from vfr_bake.training.scores.between import WitnessPsnr, witness_psnr
 from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 SOLID = 0.9
@@ -228,16 +229,20 @@ class Trainer:
         if self.processes.first and self._looks and not unclear:
             self.duration.look(step, seconds, self._measured)
 
-    def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
+    def _witness_errors(self) -> WitnessErrors:
         if self._probe is None:
             self._probe = WitnessErrors(self.witnesses, self._views.cameras, self._background)
-        return self._probe.loss, self._probe.errors(self.field, self.sampler)
+        return self._probe
 
-    def witness_psnr(self) -> float | None:
-        """PSNR in dB at some of the witnesses by now; None for a scene too small to have any."""
+    def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
+        probe = self._witness_errors()
+        return probe.loss, probe.errors(self.field, self.sampler)
+
+    def witness_psnr(self) -> WitnessPsnr | None:
+        """PSNR at some of the witnesses by now; None for a scene too small to have any."""
         if not len(self.witnesses.pixels):
             return None
-        return -10 * float(np.log10(max(self._measured()[1].mean(), 1e-12)))
+        return witness_psnr(self._measured()[1], self._witness_errors().of_whole)
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
