@@ -245,6 +245,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
     """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
+    from vfr_bake.training.scores.metrics import decibels
 
     last = None
     interrupted = False
@@ -263,7 +264,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                 skipped = f"  {trainer.n_bad_steps} skipped" if trainer.n_bad_steps else ""
                 bar.share(
                     last.progress,
-                    f"loss {error:.5f}  PSNR {_decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
+                    f"loss {error:.5f}  PSNR {decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
                 )
                 if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
                     ends.append(last.seconds)
@@ -287,7 +288,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
         "seconds": round(trainer.seconds, 1),
         "ended_early": trainer.duration.ended_early,
         "skipped_steps": trainer.n_bad_steps,
-        "training_psnr": round(_decibels(error), 3),
+        "training_psnr": round(decibels(error), 3),
         "interrupted": interrupted,
     }
 
@@ -316,11 +317,6 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
         f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{flat}{skipped}{tested}"
         + (" (stopped early)" if interrupted else ""),
     )
-
-
-def _decibels(error: float) -> float:
-    """The PSNR of a mean square error."""
-    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:

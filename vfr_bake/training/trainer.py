@@ -224,25 +224,26 @@ class Trainer:
 
     def _look(self, step: int, seconds: float) -> None:
         """Shorten the training if the error is flat; the first process decides for all."""
-        # What effects take out of the pictures stays among the errors of the witnesses, as if it were flat.
-        unclear = self.effects.exposure_on or self.effects.moving_on
-        if self.processes.first and self._looks and not unclear:
+        if self.processes.first and self._looks and not self._is_unclear:
             self.duration.look(step, seconds, self._measured)
 
-    def _witness_errors(self) -> WitnessErrors:
+    def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
         if self._probe is None:
             self._probe = WitnessErrors(self.witnesses, self._views.cameras, self._background)
-        return self._probe
-
-    def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
-        probe = self._witness_errors()
-        return probe.loss, probe.errors(self.field, self.sampler)
+        return self._probe.loss, self._probe.errors(self.field, self.sampler)
 
     def witness_psnr(self) -> WitnessPsnr | None:
-        """PSNR at some of the witnesses by now; None for a scene too small to have any."""
-        if not len(self.witnesses.pixels):
+        """PSNR at some of the witnesses by now; None for a scene too small to have any, and where it would
+        count what effects take out of the pictures."""
+        if not len(self.witnesses.pixels) or self._is_unclear:
             return None
-        return witness_psnr(self._measured()[1], self._witness_errors().of_whole)
+        loss, errors = self._measured()
+        return witness_psnr(errors, loss.is_whole)
+
+    @property
+    def _is_unclear(self) -> bool:
+        """Whether effects leave errors at the witnesses that training does not work on."""
+        return self.effects.exposure_on or self.effects.moving_on
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""

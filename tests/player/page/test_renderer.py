@@ -29,9 +29,9 @@ LEVELS = Row(
     PAGE, "pictures, root mean square against the numpy player", ALL_ASSETS, 255 * 10 ** (-50 / 20),
     "levels (50 dB)", "from inside, from far away, along an axis; k = 0, 1 and 5; transparent",
 )  # fmt: skip
-"""Two pictures of 8 bits differ by 50 dB if two thirds of their levels differ by one. Of pixels that `FAR_OFF`
-does not count: which ray of these random grids is turned past an edge by a rounding depends on the processor,
-and one such pixel in a picture of 60 x 44 is worth more than all others."""
+"""Two pictures of 8 bits differ by 50 dB if two thirds of their levels differ by one. Pixels that `FAR_OFF`
+counts are not among them: which ray of these random grids is turned past an edge by a rounding depends on the
+processor, and one such pixel in a picture of 60 x 44 is worth more than all others."""
 FAR_OFF = Row(
     PAGE, "share of the pixels that are off by more than 3 levels", ALL_ASSETS, 1e-3, "of the pixels",
     "rays along an edge that another rounding takes past it",

@@ -26,8 +26,6 @@ class WitnessErrors:
         compared; None for the mean colour of the photographs."""
         some = witnesses.some(N_LOOKED_AT)
         self._rays = some.rays(cameras)
-        self.of_whole = np.isin(some.views(), some.whole)
-        """[n] bool: which of them are of whole pictures."""
         self._background = some.rgba[:, :3].mean(axis=0) / 255 if background is None else background
         self.loss = WitnessLoss(some, self._background)
         """Compares the errors of two times."""

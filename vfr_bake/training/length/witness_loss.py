@@ -66,7 +66,8 @@ class WitnessLoss:
         """`background`: [3] in [0, 1], over which pictures are compared."""
         self._photographs = _levels(over_background(witnesses.rgba, background))
         views = witnesses.views()
-        is_whole = np.isin(views, witnesses.whole)
+        self.is_whole = is_whole = np.isin(views, witnesses.whole)
+        """[n_witnesses] bool: which of them are of whole views."""
         if len(witnesses.whole) == 1:
             run = np.arange(int(is_whole.sum())) * BLOCKS_OF_A_VIEW // max(int(is_whole.sum()), 1)
             views[is_whole] = len(witnesses.counts) + run

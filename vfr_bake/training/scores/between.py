@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vfr_bake.training.scores.metrics import decibels
+
 MOST_APART = 4.0
 """dB by which whole pictures may be worse than pixels of the learned ones: 1 to 2.5 dB of lego, fox and can;
 6 to 8 dB where can had fog before its floor."""
@@ -46,17 +48,12 @@ class WitnessPsnr(NamedTuple):
         return lines
 
 
-def witness_psnr(errors: np.ndarray, of_whole: np.ndarray) -> WitnessPsnr:
-    """PSNR of the mean square errors [n] > 0 at witnesses, of which the bools `of_whole` [n] are of whole
+def witness_psnr(errors: np.ndarray, is_whole: np.ndarray) -> WitnessPsnr:
+    """PSNR of the mean square errors [n] at witnesses, of which `is_whole` [n] says which are of whole
     pictures.
 
     >>> witness_psnr(np.array([0.001, 0.01, 0.01, 0.019]), np.array([False, True, True, False]))
     WitnessPsnr(every=20.0, single=20.0, whole=20.0)
     """
-
-    def psnr(kind: np.ndarray) -> float | None:
-        return -10 * float(np.log10(max(errors[kind].mean(), 1e-12))) if kind.any() else None
-
-    every = psnr(np.ones(len(errors), bool))
-    assert every is not None
-    return WitnessPsnr(every, psnr(~of_whole), psnr(of_whole))
+    single, whole = (decibels(errors[kind].mean()) if kind.any() else None for kind in (~is_whole, is_whole))
+    return WitnessPsnr(decibels(errors.mean()), single, whole)

@@ -8,6 +8,7 @@ mean over all windows that lie wholly inside the picture, and then over the chan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
@@ -52,8 +53,16 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     20.0
     """
     _check_same_shape(a, b)
-    error = float(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2))
-    return float("inf") if error == 0 else -10.0 * float(np.log10(error))
+    return decibels(float(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2)))
+
+
+def decibels(error: float) -> float:
+    """The PSNR of a mean square error of values in [0, 1]; infinite for 0.
+
+    >>> round(decibels(0.01), 3)
+    20.0
+    """
+    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:

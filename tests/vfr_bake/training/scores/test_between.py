@@ -18,20 +18,26 @@ def test_whole_pictures_are_told_apart_from_pixels_of_learned_ones(monkeypatch: 
 
     def errors(self: WitnessErrors, *_: object) -> np.ndarray:
         probes.append(self)
-        return np.where(self.of_whole, 0.01, 0.001)
+        return np.where(self.loss.is_whole, 0.01, 0.001)
 
     monkeypatch.setattr(WitnessErrors, "errors", errors)
     found = trainer.witness_psnr()
     assert found is not None and found.single is not None
     assert (round(found.single, 6), found.whole) == (30.0, 20.0) and 20 < found.every < 30
     counts = trainer.witnesses.counts
-    assert probes[0].of_whole.mean() == pytest.approx(counts[10] / counts.sum(), abs=0.01)
+    assert probes[0].loss.is_whole.mean() == pytest.approx(counts[10] / counts.sum(), abs=0.01)
     assert len(found.lines()) == 2 and found.lines()[1].startswith("warning: views between")
 
 
 def test_there_is_no_warning_without_a_difference_or_without_whole_pictures() -> None:
     assert len(WitnessPsnr(30.0, 32.0, 32.0 - MOST_APART + 0.01).lines()) == 1
     assert WitnessPsnr(30.0, 30.0, None).lines() == []
+
+
+def test_what_effects_take_out_of_the_pictures_is_not_called_fog() -> None:
+    trainer = Trainer(demo_scene(size=32, n_train=20, n_test=1), TrainConfig(device="cpu", steps=1))
+    trainer.effects.exposure_on = True
+    assert trainer.witness_psnr() is None
 
 
 def test_a_scene_too_small_for_witnesses_has_none() -> None:
