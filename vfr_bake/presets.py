@@ -88,7 +88,7 @@ PRESETS: dict[Preset, BakeChoice] = {
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
     "fidelity": {"refine_steps": 200, "feature_share": 1.0, "n_channels": 24},
     "balanced": {
-        "refine_steps": 800,
+        "refine_steps": 1200,
         "feature_share": 1.0,
         "n_channels": 24,
         "channel_loss_db": 0.03,

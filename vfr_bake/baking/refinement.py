@@ -60,8 +60,10 @@ PASSES = 10
 has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
 HEAD_STEPS, LAST_STEPS = 2000, 1000
 """Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
-the lookups and bits with which it is played: at most as many as refinement may have. They take a fifth of the
-time of its steps."""
+the lookups and bits with which it is played; of these at most as many as refinement may have."""
+HEAD_SHARE = 3
+"""Steps of a small head for each step that refinement may have, at most. They take a fifth of the time or
+less, and what the head has not learned refinement would have to."""
 AT_K = 0.25
 """Factor of the head's learning rate in the last round, where little is left to be learned."""
 N_HEAD = 1_000_000
@@ -108,7 +110,12 @@ def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
 
 def head_steps(choice: BakeChoice) -> int:
     """The steps in which the head is trained alone, before refinement and after it."""
-    return sum(min(n, choice.refine_steps) for n in (HEAD_STEPS if choice.head_width else 0, LAST_STEPS))
+    return (small_head_steps(choice) if choice.head_width else 0) + min(LAST_STEPS, choice.refine_steps)
+
+
+def small_head_steps(choice: BakeChoice) -> int:
+    """The steps in which a small head is trained alone before refinement."""
+    return min(HEAD_STEPS, HEAD_SHARE * choice.refine_steps)
 
 
 class Tuning:
@@ -154,7 +161,7 @@ class Tuning:
         rays = collect_training_rays(teacher, grid, 0, densities)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
-            with self._steps("small head", min(HEAD_STEPS, choice.refine_steps)) as steps:
+            with self._steps("small head", small_head_steps(choice)) as steps:
                 stored = replace(stored, head=train_head(stored, rays.some(N_HEAD), steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2

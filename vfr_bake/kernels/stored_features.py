@@ -43,23 +43,26 @@ def table(n_rows: int, n_columns: int) -> np.ndarray:
 
 
 @njit(cache=True)
-def _prefetch_rows(rows, j, table):
-    """Prefetch what fetch j will read of `table`; every other corner is the next row of the one before."""
+def _prefetch_rows(rows, j, table, n_columns):
+    """Prefetch all lines of what fetch j will read of `table`, flat; every other corner is the row after the
+    one before it."""
     if j < rows.shape[0]:
         for corner in range(0, 8, 2):
-            prefetch(table, rows[j, corner])
+            first = np.int64(rows[j, corner]) * n_columns
+            for number in range(first, first + 2 * n_columns, LINE // table.itemsize):
+                prefetch(table, number)
 
 
 @njit(parallel=True, cache=True)
 def compose(starts, rows, shares, weights, latent, out):
     """out [n, n_channels] of all rays, from the latent codes [n_vertices, n_channels], rounded."""
-    n_channels = latent.shape[1]
+    n_channels, flat = latent.shape[1], latent.reshape(-1)
     for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
             for c in range(n_channels):
                 out[i, c] = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
-                _prefetch_rows(rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, flat, n_channels)
                 for corner in range(8):
                     share = weights[j] * shares[j, corner]
                     if share == 0:
@@ -78,7 +81,7 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
     Each of `n_parts` goes through all fetches, in their order, and moves the vertices that are its own: the
     result does not depend on their number.
     """
-    n_channels = latent.shape[1]
+    n_channels, flat = latent.shape[1], latent.reshape(-1)
     low, high = np.float32(-127), np.float32(127)
     for part in prange(n_parts):
         for i in range(gradient.shape[0]):
@@ -89,8 +92,8 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                 continue
             square /= np.float32(n_channels)
             for j in range(starts[i], starts[i + 1]):
-                _prefetch_rows(rows, j + AHEAD, latent)
-                _prefetch_rows(rows, j + AHEAD, steepness)
+                _prefetch_rows(rows, j + AHEAD, flat, n_channels)
+                _prefetch_rows(rows, j + AHEAD, steepness, 1)
                 for corner in range(8):
                     row = rows[j, corner]
                     share = weights[j] * shares[j, corner]
@@ -115,7 +118,7 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
                 if tau > opaque:
                     weights[j] = np.float32(0)
                     continue
-                _prefetch_rows(rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, latent, 1)
                 code = np.float32(0)
                 for corner in range(8):
                     code += shares[j, corner] * np.rint(latent[rows[j, corner]])
@@ -137,13 +140,13 @@ def slants(
     n_channels] are the latent feature codes, at `rows` by `shares`; `gradient` [n, n_channels] and
     `gradient_of_opacity` [n] are those of x and A; `latent` are the density codes [n_densities].
     """
-    n_channels = values.shape[1]
+    n_channels, flat = values.shape[1], values.reshape(-1)
     for chunk in prange((gradient.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
             behind = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
-                _prefetch_rows(rows, j + AHEAD, values)
-                _prefetch_rows(density_rows, j + AHEAD, latent)
+                _prefetch_rows(rows, j + AHEAD, flat, n_channels)
+                _prefetch_rows(density_rows, j + AHEAD, latent, 1)
                 along = np.float32(0)
                 for corner in range(8):
                     row = rows[j, corner]
@@ -175,8 +178,8 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
     gradients `slants` [n_fetches] of what is interpolated from `rows` by `shares`; in parts as `descend`."""
     for part in prange(n_parts):
         for j in range(slants.shape[0]):
-            _prefetch_rows(rows, j + AHEAD, latent)
-            _prefetch_rows(rows, j + AHEAD, steepness)
+            _prefetch_rows(rows, j + AHEAD, latent, 1)
+            _prefetch_rows(rows, j + AHEAD, steepness, 1)
             if slants[j] == 0:
                 continue
             for corner in range(8):

@@ -13,8 +13,9 @@ import numpy as np
 from vfr_bake.training.scores.metrics import decibels
 
 MOST_APART = 4.0
-"""dB by which whole pictures may be worse than pixels of the learned ones: 1 to 2.5 dB of lego, fox and can;
-6 to 8 dB where can had fog before its floor."""
+"""dB by which whole pictures may be worse than pixels of the learned ones: they are by 1.3 dB in can and by
+0.8 dB in the built-in scene. Where fog stood before can's floor, its test views were worse than the views
+that it had learned from by 6 to 8 dB."""
 
 
 class WitnessPsnr(NamedTuple):
