@@ -60,7 +60,7 @@ PASSES = 10
 has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
 HEAD_STEPS, LAST_STEPS = 2000, 1000
 """Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
-the lookups and bits with which it is played; of these at most as many as refinement may have."""
+the lookups and bits with which it is played. The latter are at most as many as refinement may have."""
 HEAD_SHARE = 3
 """Steps of a small head for each step that refinement may have, at most. They take a fifth of the time or
 less, and what the head has not learned refinement would have to."""

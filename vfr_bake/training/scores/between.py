@@ -51,10 +51,11 @@ class WitnessPsnr(NamedTuple):
 
 def witness_psnr(errors: np.ndarray, is_whole: np.ndarray) -> WitnessPsnr:
     """PSNR of the mean square errors [n] at witnesses, of which `is_whole` [n] says which are of whole
-    pictures.
+    pictures; no error counts as one of 1e-12.
 
     >>> witness_psnr(np.array([0.001, 0.01, 0.01, 0.019]), np.array([False, True, True, False]))
     WitnessPsnr(every=20.0, single=20.0, whole=20.0)
     """
+    errors = np.maximum(errors, 1e-12)
     single, whole = (decibels(errors[kind].mean()) if kind.any() else None for kind in (~is_whole, is_whole))
     return WitnessPsnr(decibels(errors.mean()), single, whole)

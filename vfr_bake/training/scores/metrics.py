@@ -57,12 +57,12 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def decibels(error: float) -> float:
-    """The PSNR of a mean square error of values in [0, 1]; infinite for 0.
+    """The PSNR of a mean square error of values in [0, 1]; infinite for 0, NaN for NaN.
 
-    >>> round(decibels(0.01), 3)
-    20.0
+    >>> round(decibels(0.01), 3), decibels(0.0), decibels(math.nan)
+    (20.0, inf, nan)
     """
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:

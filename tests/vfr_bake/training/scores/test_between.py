@@ -8,7 +8,7 @@ import pytest
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.training.length.witness_errors import WitnessErrors
-from vfr_bake.training.scores.between import MOST_APART, WitnessPsnr
+from vfr_bake.training.scores.between import MOST_APART, WitnessPsnr, witness_psnr
 from vfr_bake.training.trainer import Trainer
 
 
@@ -27,6 +27,12 @@ def test_whole_pictures_are_told_apart_from_pixels_of_learned_ones(monkeypatch: 
     counts = trainer.witnesses.counts
     assert probes[0].loss.is_whole.mean() == pytest.approx(counts[10] / counts.sum(), abs=0.01)
     assert len(found.lines()) == 2 and found.lines()[1].startswith("warning: views between")
+
+
+def test_pictures_without_any_error_have_a_finite_psnr() -> None:
+    """A scene of one colour may be shown exactly in 8 bits; what is expected of it and JSON take numbers."""
+    found = witness_psnr(np.zeros(4), np.array([False, True, True, False]))
+    assert found == pytest.approx((120.0, 120.0, 120.0))
 
 
 def test_there_is_no_warning_without_a_difference_or_without_whole_pictures() -> None:
