@@ -28,7 +28,7 @@ from tests.player.march.test_march import random_rays
 from vfr_bake.baking.distillation import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.density import Limits
-from vfr_bake.kernels.stored_features import compose, descend, descend_density
+from vfr_bake.kernels.stored_features import PARTS, compose, descend, descend_density
 
 F32 = np.float32
 N_CHANNELS = 10
@@ -171,14 +171,15 @@ def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
     shares = rng.uniform(0, 1, (50, 8)).astype(F32)
     starts, weights = np.arange(0, 51, 10), rng.uniform(0, 1, 50).astype(F32)
     gradient = rng.normal(size=(5, N_CHANNELS)).astype(F32)
-    small, codes = rng.uniform(0, 100, (1000, N_CHANNELS)).astype(F32), rng.uniform(0, 100, 1000).astype(F32)
-    large, large_codes = zeros((n_rows, N_CHANNELS), F32), zeros(MOST_ROWS, F32)
+    small = rng.integers(0, 100 * PARTS, (1000, N_CHANNELS)).astype(np.int16)
+    codes = rng.uniform(0, 100, 1000).astype(F32)
+    large, large_codes = zeros((n_rows, N_CHANNELS), np.int16), zeros(MOST_ROWS, F32)
     large[-1000:], large_codes[-1000:] = small, codes
     out = []
     for latent, rows in ((small, near), (large, far)):
         composites, steepness = np.empty((5, N_CHANNELS), F32), zeros(len(latent), F32)
         compose(starts, rows, shares, weights, latent, composites)
-        descend(starts, rows, shares, weights, gradient, F32(0.5), 2, latent, steepness)
+        descend(starts, rows, shares, weights, gradient, F32(0.5), 2, latent, steepness, 3)
         out.append((composites, latent[-1000:], steepness[-1000:]))
     for latent, offset in ((codes, 0), (large_codes, MOST_ROWS - 1000)):
         steepness = zeros(len(latent), F32)

@@ -24,7 +24,7 @@ from tests.numerics.bounds import Row
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
 from tests.vertex_grids import grid_of
-from vfr_bake.baking.grids import code_step, encode_features
+from vfr_bake.baking.grids import code_step, latent, whole_codes
 
 MARCHES = [pytest.param(march, id="numpy"), pytest.param(march_compiled, id="numba")]
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
@@ -107,14 +107,14 @@ def test_every_feature_code_comes_back(scale: float, levels: int) -> None:
     values = codes * (scale / levels)
     step = code_step(values, levels)
     assert np.isfinite(step) and step > 0
-    FEATURE_CODES.check(encode_features(values / step), codes)
+    FEATURE_CODES.check(whole_codes(latent(values / step)), codes)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-320, 5.0, -1e30])
 def test_a_constant_channel_keeps_its_value(value: float) -> None:
     values = np.full((9, 1), value)
     step = code_step(values, 127)
-    kept = encode_features(values / step) * step
+    kept = whole_codes(latent(values / step)) * step
     if 0 < abs(value) < 1e-300:  # a step of 1e-320 / 127 has seven bits left
         np.testing.assert_allclose(kept, values, rtol=1e-2)
     else:
@@ -122,7 +122,7 @@ def test_a_constant_channel_keeps_its_value(value: float) -> None:
 
 
 def test_what_is_out_of_range_is_clipped_not_wrapped() -> None:
-    CLIPPED.holds(encode_features(np.array([-1e9, -127.6, 127.6, 1e9])) == [-127, -127, 127, 127])
+    CLIPPED.holds(whole_codes(latent(np.array([-1e9, -127.6, 127.6, 1e9]))) == [-127, -127, 127, 127])
 
 
 @given(st.lists(st.integers(0, 255), max_size=300), st.integers(1, 4))

@@ -34,17 +34,17 @@ from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
 from vfr_bake.baking.grids import (
-    LARGEST_CODE,
     Layout,
     Parts,
     Projection,
     code_step,
-    codes_of_field,
     evaluate_densities,
-    evaluate_features,
+    features_of_field,
     head_sensitivity,
+    latent_features,
     make_layout,
     project,
+    some_features,
 )
 from vfr_bake.baking.head import fold_head, runner, small_head
 from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
@@ -247,24 +247,24 @@ class _Bake:
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
             projection = self._projection(teacher)
-            features = evaluate_features(model, layout, projection.matrix, self._progress("features"))
-            step = code_step(features, choice.code_levels)
-            features /= np.float32(step)
-            np.clip(features, -LARGEST_CODE, LARGEST_CODE, out=features)
+            step = code_step(some_features(model, layout, projection.matrix), choice.code_levels)
+            matrix = projection.matrix / step
+            features = latent_features(model, layout, matrix, self._progress("features"))
             first = model.field.head.first_weights().astype(np.float64)
             head = fold_head(model.field.head, first @ projection.back * step)
-            grid = layout.grid(density, features)
-            played = held_out.march(replace(grid, features=features), 0)
+            played = held_out.march(grid := layout.grid(density, features), 0)
             own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
+            del grid
             held_out.measure_march("grid", own, runner(fold_head(model.field.head, first)))
-            held_out.measure_march("rank", played, runner(head))
-            held_out.measure("codes", grid, runner(head), 0)
+            projected = (own.features @ matrix.T).astype(np.float32)
+            held_out.measure_march("rank", own._replace(features=projected), runner(head))
+            held_out.measure_march("codes", played, runner(head))
         n_all = model.field.config.n_channels
         self.left_out["channels"] = (
             f"{n_all - features.shape[1]} of {n_all} feature channels: what the loss after 'rank' has more "
             "than that after 'grid', before refinement"
         )
-        again = partial(codes_of_field, model, layout, projection.matrix / step)
+        again = partial(features_of_field, model, layout, matrix)
         return Stored(head, features, density), teacher, again
 
     def _needed(self, detail: Detail, layout: Layout, stored: Stored, teacher: TeacherRays) -> Needed:

@@ -34,9 +34,6 @@ RAYS_AT_ONCE = 1 << 12
 """Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 FIELD_RAYS_AT_ONCE = 1 << 13
 """Rays whose field features are evaluated at once."""
-UNROUNDED = 1 << 16
-"""The kernel that composes rounds codes to whole numbers: features are counted in parts of one, so small that
-it does not matter."""
 N_TYPICAL = 4096
 """Training rays that tell the typical size of composites."""
 
@@ -68,10 +65,11 @@ class Fetches(NamedTuple):
     opacity: np.ndarray
     """[n] float32 opacity of the baked grid."""
 
-    def compose(self, codes: np.ndarray) -> np.ndarray:
-        """[n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded."""
-        out = np.empty((len(self.opacity), codes.shape[1]), np.float32)
-        compose(self.starts, *self.features, self.weights, codes, out)
+    def compose(self, features: np.ndarray) -> np.ndarray:
+        """[n, n_channels] float32 composites of latent features [n_vertices, n_channels] int16, rounded to
+        codes."""
+        out = np.empty((len(self.opacity), features.shape[1]), np.float32)
+        compose(self.starts, *self.features, self.weights, features, out)
         return out
 
 
@@ -283,9 +281,7 @@ def _field_features(
     numbers[met] = np.arange(len(met))
     at = unit_points(layout.features.index[met], layout.features.resolution, layout.contracted)
     vertices = model.field.features(at)
-    vertices *= np.float32(UNROUNDED)
     starts = np.concatenate([[0], np.cumsum(fetches.counts)])
     out = np.empty((len(fetches.hits), vertices.shape[1]), np.float32)
     compose(starts, numbers[rows], shares, fetches.weights, vertices, out)
-    out *= np.float32(1 / UNROUNDED)
     return out

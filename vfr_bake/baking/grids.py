@@ -15,7 +15,7 @@ S = M^(1/2) and U holds the first r eigenvectors of S G S (Eckart-Young).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels.stored_features import table
+from vfr_bake.kernels.stored_features import PARTS, PARTS_BITS, table
 from vfr_bake.training.model_file import Model
 
 SLAB = 64
@@ -47,7 +47,7 @@ ROWS_AT_ONCE = 1 << 18
 """Vertices whose codes are rounded at once."""
 LARGEST_CODE = 127
 """Largest magnitude of a feature's code."""
-FAR_OUT, N_RANKED = 1e-4, 1_000_000
+FAR_OUT, N_RANKED = 1e-4, 250_000
 """Share of the vertices whose features may have larger codes than was asked for, and vertices that decide it.
 The largest of ten million of a room was 2.5 times as large as all but a ten thousandth."""
 LEAST_SENSITIVITY = 1e-6
@@ -126,9 +126,9 @@ class Layout:
         return values_beneath(self.pyramids.densities, whole, "densities", self.density_step)
 
     def finest(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
-        """The asset's finest level, from codes that need not be whole: one for each vertex of the densities,
-        [n, n_channels] for each of the features."""
-        return GridArrays(_finest(self._densities(density)), self.features.values(encode_features(features)))
+        """The asset's finest level, from density codes [n] that need not be whole, and latent features
+        [n_features, n_channels] int16."""
+        return GridArrays(_finest(self._densities(density)), self.features.values(whole_codes(features)))
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
         """The grid that a player makes of `finest`."""
@@ -186,8 +186,22 @@ def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.n
     return codes
 
 
-def evaluate_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
-    """The field's features times `matrix` [n_stored, n_channels]: [n_features, n_stored] float32."""
+def some_features(model: Model, layout: Layout, matrix: np.ndarray) -> np.ndarray:
+    """[n, n_stored] float32: the field's features times `matrix` [n_stored, n_channels] at N_RANKED of the
+    vertices, spread evenly, or at all where there are no more."""
+    vertices = layout.features
+    index = vertices.index[:: -(-len(vertices) // N_RANKED)] if len(vertices) else vertices.index
+    some = replace(vertices, index=index)
+    parts = [
+        model.field.features(points) @ matrix.T.astype(np.float32)
+        for _, points in _chunks(some, layout.contracted)
+    ]
+    return np.concatenate([np.zeros((0, len(matrix)), np.float32), *parts])
+
+
+def latent_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
+    """The field's features times `matrix` [n_stored, n_channels], which makes codes of them, as latent
+    features [n_features, n_stored] int16."""
     features = table(len(layout.features), len(matrix))
     for rows, values in features_of_field(model, layout, matrix):
         features[rows] = values
@@ -199,18 +213,12 @@ def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts
     """The same a part at a time."""
     back = matrix.T.astype(np.float32)
     for rows, points in _chunks(layout.features, layout.contracted):
-        yield rows, model.field.features(points) @ back
-
-
-def codes_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts:
-    """The same as codes, which need not be whole, but end at 127."""
-    for rows, values in features_of_field(model, layout, matrix):
-        yield rows, np.clip(values, -LARGEST_CODE, LARGEST_CODE)
+        yield rows, latent(model.field.features(points) @ back)
 
 
 def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
-    for start in range(0, len(vertices), VERTEX_CHUNK):
-        rows = slice(start, min(start + VERTEX_CHUNK, len(vertices)))
+    for start in range(0, len(vertices.index), VERTEX_CHUNK):
+        rows = slice(start, min(start + VERTEX_CHUNK, len(vertices.index)))
         yield rows, unit_points(vertices.index[rows], vertices.resolution, contracted)
 
 
@@ -301,56 +309,74 @@ def code_step(values: np.ndarray, levels: int = 127) -> float:
     """
     if not len(values):
         return 1.0
-    some = values[:: -(-len(values) // N_RANKED)]
-    magnitudes = np.maximum(some.max(axis=1), -some.min(axis=1))
+    magnitudes = np.maximum(values.max(axis=1), -values.min(axis=1))
     largest = np.quantile(magnitudes, 1 - FAR_OUT, method="higher") or max(values.max(), -values.min())
     return float(largest) / levels if largest > 0 else 1.0
 
 
-def encode_features(codes: np.ndarray) -> np.ndarray:
-    """Codes that need not be whole [n_vertices, n_stored] as signed bytes, rounded to nearest."""
-    whole = np.empty(codes.shape, np.int8)
-    for first in range(0, len(codes), ROWS_AT_ONCE):
+def latent(values: np.ndarray) -> np.ndarray:
+    """Codes that need not be whole as latent features, int16 in parts of a code
+    (`vfr_bake.kernels.stored_features`); they end at 127.
+
+    >>> latent(np.array([1.25, -3.5, 200.0])).tolist()
+    [320, -896, 32512]
+    """
+    return np.rint(np.clip(values, -LARGEST_CODE, LARGEST_CODE) * np.float32(PARTS)).astype(np.int16)
+
+
+def codes(values: np.ndarray) -> np.ndarray:
+    """Codes as float32, from any that need not be whole or from latent features as int16.
+
+    >>> codes(latent(np.array([1.25, -3.5]))).tolist(), codes(np.array([1.25])).tolist()
+    ([1.25, -3.5], [1.25])
+    """
+    unit = 1 / PARTS if values.dtype == np.int16 else 1
+    return values.astype(np.float32) * np.float32(unit)
+
+
+def whole_codes(features: np.ndarray) -> np.ndarray:
+    """The codes nearest to latent features [n_vertices, n_stored] int16, as signed bytes; ties upwards.
+
+    >>> whole_codes(latent(np.array([[1.25, -3.5, 200.0]]))).tolist()
+    [[1, -3, 127]]
+    """
+    whole = np.empty(features.shape, np.int8)
+    for first in range(0, len(features), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
-        whole[rows] = np.clip(np.rint(codes[rows]), -LARGEST_CODE, LARGEST_CODE)
+        whole[rows] = (features[rows] + np.int16(PARTS // 2)) >> PARTS_BITS
     return whole
 
 
-REMAINDER_STEPS = 256
-"""Steps of a code in which remainders are kept: they are at most half a code."""
+def remainders(features: np.ndarray) -> np.ndarray:
+    """What `whole_codes` rounds away of latent features [n_vertices, n_stored], as signed bytes."""
+    left = np.empty(features.shape, np.int8)
+    for first in range(0, len(features), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        left[rows] = features[rows] - (((features[rows] + np.int16(PARTS // 2)) >> PARTS_BITS) << PARTS_BITS)
+    return left
 
 
-def remainders(codes: np.ndarray) -> np.ndarray:
-    """What `encode_features` rounds away of codes within -127..127, [n_vertices, n_stored], as signed bytes:
-    a quarter of the memory that a copy of the codes would take."""
-    out = np.empty(codes.shape, np.int8)
-    for first in range(0, len(codes), ROWS_AT_ONCE):
-        some = codes[first : first + ROWS_AT_ONCE]
-        steps = np.rint((some - np.rint(some)) * REMAINDER_STEPS)
-        out[first : first + ROWS_AT_ONCE] = np.clip(steps, -127, 127)  # less than half: rounded as before
-    return out
+def with_remainders(whole: np.ndarray, left: np.ndarray) -> Parts:
+    """The latent features of which `whole_codes` made `whole` and `remainders` made `left`, a part at a time.
 
-
-def unrounded(whole: np.ndarray, left: np.ndarray) -> Parts:
-    """The codes of which `encode_features` made `whole` and `remainders` made `left`, a part at a time.
-
-    >>> codes = np.array([[1.25, -3.5]], np.float32)
-    >>> [part.round(2).tolist() for _, part in unrounded(encode_features(codes), remainders(codes))]
-    [[[1.25, -3.5]]]
+    >>> features = latent(np.array([[1.25, -3.5]]))
+    >>> [part.tolist() for _, part in with_remainders(whole_codes(features), remainders(features))]
+    [[[320, -896]]]
     """
     for first in range(0, len(whole), ROWS_AT_ONCE):
         rows = slice(first, first + ROWS_AT_ONCE)
-        yield rows, whole[rows] + left[rows] * np.float32(1 / REMAINDER_STEPS)
+        yield rows, (whole[rows].astype(np.int16) << PARTS_BITS) + left[rows]
 
 
-def move_towards(codes: np.ndarray, others: Parts, share: float) -> None:
-    """Move `codes` [n_vertices, n_stored] float32, in place, by a `share` of the way to `others`, which are
+def move_towards(features: np.ndarray, others: Parts, share: float) -> None:
+    """Move latent features [n_vertices, n_stored], in place, by a `share` of the way to `others`, which are
     given a part at a time: there may be no room for both.
 
-    >>> codes = np.zeros((3, 1), np.float32)
-    >>> move_towards(codes, [(slice(0, 2), np.ones((2, 1)))], 0.25)
-    >>> codes[:, 0].tolist()
-    [0.25, 0.25, 0.0]
+    >>> features = np.zeros((3, 1), np.int16)
+    >>> move_towards(features, [(slice(0, 2), np.full((2, 1), 40, np.int16))], 0.25)
+    >>> features[:, 0].tolist()
+    [10, 10, 0]
     """
     for rows, values in others:
-        codes[rows] += np.float32(share) * (values - codes[rows])
+        way = values.astype(np.float32) - features[rows]
+        features[rows] += np.rint(np.float32(share) * way).astype(np.int16)

@@ -45,9 +45,10 @@ RAY_BYTES = {False: 40, True: 120}
 """Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what the model shows,
 twice that for those that meet something in the grid, too, and as much again while they are put together. A
 third of an object's rays meets something."""
-CHANNEL_BYTES = 11
-"""Bytes that a stored channel takes in a cell, which has about 1.2 vertices: the float that is trained, the
-code that is played, and where detail is dropped, their means on coarser levels."""
+CHANNEL_BYTES = 8.5
+"""Bytes that a stored channel takes in a cell, which has about 1.3 vertices, when codes are chosen: the two
+of what was trained, and one each of the codes that are tried, of the best ones so far, and of those that are
+played; all with their coarser levels."""
 DENSITY_BYTES = 40
 """Bytes that a density takes; a cell of the features holds as many densities as finer cells."""
 REFINED_BY = 0.8

@@ -40,7 +40,7 @@ from player.asset.structure import encode_structure
 from player.asset.symbols import N_CLASSES, LevelRows, level_rows
 from vfr_bake.baking.detail.shown import Wanted
 from vfr_bake.baking.distillation import TeacherRays, collect_training_rays
-from vfr_bake.baking.grids import Layout
+from vfr_bake.baking.grids import Layout, codes
 from vfr_bake.baking.head import FoldedHead
 from vfr_bake.baking.refinement import Stored
 from vfr_bake.kernels.stored_features import slants
@@ -214,7 +214,7 @@ class Choices:
             else:
                 predicted = np.zeros(vertices.n, np.int16)
             inside = ~vertices.on_border  # what is on the border has no symbol
-            wanted = np.clip(self._wanted[level][inside, number].astype(np.float32), *self._limits)
+            wanted = np.clip(codes(self._wanted[level][inside, number]), *self._limits)
             weights, near = self._weights[level][inside] * factor, np.zeros(len(wanted) + 1, np.int16)
             values, cost = np.empty(len(wanted), np.int16), first_bits()
             for _ in range(TURNS):

@@ -27,7 +27,7 @@ from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
-from vfr_bake.baking.grids import Layout, Parts, encode_features, move_towards, remainders, unrounded
+from vfr_bake.baking.grids import Layout, Parts, move_towards, remainders, whole_codes, with_remainders
 from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
@@ -93,13 +93,13 @@ are."""
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What the asset will hold, codes as floats that need not be whole."""
+    """What the asset will hold, before its codes are rounded."""
 
     head: HeadWeights
     features: np.ndarray
-    """[n_features, n_channels] float32 within -127..127."""
+    """[n_features, n_channels] int16: latent features, as `vfr_bake.kernels.stored_features` has them."""
     density: np.ndarray
-    """[n_densities] float32 within 0..255."""
+    """[n_densities] float32 codes within 0..255 that need not be whole."""
 
 
 def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
@@ -225,13 +225,13 @@ class Tuning:
         asked, left = refined_steps(self._config, self._choice, len(rays)), remainders(stored.features)
         with self._steps("refinement at k", asked) as steps:
             tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)
-        played, grid = grid.features, replace(grid, features=encode_features(tuned.features))
+        played, grid = grid.features, replace(grid, features=whole_codes(tuned.features))
         head = runner(tuned.head, self.ranges)
         after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
         if self._gained("refinement at k", self.kept, after):
             self.kept = after
             return tuned
-        move_towards(stored.features, unrounded(played, left), 1.0)
+        move_towards(stored.features, with_remainders(played, left), 1.0)
         return stored
 
     @contextmanager
@@ -362,7 +362,7 @@ def refine(
 ) -> Stored:
     """Head, features and densities after `steps` on the squared error of the colours over random backgrounds.
 
-    Codes are rounded wherever they are composed, and returned unrounded. The features of `stored` are changed
+    Codes are rounded where they are composed, not where they are kept. The features of `stored` are changed
     in place: there may be no room for them twice. With a `density_range`, that of `Layout`, the `rays` hold
     every sample and the densities around it, and their weights follow the densities. Without one the
     densities stay as they are. With `ranges` the head is trained as it is played in 8 bits.
@@ -401,7 +401,7 @@ def refine(
             rate = np.float32(DENSITY_RATE * moving)
             descend_density(*fetches.densities, fetch_gradient, rate, n_parts, density, density_squares)
         rate = np.float32(code_rate * moving)
-        descend(*where, fetches.weights, composed_gradient, rate, n_parts, features, squares)
+        descend(*where, fetches.weights, composed_gradient, rate, n_parts, features, squares, step)
         if step == 0:
             _damp(squares)
             _damp(density_squares)

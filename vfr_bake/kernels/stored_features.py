@@ -6,14 +6,19 @@ x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where 
 of a ray, weights follow from the density codes q_j, which are interpolated in the same way on a grid of their
 own: delta_j = exp(low + slope q_j) lengths[j], T_j =
 exp(-sum_{i<j} delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as
-the integer nearest to a float `latent`; what is composed is the integers, and the gradient is applied to the
-latent as if there were no rounding (straight through).
+the integer nearest to a `latent`; what is composed is the integers, and the gradient is applied to the
+latent as if there were no rounding (straight through). Latent densities are float32, latent features int16 in
+256ths of a code: there are so many of them that they decide how fine a grid fits into memory.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
-from numba import prange
+from numba import prange, types
+from numba.extending import overload
 
 from player.compiled.prefetch import prefetch
 from vfr_bake.kernels import njit
@@ -27,19 +32,38 @@ AHEAD = 6
 """Fetches by which memory is prefetched ahead: the rows of one lie all over the grid."""
 LINE = 64
 """Bytes of a line of the cache."""
+PARTS_BITS = 8
+PARTS = 1 << PARTS_BITS
+"""Parts of a code that a latent feature counts."""
+LARGEST_LATENT = 127 * PARTS
+GOLDEN = np.uint32(0x9E3779B9)
+"""The golden ratio's part of 2^32: its multiples, modulo that, are spread evenly."""
 
 
 def table(n_rows: int, n_columns: int) -> np.ndarray:
-    """[n_rows, n_columns] float32 that has no values yet and begins with a line of the cache. Where rows are
-    16 numbers, each lies in one line instead of two; steps of refinement take a tenth less time.
+    """[n_rows, n_columns] int16 that has no values yet and begins with a line of the cache: rows of 16
+    numbers never lie in two.
 
     >>> table(3, 16).shape, table(3, 16).ctypes.data % LINE
     ((3, 16), 0)
     """
     n = n_rows * n_columns
-    memory = np.empty(n + LINE // 4, np.float32)
-    first = -memory.ctypes.data % LINE // 4
+    memory = np.empty(n + LINE // 2, np.int16)
+    first = -memory.ctypes.data % LINE // 2
     return memory[first : first + n].reshape(n_rows, n_columns)
+
+
+def _shown(value: Any) -> float:
+    """What is composed of a stored value: a latent feature rounded to a whole code, ties upwards; a code or a
+    float as it is."""
+    raise NotImplementedError("compiled code alone calls this")
+
+
+@overload(_shown, strict=False)  # it compares annotations, too
+def _overload_shown(value: types.Type) -> Callable[[Any], Any]:
+    if value == types.int16:
+        return lambda value: np.float32((value + (PARTS >> 1)) >> PARTS_BITS)
+    return lambda value: np.float32(value)
 
 
 @njit(cache=True)
@@ -55,7 +79,8 @@ def _prefetch_rows(rows, j, table, n_columns):
 
 @njit(parallel=True, cache=True)
 def compose(starts, rows, shares, weights, latent, out):
-    """out [n, n_channels] of all rays, from the latent codes [n_vertices, n_channels], rounded."""
+    """out [n, n_channels] of all rays, from `latent` [n_vertices, n_channels]: latent features, which are
+    rounded, or codes int8 or floats as they are."""
     n_channels, flat = latent.shape[1], latent.reshape(-1)
     for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
@@ -69,12 +94,24 @@ def compose(starts, rows, shares, weights, latent, out):
                         continue
                     row = rows[j, corner]
                     for c in range(n_channels):
-                        out[i, c] += share * np.rint(latent[row, c])
+                        out[i, c] += share * _shown(latent[row, c])
+
+
+@njit(cache=True)
+def _mixed(step, fetch):
+    """A number of 32 bits, as random as the rounding of a gradient needs, from two others."""
+    mixed = np.uint32(step * np.uint32(0x85EBCA6B)) ^ fetch
+    mixed = np.uint32((mixed ^ (mixed >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    mixed = np.uint32((mixed ^ (mixed >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(mixed ^ (mixed >> np.uint32(16)))
 
 
 @njit(parallel=True, cache=True)
-def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, steepness):
-    """One step of Adagrad on `latent`, in place, codes kept within -127..127.
+def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, steepness, step):
+    """Step number `step` of Adagrad on the latent features, in place, codes kept within -127..127.
+
+    A move of 3.25 parts of a code is one of 4 parts in a quarter of all cases, and else one of 3, so that
+    small moves are not lost: by a number that follows from the step, the fetch and the channel.
 
     `gradient` [n, n_channels] is that of the composites; `steepness` [n_vertices] collects the mean square of
     what a vertex has seen, over its channels, so that vertices that few rays meet move as fast as the others.
@@ -82,7 +119,7 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
     result does not depend on their number.
     """
     n_channels, flat = latent.shape[1], latent.reshape(-1)
-    low, high = np.float32(-127), np.float32(127)
+    low, high = np.float32(-LARGEST_LATENT), np.float32(LARGEST_LATENT)
     for part in prange(n_parts):
         for i in range(gradient.shape[0]):
             square = np.float32(0)
@@ -102,9 +139,14 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                     steepness[row] += share * share * square
                     if steepness[row] == 0:  # the square of next to nothing is nothing
                         continue
-                    step = rate * share / np.sqrt(steepness[row])
+                    length = np.float32(PARTS) * rate * share / np.sqrt(steepness[row])
+                    random = _mixed(np.uint32(step), np.uint32(8 * j + corner))
                     for c in range(n_channels):
-                        latent[row, c] = min(max(latent[row, c] - step * gradient[i, c], low), high)
+                        moved = np.float32(latent[row, c]) - length * gradient[i, c]
+                        part_of_one = np.float32(random >> np.uint32(8)) * np.float32(2.0**-24)
+                        moved = np.floor(min(max(moved, low), high) + part_of_one)
+                        latent[row, c] = np.int16(moved)
+                        random = np.uint32(random + GOLDEN)
 
 
 @njit(parallel=True, cache=True)
@@ -137,7 +179,7 @@ def slants(
     """The gradient of each fetch's interpolated density code into `out` [n_fetches].
 
     dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
-    n_channels] are the latent feature codes, at `rows` by `shares`; `gradient` [n, n_channels] and
+    n_channels] are the latent features, at `rows` by `shares`; `gradient` [n, n_channels] and
     `gradient_of_opacity` [n] are those of x and A; `latent` are the density codes [n_densities].
     """
     n_channels, flat = values.shape[1], values.reshape(-1)
@@ -152,7 +194,7 @@ def slants(
                     row = rows[j, corner]
                     dot = np.float32(0)
                     for c in range(n_channels):
-                        dot += gradient[i, c] * np.rint(values[row, c])
+                        dot += gradient[i, c] * _shown(values[row, c])
                     along += shares[j, corner] * dot
                 out[j] = along
                 behind += weights[j] * along

@@ -35,7 +35,7 @@ from vfr_bake.baking.distillation import (
     corners,
     player_fetches,
 )
-from vfr_bake.baking.grids import code_step, encode_features, head_sensitivity, project
+from vfr_bake.baking.grids import code_step, head_sensitivity, latent, project, whole_codes
 from vfr_bake.baking.head import FoldedHead, fold_head
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.baking.refinement import (
@@ -52,6 +52,7 @@ from vfr_bake.baking.refinement import (
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.networks import Head
+from vfr_bake.kernels.stored_features import PARTS
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
@@ -121,9 +122,9 @@ def test_sensitivity_is_the_mean_square_of_finite_differences() -> None:
 def test_feature_codes_are_within_half_a_step(size: float) -> None:
     values = np.random.default_rng(0).normal(size=(1000, 3)) * np.array([size, 0, 0.1 * size])
     step = code_step(values)
-    codes = encode_features(values / step)
+    codes = whole_codes(latent(values / step))
     assert codes.dtype == np.int8 and np.abs(codes.astype(int)).max() == 127
-    assert (np.abs(codes * step - values) <= step * 0.5000001).all()
+    assert (np.abs(codes * step - values) <= step * (0.5000001 + 0.5 / PARTS)).all()
     assert np.abs(codes[:, 2].astype(int)).max() < 30, "a channel of little use takes few bits"
 
 
@@ -132,7 +133,7 @@ def test_the_few_largest_features_do_not_make_all_codes_coarse() -> None:
     values[:4] *= 1000
     step = code_step(values)
     assert step == pytest.approx(1 / 127, rel=1e-3)
-    assert np.abs(encode_features(values / step)[:4]).max() == 127, "they end there"
+    assert np.abs(whole_codes(latent(values / step))[:4]).max() == 127, "they end there"
     few = np.zeros((50_000, 2), np.float32)
     few[7, 1] = -5.0
     assert code_step(few) == pytest.approx(5 / 127), "there is nothing else"
@@ -198,7 +199,7 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
     with torch.no_grad():
         wanted = FoldedHead(weights)(codes, dirs).numpy()
     # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
-    baked = (codes * 0.8 + 10).numpy().round()
+    baked = latent((codes * 0.8 + 10).numpy().round())
     training_rays = training_rays_of(dirs.numpy(), wanted)
     stored = Stored(weights, baked, np.full(4000, 255, np.float32))
     opaque = (0.0, float(np.log(20)))  # of a sample of length 1 with the largest code
@@ -223,7 +224,7 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
     both = refine(own, training_rays, Steps(200, lambda *_: None), opaque, code_rate=4)
     assert error(both) < alone
     assert both.features is own.features, "moved where they are"
-    assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127
+    assert not np.array_equal(both.features, baked) and np.abs(both.features).max() <= 127 * PARTS
 
 
 def test_a_round_that_gains_nothing_leaves_what_was_stored(
@@ -234,13 +235,12 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
     density, features = stored.density.copy(), stored.features.copy()
-    assert np.abs(features - np.rint(features)).max() > 0.4, "codes that are not whole yet"
+    assert (features % PARTS).any(), "codes that are not whole yet"
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: False)
     tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
     left = tuning.run(stored, layout, teacher, again)
     np.testing.assert_array_equal(left.density, density)
-    np.testing.assert_array_equal(encode_features(left.features), encode_features(features))
-    assert np.abs(left.features - features).max() < 0.005, "a 256th of a code, and float32"
+    np.testing.assert_array_equal(left.features, features)
     assert left.head is stored.head
     assert tuning.kept.name == "k", "not a round that was given up"
 
@@ -270,9 +270,10 @@ def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: p
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
     density, features = stored.density.copy(), stored.features.copy()
+    farther = latent(features / PARTS + 2)
 
     def moved(stored: Stored, *_: object) -> Stored:
-        stored.features[:] = np.clip(features + 2, -127, 127)
+        stored.features[:] = farther
         output, bias = stored.head.output
         return Stored(replace(stored.head, output=(output, bias + 1)), stored.features, density + 4)
 
@@ -284,8 +285,7 @@ def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: p
     left = tuning.run(stored, layout, teacher, again)
     assert "half" in tuning.left_out["refinement"]
     np.testing.assert_allclose(left.density, density + 2)
-    expected = (features + np.clip(features + 2, -127, 127)) / 2
-    assert np.abs(left.features - expected).max() < 0.01
+    assert np.abs(left.features - (features + farther.astype(int)) / 2).max() <= 0.5
     np.testing.assert_allclose(left.head.output[1], before.output[1] + 0.5)
     np.testing.assert_array_equal(left.head.spatial[0][0], before.spatial[0][0])
 
@@ -324,7 +324,7 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, n_fetche
     nothing = np.zeros_like(rays_o)
     teacher = TeacherRays(rays_o, rays_d, nothing, nothing[:, 0])
     training_rays = collect_training_rays(teacher, grid, n_fetches)
-    composed, opacity = training_rays.composed(grid.features.astype(np.float32))
+    composed, opacity = training_rays.composed(latent(grid.features))
     # float32 sums of up to 127 in another order
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
     assert np.array_equal(opacity, found.opacity)

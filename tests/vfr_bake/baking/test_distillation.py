@@ -10,6 +10,7 @@ import pytest
 from player.errors import TrainingError
 from tests.numerics.fog import FEATURE, fog
 from vfr_bake.baking.distillation import TeacherRays, collect_training_rays
+from vfr_bake.baking.grids import latent
 
 ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
 """Where rays along x begin that meet the box, and that pass it."""
@@ -44,11 +45,11 @@ def test_training_rays_are_those_that_meet_something(
     fetches = training_rays.fetches(np.array([2, 0, 2, 1]))
     counts = np.diff(fetches.starts)
     assert len(counts) == 4 and ((counts == n_fetches).all() if n_fetches else (counts > 60).all())
-    composed, opacity = training_rays.composed(grid.features.astype(np.float32))
+    composed, opacity = training_rays.composed(latent(grid.features))
     np.testing.assert_allclose(composed[:, 0], FEATURE * opacity, rtol=1e-5)
     assert np.array_equal(fetches.opacity, opacity[[2, 0, 2, 1]])
     one = collect_training_rays(teacher_rays([ALONG]), grid, n_fetches)
-    assert len(one) == 1 and np.array_equal(one.composed(grid.features.astype(np.float32))[0], composed[:1])
+    assert len(one) == 1 and np.array_equal(one.composed(latent(grid.features))[0], composed[:1])
 
 
 def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,11 +57,11 @@ def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 100)
     monkeypatch.setattr("player.compiled.samples.MOST_AT_ONCE", 1)
     rays, grid = teacher_rays([ALONG] * 3000), fog(0.1)
-    collect_training_rays(rays.some(100), grid, 0).composed(grid.features.astype(np.float32))  # compiles
+    collect_training_rays(rays.some(100), grid, 0).composed(latent(grid.features))  # compiles
     tracemalloc.start()
     try:
         held = collect_training_rays(rays, grid, 0)
-        composed, _ = held.composed(grid.features.astype(np.float32))
+        composed, _ = held.composed(latent(grid.features))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -10,7 +10,7 @@ import pytest
 from player.render import choose_march
 from vfr_bake.baking.cells import Resolutions, occupied_cells
 from vfr_bake.baking.distillation import FIELD_RAYS_AT_ONCE, with_field_features
-from vfr_bake.baking.grids import evaluate_densities, evaluate_features, make_layout
+from vfr_bake.baking.grids import evaluate_densities, make_layout, unit_points
 from vfr_bake.training.model_file import Model
 
 
@@ -19,8 +19,8 @@ def quiet(done: int, of: int) -> None: ...
 
 def test_they_are_those_of_a_grid_that_holds_them_all(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     layout = make_layout(occupied_cells(model, 40), model.occupancy.step, Resolutions(64, 40))
-    every = evaluate_features(model, layout, np.eye(model.field.config.n_channels), quiet)
-    grid = layout.grid(evaluate_densities(model, layout, quiet), np.zeros((len(every), 1), np.float32))
+    every = model.field.features(unit_points(layout.features.index, 40, contracted=False))
+    grid = layout.grid(evaluate_densities(model, layout, quiet), np.zeros((len(every), 1), np.int16))
     rays_o, rays_d = model.model_cameras()[0].rays()
     march = choose_march("numba")[1].march
     wanted = march(replace(grid, features=every), rays_o, rays_d, 0)

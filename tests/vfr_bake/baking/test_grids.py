@@ -12,10 +12,11 @@ from vfr_bake.baking.cells import Resolutions, corners_of, occupied_cells, subdi
 from vfr_bake.baking.grids import (
     _corners,
     evaluate_densities,
-    evaluate_features,
+    latent_features,
     make_layout,
     unit_points,
 )
+from vfr_bake.kernels.stored_features import PARTS
 from vfr_bake.training.model_file import Model
 
 COARSE = 40
@@ -54,9 +55,9 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
 def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
     layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, Resolutions(64, COARSE))
     matrix = np.random.default_rng(0).normal(size=(3, model.field.config.n_channels))
-    features = evaluate_features(model, layout, matrix, quiet)
+    features = latent_features(model, layout, matrix, quiet) / PARTS
     points = unit_points(layout.features.index, COARSE, contracted=False)
-    np.testing.assert_allclose(features, model.field.features(points) @ matrix.T, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(features, model.field.features(points) @ matrix.T, rtol=0, atol=0.51 / PARTS)
     stored, random = set(map(tuple, layout.features.index.tolist())), np.random.default_rng(0)
     places = layout.densities.index * (COARSE / 64)
     places += random.uniform(-0.3, 0.3, places.shape)

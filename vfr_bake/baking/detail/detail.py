@@ -35,7 +35,7 @@ from vfr_bake.baking.detail.shown import (
     wanted_values,
 )
 from vfr_bake.baking.distillation import TeacherRays
-from vfr_bake.baking.grids import Layout, encode_features
+from vfr_bake.baking.grids import Layout, whole_codes
 from vfr_bake.baking.held_out import Head, HeldOut, Shown, Stage
 from vfr_bake.training.length.witness_loss import Loss
 
@@ -62,7 +62,7 @@ class Levels:
     dropped: list[np.ndarray]
     """The bricks of each level that are dropped, as in `Choice.dropped`."""
     values: list[np.ndarray]
-    """For each level [n_vertices, n_channels] float32, the finest first."""
+    """For each level [n_vertices, n_channels] int16 latent features, the finest first."""
 
 
 @dataclass(eq=False)
@@ -74,21 +74,19 @@ class Needed:
     density: np.ndarray
     """[n_densities] float32 codes of all vertices of the finest level."""
     features: np.ndarray
-    """[n_features, n_channels] float32, the same."""
+    """[n_features, n_channels] int16 latent features, the same."""
     wanted_densities: Wanted
     """What of the densities is shown, and what it should be."""
     levels_of_features: Levels
 
     def take_features(self) -> Wanted:
-        """The same of the features, in float16, which is off by 0.03 of a code at most. It takes the place of
-        `features` and of `levels_of_features`, because there may be no room for them all."""
+        """The same of the features. It takes the place of `features` and of `levels_of_features`, because
+        there may be no room for them all."""
         levels = self.levels_of_features
         shown = levels.choice.shown(levels.dropped)
         wanted = wanted_values(levels.choice, levels.values, shown, sampled=False)
         self.features = self.features[:0].copy()
         levels.values.clear()
-        for level in range(len(wanted.values)):
-            wanted.values[level] = wanted.values[level].astype(np.float16)
         return wanted
 
 
@@ -119,7 +117,7 @@ class Detail:
         Args:
             layout: the finest level.
             density: [n_densities] codes that need not be whole.
-            features: [n_features, n_channels] the same, changed in place.
+            features: [n_features, n_channels] int16 latent features, changed in place.
             cameras: views, model frame, that tell what is seen; without any, every cell is stored.
             teacher: rays of such views.
         """
@@ -205,11 +203,12 @@ class Detail:
         n_levels = min(len(pyramid.levels), COARSEST_SHOWN + 1)
         ends = np.cumsum([vertices.n for vertices in pyramid.vertices[:n_levels]])
         codes = np.empty((ends[-1], features.shape[1]), np.int8)
-        codes[: ends[0]] = encode_features(features)
+        codes[: ends[0]] = whole_codes(features)
         heavy = heavy_vertices(levels_of_features(grid, pyramid, codes, 1), int(ends[0]), rays)
         values = mean_values(pyramid, features, heavy)
+        values[1:] = [np.rint(of_level).astype(np.int16) for of_level in values[1:]]
         for level, (first, end) in enumerate(pairwise(ends), start=1):
-            codes[first:end] = encode_features(values[level])
+            codes[first:end] = whole_codes(values[level])
         levels = levels_of_features(grid, pyramid, codes, n_levels)
         choice = Choice(pyramid, tuple(feature_errors(levels, rays)))
         return Levels(choice, self._shown(choice, levels, FEATURE_LOSS, "features' detail"), values)

@@ -42,7 +42,7 @@ _NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 
 
 def mean_values(pyramid: Pyramid, finest: np.ndarray, heavy: np.ndarray) -> list[np.ndarray]:
-    """The values of all levels, [n_vertices, n_channels] float32 each, the finest first.
+    """The values of all levels, [n_vertices, n_channels] each, the finest first and the others as float32.
 
     Args:
         pyramid: of a finest level and what lies beneath.
@@ -171,7 +171,7 @@ class Wanted(NamedTuple):
     pyramid: Pyramid
     """The cells that are left."""
     values: list[np.ndarray]
-    """For each level [n_vertices, n_channels] float32 or float16."""
+    """For each level [n_vertices, n_channels]: codes as floats, or latent features as int16."""
 
 
 def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, sampled: bool) -> Wanted:

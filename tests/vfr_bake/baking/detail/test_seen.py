@@ -13,6 +13,7 @@ from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, thinned
 from vfr_bake.baking.detail.shown import take_rows
 from vfr_bake.baking.grids import Layout, make_layout
 from vfr_bake.data.demo import demo_cameras
+from vfr_bake.kernels.stored_features import PARTS
 
 
 def quiet(*_: object) -> None:
@@ -33,7 +34,7 @@ def test_block_weights_are_those_of_the_march_summed(contracted: bool) -> None:
     random = np.random.default_rng(0)
     layout = layout_of(random.random((10, 10, 10)) < 0.4, 40, 40, contracted)
     codes = random.uniform(0, 200, len(layout.densities)).astype(np.float32)
-    grid = layout.grid(codes, np.zeros((len(layout.features), 1)))
+    grid = layout.grid(codes, np.zeros((len(layout.features), 1), np.int16))
     cameras = views(3)
     found = block_weights(grid, cameras, 10**9, quiet)
     expected = np.zeros(found.shape)
@@ -70,7 +71,9 @@ def test_fog_that_nobody_saw_is_left_out() -> None:
     layout = layout_of(radius < 0.4, 64, 48)
     away = np.linalg.norm(layout.densities.index / 64 - 0.5, axis=1)
     density = np.where(away > 0.3, 255, 120).astype(np.float32)
-    features = np.random.default_rng(2).integers(-9, 9, (len(layout.features), 2)).astype(np.float32)
+    features = (
+        np.random.default_rng(2).integers(-9 * PARTS, 9 * PARTS, (len(layout.features), 2)).astype(np.int16)
+    )
     grid = layout.grid(density, features)
     weights = block_weights(grid, views(12), 10**6, quiet)
     left = thinned(layout, heavy_blocks(weights, 0.0))

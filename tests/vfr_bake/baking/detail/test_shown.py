@@ -23,7 +23,7 @@ from vfr_bake.baking.detail.errors import (
 from vfr_bake.baking.detail.search import largest
 from vfr_bake.baking.detail.shown import Choice, Wanted, mean_values, wanted_values
 from vfr_bake.baking.distillation import TeacherRays
-from vfr_bake.baking.grids import Layout, encode_features
+from vfr_bake.baking.grids import Layout, latent
 from vfr_bake.baking.rate import Choices
 from vfr_bake.training.length.witness_loss import Loss
 
@@ -51,9 +51,9 @@ def test_the_error_of_a_feature_brick_is_what_the_march_shows_differently(
 ) -> None:
     layout, random = some_layout(3, features, contracted), np.random.default_rng(4)
     codes = random.integers(-90, 90, (len(layout.features), 3)).astype(np.int8)
-    grid = layout.grid(faint(layout, 5)[:, 0], codes)
+    grid = layout.grid(faint(layout, 5)[:, 0], latent(codes))
     pyramid, rays = pyramid_beneath(layout.features.pyramid), rays_of(2)
-    values = [encode_features(v) for v in mean_values(pyramid, codes, np.ones(len(codes)))]
+    values = [np.rint(v).astype(np.int8) for v in mean_values(pyramid, codes, np.ones(len(codes)))]
     levels = levels_of_features(grid, pyramid, np.concatenate(values[:3]), 3)
     errors = feature_errors(levels, rays)
     assert errors.shape == (3, len(pyramid.levels[0])) and not errors[0].any()
@@ -78,7 +78,7 @@ def test_the_error_of_a_feature_brick_is_what_the_march_shows_differently(
 def test_the_error_of_a_density_brick_is_that_of_its_segments(contracted: bool) -> None:
     layout, rays = some_layout(6, 40, contracted), rays_of(2)
     codes = faint(layout, 7)
-    grid = layout.grid(codes[:, 0], np.zeros((len(layout.features), 1)))
+    grid = layout.grid(codes[:, 0], np.zeros((len(layout.features), 1), np.int16))
     pyramid = pyramid_beneath(layout.densities.pyramid)
     values = [np.rint(v).astype(np.uint8) for v in mean_values(pyramid, codes, np.ones(len(codes)))]
     levels = levels_of_densities(grid, pyramid, values[:3])

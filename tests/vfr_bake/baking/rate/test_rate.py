@@ -16,6 +16,7 @@ from vfr_bake.baking import bake
 from vfr_bake.baking.coarser_levels import pyramid_beneath
 from vfr_bake.baking.detail.shown import Wanted, mean_values
 from vfr_bake.baking.distillation import collect_training_rays
+from vfr_bake.baking.grids import latent, whole_codes
 from vfr_bake.baking.head import runner
 from vfr_bake.baking.rate import (
     AROUND,
@@ -225,14 +226,14 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
         rgb = head(composed, rays.teacher.rays_d).astype(np.float64) - model.background
         return rgb * opacity[:, None]
 
-    some = np.argsort(found.features)[-400::40]
-    changes, base = [], colours(np.rint(stored.features))
+    some, codes = np.argsort(found.features)[-400::40], whole_codes(stored.features)
+    changes, base = [], colours(latent(codes))
     for row in some:
         total = 0.0
         for channel in range(stored.features.shape[1]):
-            moved = np.rint(stored.features)
+            moved = codes.copy()
             moved[row, channel] += 1
-            total += float(((colours(moved) - base) ** 2).mean())
+            total += float(((colours(latent(moved)) - base) ** 2).mean())
         changes.append(total)
     # Signs are random: a vertex that some hundred rays meet is known within a fifth, all together better.
     assert found.features[some].sum() == pytest.approx(np.sum(changes), rel=0.2)
