@@ -208,11 +208,7 @@ class _Bake:
             )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        most, room = plan.most_cells, f"{self.config.max_memory:g} GB of memory"
-        if self.config.max_mb is not None:
-            in_bytes = cells_that_fit(self.config.max_mb, self._other_bytes(self.config.max_mb))
-            if in_bytes < most:
-                most, room = in_bytes, f"{self.config.max_mb:g} MB"
+        most, room = min(self._room_for_cells())
         fitted = fit_cells(visible, plan.resolutions, most)
         unbounded, resolutions = model.field.config.unbounded, fitted.resolutions
         if resolutions != plan.resolutions:
@@ -225,6 +221,15 @@ class _Bake:
         near = 0.0 if isinstance(model.sampler, OccupancyGrid) else model.sampler.near
         layout = make_layout(fitted.cells, step, resolutions, unbounded, near, self.choice.density_step)
         return layout, plan.n_rays(fitted.n_cells)
+
+    def _room_for_cells(self) -> Iterator[tuple[int, str]]:
+        """How many cells of the features fit, and into what."""
+        config, choice, plan = self.config, self.choice, self.plan
+        yield plan.most_cells, f"{config.max_memory:g} GB of memory"
+        if config.max_mb is not None:
+            yield cells_that_fit(config.max_mb, self._other_bytes(config.max_mb)), f"{config.max_mb:g} MB"
+        if plan.page_cells is not None:
+            yield plan.page_cells, f"a page that takes {choice.page_mb:g} MB of graphics memory"
 
     def _mesh(self, asset: Asset, sizes: dict[str, int]) -> tuple[TriangleMesh, Removed]:
         """The mesh of an asset that has everything else, whose files have these sizes."""

@@ -25,6 +25,9 @@ MANIFEST_BYTES = 20_000
 CELL_BYTES = 0.1
 """Bytes that a stored cell of the features takes at least, with its densities: where there are fewer for
 each, coarser grids show more."""
+PAGE_CHANNEL_BYTES, PAGE_INDEX_BYTES, PAGE_DENSITY_BYTES = 1.8, 19, 13
+"""Bytes of graphics memory that a page takes for each cell of the features: for a channel, whose vertices lie
+in more than one brick; to find them; and for a density. A capture's takes 6 % less."""
 FEWEST_CELLS = 4096
 """Cells that an asset has in any case: with fewer it shows nothing."""
 SIZE = 800
@@ -50,6 +53,17 @@ def cells_that_fit(max_mb: float, others: int) -> int:
     26800000
     """
     return max(int((max_mb * 1e6 - others - MANIFEST_BYTES) / CELL_BYTES), FEWEST_CELLS)
+
+
+def cells_of_page(page_mb: float, n_channels: int, densities_per_cell: float) -> int:
+    """How many cells of the features may be stored if a page of the asset is to take no more than `page_mb`
+    megabytes of graphics memory, roughly.
+
+    >>> cells_of_page(512, 24, 1.0)
+    6808510
+    """
+    of_features = PAGE_CHANNEL_BYTES * 4 * -(-n_channels // 4) + PAGE_INDEX_BYTES
+    return max(int(page_mb * 1e6 / (of_features + PAGE_DENSITY_BYTES * densities_per_cell)), FEWEST_CELLS)
 
 
 def file_sizes(folder: Path) -> dict[str, int]:

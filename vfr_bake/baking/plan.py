@@ -24,6 +24,7 @@ from vfr_bake.baking.cells import (
 )
 from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import BETWEEN
+from vfr_bake.baking.limits import cells_of_page
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
@@ -91,6 +92,8 @@ class Plan:
     """Bytes for cells and rays."""
     marks: float
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
+    page_cells: int | None
+    """Cells that fit into a page of the asset; None where the resolution was given."""
 
     @property
     def ray_bytes(self) -> int:
@@ -126,11 +129,15 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     resolutions = _resolutions(model, config)
     fine, coarse = resolutions
     marks = _marks_bytes(model, config) * coarse**3
-    cell_bytes = CHANNEL_BYTES * min(choice.n_channels, field.n_channels) + 60
+    n_channels = min(choice.n_channels, field.n_channels)
+    cell_bytes = CHANNEL_BYTES * n_channels + 60
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
     room = config.max_memory * 1e9 - PROGRAM_BYTES
-    plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks)
-    plan = replace(plan, n_cells=min(plan.n_cells, float(max(plan.most_cells, 0))))
+    given = config.resolution or config.feature_resolution
+    page_cells = None if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
+    plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks, page_cells)
+    fit = max(plan.most_cells, 0) if page_cells is None else min(max(plan.most_cells, 0), page_cells)
+    plan = replace(plan, n_cells=min(plan.n_cells, float(fit)))
     if plan.most_cells <= 0 or marks > room:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(

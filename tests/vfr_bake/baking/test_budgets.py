@@ -14,8 +14,9 @@ import pytest
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.errors import ConfigError, TrainingError
+from player.page.gpu_memory import TILE, gpu_bytes
 from vfr_bake.baking import mesh as baked_mesh
-from vfr_bake.baking.bake import bake
+from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import file_sizes, keep_to_time
@@ -259,3 +260,24 @@ def test_the_mesh_is_at_most_a_tenth_of_the_asset(
     assert len(read_ply(tmp_path / "asset" / "mesh.ply").faces) == result.figures["mesh_faces"]
     assert asset.manifest.provenance["baked"]["mesh_faces"] == result.figures["mesh_faces"]
     assert result.seconds >= result.figures["time"]["mesh"] > 0
+
+
+def test_a_grid_is_as_coarse_as_a_page_of_it_has_to_be(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Roughly: shells have more bricks for their cells than the fog of a capture."""
+
+    def page_mb_of(allowed: float) -> float:
+        monkeypatch.setitem(PRESETS, "balanced", replace(PRESETS["balanced"], page_mb=allowed))
+        work = _Bake(model, BakeConfig(check_views=1), quiet)
+        layout, _ = work._cells()
+        said = f"a page that takes {allowed:g} MB" in work.left_out.get("resolution", "")
+        assert said == (allowed < 512)
+        assert work.plan.page_cells is not None and work.plan.n_cells <= work.plan.page_cells
+        n_channels = work.choice.n_channels
+        codes = np.zeros(len(layout.densities)), np.zeros((len(layout.features), n_channels), np.int16)
+        tile = TILE * TILE * (16 * -(-n_channels // 8) + 12)
+        return (gpu_bytes(SimpleNamespace(grid=layout.grid(*codes))) - tile) / 1e6
+
+    whole = page_mb_of(512)
+    for share in (0.3, 0.15):
+        assert page_mb_of(share * whole) < 1.25 * share * whole
+    assert make_plan(model, BakeConfig(resolution=48)).page_cells is None, "it was asked for"
