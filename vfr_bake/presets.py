@@ -57,9 +57,9 @@ class BakeChoice:
     target_loss_db: float
     """Loss that the preset aims at, dB."""
     page_mb: float
-    """Graphics memory that a page of the grids may take before any detail is dropped, MB, roughly: they are as
-    fine as fits, unless their resolution was given. The phone's pages are to take half of it: more than half
-    of its features' detail is dropped."""
+    """Graphics memory that a page of the grids may take before any detail is dropped, MB, roughly: they are
+    as fine as fits, unless their resolution was given. The phone's pages are to take half of it: more than
+    half of its features' detail is dropped."""
 
 
 PRESETS: dict[Preset, BakeChoice] = {
