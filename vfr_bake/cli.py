@@ -353,8 +353,8 @@ def _bake(options: Any) -> int:
     fine, coarse = plan.resolutions
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes and {plan.n_bytes / 1e9:.1f} GB of memory "
-        f"({options.config.max_memory:g} GB at most), densities on {fine} cells per axis and features on "
-        f"{coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
+        f"({options.config.max_memory:g} GB at most), densities on at most {fine} cells per axis and "
+        f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )
     prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # at its end the bake plays the asset
