@@ -228,8 +228,8 @@ class _Bake:
         yield plan.most_cells, f"{config.max_memory:g} GB of memory"
         if config.max_mb is not None:
             yield cells_that_fit(config.max_mb, self._other_bytes(config.max_mb)), f"{config.max_mb:g} MB"
-        if plan.page_cells is not None:
-            yield plan.page_cells, f"a page that takes {choice.page_mb:g} MB of graphics memory"
+        if np.isfinite(plan.page_cells):
+            yield int(plan.page_cells), f"a page that takes {choice.page_mb:g} MB of graphics memory"
 
     def _mesh(self, asset: Asset, sizes: dict[str, int]) -> tuple[TriangleMesh, Removed]:
         """The mesh of an asset that has everything else, whose files have these sizes."""
@@ -257,9 +257,9 @@ class _Bake:
             features = latent_features(model, layout, matrix, self._progress("features"))
             first = model.field.head.first_weights().astype(np.float64)
             head = fold_head(model.field.head, first @ projection.back * step)
-            played = held_out.march(grid := layout.grid(density, features), 0)
+            grid = layout.grid(density, features)
+            played = held_out.march(grid, 0)
             own = with_field_features(model, layout, grid, held_out.rays_o, held_out.rays_d, played)
-            del grid
             held_out.measure_march("grid", own, runner(fold_head(model.field.head, first)))
             projected = (own.features @ matrix.T).astype(np.float32)
             held_out.measure_march("rank", own._replace(features=projected), runner(head))

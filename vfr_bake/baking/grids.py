@@ -15,7 +15,7 @@ S = M^(1/2) and U holds the first r eigenvectors of S G S (Eckart-Young).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels.stored_features import PARTS, PARTS_BITS, table
+from vfr_bake.kernels.stored_features import LARGEST_LATENT, PARTS, PARTS_BITS, table
 from vfr_bake.training.model_file import Model
 
 SLAB = 64
@@ -45,8 +45,6 @@ FAR = 30.0
 times the square of the distance far away. The smallest density code is invisible even at this distance."""
 ROWS_AT_ONCE = 1 << 18
 """Vertices whose codes are rounded at once."""
-LARGEST_CODE = 127
-"""Largest magnitude of a feature's code."""
 FAR_OUT, N_RANKED = 1e-4, 250_000
 """Share of the vertices whose features may have larger codes than was asked for, and vertices that decide it.
 The largest of ten million of a room was 2.5 times as large as all but a ten thousandth."""
@@ -190,13 +188,9 @@ def some_features(model: Model, layout: Layout, matrix: np.ndarray) -> np.ndarra
     """[n, n_stored] float32: the field's features times `matrix` [n_stored, n_channels] at N_RANKED of the
     vertices, spread evenly, or at all where there are no more."""
     vertices = layout.features
-    index = vertices.index[:: -(-len(vertices) // N_RANKED)] if len(vertices) else vertices.index
-    some = replace(vertices, index=index)
-    parts = [
-        model.field.features(points) @ matrix.T.astype(np.float32)
-        for _, points in _chunks(some, layout.contracted)
-    ]
-    return np.concatenate([np.zeros((0, len(matrix)), np.float32), *parts])
+    index = vertices.index[:: max(-(-len(vertices) // N_RANKED), 1)]
+    points = unit_points(index, vertices.resolution, layout.contracted)
+    return model.field.features(points) @ matrix.T.astype(np.float32)
 
 
 def latent_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
@@ -217,8 +211,8 @@ def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts
 
 
 def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
-    for start in range(0, len(vertices.index), VERTEX_CHUNK):
-        rows = slice(start, min(start + VERTEX_CHUNK, len(vertices.index)))
+    for start in range(0, len(vertices), VERTEX_CHUNK):
+        rows = slice(start, min(start + VERTEX_CHUNK, len(vertices)))
         yield rows, unit_points(vertices.index[rows], vertices.resolution, contracted)
 
 
@@ -316,12 +310,14 @@ def code_step(values: np.ndarray, levels: int = 127) -> float:
 
 def latent(values: np.ndarray) -> np.ndarray:
     """Codes that need not be whole as latent features, int16 in parts of a code
-    (`vfr_bake.kernels.stored_features`); they end at 127.
+    (`vfr_bake.kernels.stored_features`), rounded down, so that `whole_codes` finds the nearest code; they end
+    at 127.
 
     >>> latent(np.array([1.25, -3.5, 200.0])).tolist()
     [320, -896, 32512]
     """
-    return np.rint(np.clip(values, -LARGEST_CODE, LARGEST_CODE) * np.float32(PARTS)).astype(np.int16)
+    parts = np.floor(values * np.float32(PARTS))
+    return np.clip(parts, -LARGEST_LATENT, LARGEST_LATENT).astype(np.int16)
 
 
 def codes(values: np.ndarray) -> np.ndarray:
@@ -348,12 +344,9 @@ def whole_codes(features: np.ndarray) -> np.ndarray:
 
 
 def remainders(features: np.ndarray) -> np.ndarray:
-    """What `whole_codes` rounds away of latent features [n_vertices, n_stored], as signed bytes."""
-    left = np.empty(features.shape, np.int8)
-    for first in range(0, len(features), ROWS_AT_ONCE):
-        rows = slice(first, first + ROWS_AT_ONCE)
-        left[rows] = features[rows] - (((features[rows] + np.int16(PARTS // 2)) >> PARTS_BITS) << PARTS_BITS)
-    return left
+    """What `whole_codes` rounds away of latent features [n_vertices, n_stored], as signed bytes: their low
+    bytes."""
+    return features.astype(np.int8)
 
 
 def with_remainders(whole: np.ndarray, left: np.ndarray) -> Parts:

@@ -92,8 +92,8 @@ class Plan:
     """Bytes for cells and rays."""
     marks: float
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
-    page_cells: int | None
-    """Cells that fit into a page of the asset; None where the resolution was given."""
+    page_cells: float
+    """Cells that fit into a page of the asset; infinitely many where the resolution was given."""
 
     @property
     def ray_bytes(self) -> int:
@@ -134,10 +134,9 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     given = config.resolution or config.feature_resolution
-    page_cells = None if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
+    page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
     plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks, page_cells)
-    fit = max(plan.most_cells, 0) if page_cells is None else min(max(plan.most_cells, 0), page_cells)
-    plan = replace(plan, n_cells=min(plan.n_cells, float(fit)))
+    plan = replace(plan, n_cells=min(plan.n_cells, max(plan.most_cells, 0), page_cells))
     if plan.most_cells <= 0 or marks > room:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(

@@ -54,9 +54,13 @@ def table(n_rows: int, n_columns: int) -> np.ndarray:
 
 
 def _shown(value: Any) -> float:
-    """What is composed of a stored value: a latent feature rounded to a whole code, ties upwards; a code or a
-    float as it is."""
-    raise NotImplementedError("compiled code alone calls this")
+    """What is composed of a stored value: a latent feature, int16, rounded to a whole code, ties upwards; a
+    code or a float as it is.
+
+    >>> [float(_shown(np.int16(parts))) for parts in (127, 128, -128, -129)], _shown(np.int8(7))
+    ([0.0, 1.0, 0.0, -1.0], np.int8(7))
+    """
+    return np.floor(value / PARTS + 0.5) if isinstance(value, np.int16) else value
 
 
 @overload(_shown, strict=False)  # it compares annotations, too

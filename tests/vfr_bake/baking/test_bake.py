@@ -124,7 +124,7 @@ def test_feature_codes_are_within_half_a_step(size: float) -> None:
     step = code_step(values)
     codes = whole_codes(latent(values / step))
     assert codes.dtype == np.int8 and np.abs(codes.astype(int)).max() == 127
-    assert (np.abs(codes * step - values) <= step * (0.5000001 + 0.5 / PARTS)).all()
+    assert (np.abs(codes * step - values) <= step * 0.5000001).all()
     assert np.abs(codes[:, 2].astype(int)).max() < 30, "a channel of little use takes few bits"
 
 

@@ -55,7 +55,7 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
 def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
     layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, Resolutions(64, COARSE))
     matrix = np.random.default_rng(0).normal(size=(3, model.field.config.n_channels))
-    features = latent_features(model, layout, matrix, quiet) / PARTS
+    features = (latent_features(model, layout, matrix, quiet) + 0.5) / PARTS  # they are rounded down
     points = unit_points(layout.features.index, COARSE, contracted=False)
     np.testing.assert_allclose(features, model.field.features(points) @ matrix.T, rtol=0, atol=0.51 / PARTS)
     stored, random = set(map(tuple, layout.features.index.tolist())), np.random.default_rng(0)
