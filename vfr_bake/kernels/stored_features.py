@@ -60,7 +60,7 @@ def _shown(value: Any) -> float:
     >>> [float(_shown(np.int16(parts))) for parts in (127, 128, -128, -129)], _shown(np.int8(7))
     ([0.0, 1.0, 0.0, -1.0], np.int8(7))
     """
-    return np.floor(value / PARTS + 0.5) if isinstance(value, np.int16) else value
+    return np.floor(value / PARTS + 0.5) if value.dtype == np.int16 else value
 
 
 @overload(_shown, strict=False)  # it compares annotations, too
