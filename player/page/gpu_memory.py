@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from player.asset.asset import Asset
 from player.errors import FormatError
 
 DENSITY_BRICK = (8, 8, 10)
 """Texels of a brick of densities: 8 x 8 columns of four vertices each, and which cells are live."""
-INDEX_BRICK = (8, 8, 9)
-"""Texels of a brick that finds rows of features."""
+COLUMN_BRICK = (9, 8, 1)
+"""Texels of a brick that finds rows of features, of four numbers of 32 bits."""
 MOST_LAYERS = 25
 """Bricks above each other in a texture."""
 MOST_BRICKS = MOST_LAYERS * 256**2
 WIDTH = 2048
 """Texels of a line of features, at most."""
 LINES_A_LAYER = 256
+MOST_LAYERS_OF_FEATURES = 256
 MOST_ROWS = 2**24
 TILE = 256
 """Pixels along a side of what is drawn at a time."""
@@ -35,13 +34,13 @@ def gpu_bytes(asset: Asset) -> int:
 
     Raises FormatError: one of its arrays is larger than any texture.
     """
-    grid, stored = asset.grid, asset.grid.rows.rows
-    cubes = 4 * grid.n_per_axis**3 + 8 * grid.rows.n_per_axis**3
+    grid = asset.grid
+    cubes = 4 * (grid.n_per_axis**3 + grid.rows.n_per_axis**3)
     density = 4 * block_texels(len(grid.slot_coords), DENSITY_BRICK)
-    indices = 8 * block_texels(len(stored) // 729, INDEX_BRICK)
-    features = feature_bytes(int(np.count_nonzero(stored >= 0)), grid.n_channels)
+    columns = 16 * block_texels(len(grid.rows.rows) // 729, COLUMN_BRICK)
+    features = feature_bytes(len(grid.features), grid.n_channels)
     tile = TILE * TILE * (16 * -(-grid.n_channels // 8) + 8 + 4)
-    return cubes + density + indices + features + tile
+    return cubes + density + columns + features + tile
 
 
 def block_texels(n: int, brick: tuple[int, int, int]) -> int:
@@ -63,10 +62,11 @@ def feature_bytes(n: int, n_channels: int) -> int:
     >>> feature_bytes(0, 12), feature_bytes(512 * 256 + 1, 12) == 2 * 512 * 256 * 12
     (6144, True)
     """
-    if n > MOST_ROWS:
-        raise FormatError(f"graphics memory: expected at most {MOST_ROWS} rows of features, got {n}")
     words = -(-n_channels // 4)
     per_line = 2 ** math.floor(math.log2(WIDTH / words))
+    most = min(MOST_ROWS, per_line * LINES_A_LAYER * MOST_LAYERS_OF_FEATURES)
+    if n > most:
+        raise FormatError(f"graphics memory: expected at most {most} rows of features, got {n}")
     lines = max(-(-n // per_line), 1)
     layers = -(-lines // LINES_A_LAYER)
     return 4 * words * per_line * min(lines, LINES_A_LAYER) * layers

@@ -25,9 +25,9 @@ MANIFEST_BYTES = 20_000
 CELL_BYTES = 0.1
 """Bytes that a stored cell of the features takes at least, with its densities: where there are fewer for
 each, coarser grids show more."""
-PAGE_CHANNEL_BYTES, PAGE_INDEX_BYTES, PAGE_DENSITY_BYTES = 1.8, 19, 13
-"""Bytes of graphics memory that a page takes for each cell of the features: for a channel, whose vertices lie
-in more than one brick; to find them; and for a density. A capture's takes 6 % less."""
+PAGE_CHANNEL_BYTES, PAGE_COLUMN_BYTES, PAGE_DENSITY_BYTES = 1.4, 5, 13
+"""Bytes of graphics memory that a page takes for each cell of the features, roughly: for a channel, because
+there are more vertices than cells; to find them; and for a density."""
 FEWEST_CELLS = 4096
 """Cells that an asset has in any case: with fewer it shows nothing."""
 SIZE = 800
@@ -60,9 +60,9 @@ def cells_of_page(page_mb: float, n_channels: int, densities_per_cell: float) ->
     megabytes of graphics memory, roughly.
 
     >>> cells_of_page(512, 24, 1.0)
-    6808510
+    9922480
     """
-    of_features = PAGE_CHANNEL_BYTES * 4 * -(-n_channels // 4) + PAGE_INDEX_BYTES
+    of_features = PAGE_CHANNEL_BYTES * 4 * -(-n_channels // 4) + PAGE_COLUMN_BYTES
     return max(int(page_mb * 1e6 / (of_features + PAGE_DENSITY_BYTES * densities_per_cell)), FEWEST_CELLS)
 
 

@@ -13,27 +13,43 @@ void addRow(int row, float share) {
   ADD_ROW
 }
 
+// How many of the lowest eight bits are set.
+ivec4 nSet(uvec4 bits) {
+  bits -= (bits >> 1) & 0x55u;
+  bits = (bits & 0x33u) + ((bits >> 2) & 0x33u);
+  return ivec4((bits + (bits >> 4)) & 15u);
+}
+
 // Adds the features at a place, in cells of the densities' grid; false where too little is stored.
 bool addFeatures(vec3 g, float weight) {
   g = clamp(g * uFeatureScale, vec3(0), vec3(uFeatureResolution));
   vec3 cell = min(floor(g), vec3(uFeatureResolution - 1));
   ivec4 owner = ownerAt(ivec3(cell * 0.125));
-  if (owner.y >= 65280) return false; // there is none
-  int level = int(float(owner.y) * (1.0 / 256.0)), first = owner.z + owner.w * 65536;
-  float scale = 1.0 / float(1 << level);
+  if (owner.w == NO_LEVEL) return false;
+  float scale = 1.0 / float(1 << owner.w);
   vec3 own = floor(cell * scale), share = g * scale - own;
-  ivec3 at = ivec3(owner.x & 255, int(float(owner.x) * (1.0 / 256.0)), owner.y & 255) * ivec3(8, 8, 9) + (ivec3(own) & 7);
-  ivec4 low = indicesAt(at), high = indicesAt(at + ivec3(0, 0, 1)); // the corners (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1)
+  ivec3 local = ivec3(own) & 7, at = owner.xyz * ivec3(9, 8, 1) + ivec3(local.xy, 0);
+  uvec4 near = columnsAt(at), far = columnsAt(at + ivec3(1, 0, 0));
+  uvec4 column = uvec4(near.xz, far.xz); // of the corners (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1)
+  uint bit = 1u << local.z;
+  ivec4 low = ivec4(column >> 8) + nSet(column & (bit - 1u)), high;
+  bvec4 isLow = notEqual(column & bit, uvec4(0)), isHigh;
+  if (local.z < 7) {
+    isHigh = notEqual(column & (bit << 1), uvec4(0));
+    high = low + ivec4(isLow);
+  } else {
+    uvec4 next = uvec4(near.yw, far.yw);
+    isHigh = notEqual(next & 1u, uvec4(0));
+    high = ivec4(next >> 8);
+  }
   vec4 across = vec4((1.0 - share.x) * (1.0 - share.y), (1.0 - share.x) * share.y, share.x * (1.0 - share.y), share.x * share.y);
-  vec4 below = across * (1.0 - share.z) * vec4(greaterThanEqual(low, ivec4(0)));
-  vec4 above = across * share.z * vec4(greaterThanEqual(high, ivec4(0)));
+  vec4 below = across * (1.0 - share.z) * vec4(isLow);
+  vec4 above = across * share.z * vec4(isHigh);
   float total = dot(below + above, vec4(1));
   if (total < MIN_TOTAL) return false;
   weight *= 127.0 / total;
   below *= weight;
   above *= weight;
-  low = first + max(low, ivec4(0));
-  high = first + max(high, ivec4(0));
   addRow(low.x, below.x);
   addRow(low.y, below.y);
   addRow(low.z, below.z);

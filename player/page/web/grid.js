@@ -6,19 +6,19 @@
 // - density [Uint8]: a block of bricks (`blockOf`) of 8 x 8 x 10 texels of four bytes. The texel (x, y, z) of a brick, z = 0..8,
 //   has the codes of the vertices (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1), so that a cell is read with two fetches;
 //   that of z = 9 has in its first byte which cells of the column are live, a bit for each;
-// - owners [nf^3 * 4] Uint16: of the brick that holds the feature vertices around a place where its indices are, in bricks,
-//   x + 256 y, z + 256 level, and its first row in two halves; NO_OWNER where there is none;
-// - indices [Int16]: a block of bricks of 8 x 8 x 9 texels of four numbers: for the same four vertices how many rows they are
-//   behind the brick's first, -1 for one that is not stored;
-// - features [Int8]: rows of codes, four a texel, ROWS_A_LINE a line. Each brick has its own rows, those behind its last
-//   vertices too, in the order of x, y and z.
+// - owners [nf^3 * 4] Uint8: of the brick that holds the feature vertices around a place where its columns are, (x, y, z) in
+//   bricks, and its level; NO_LEVEL where there is none;
+// - columns [Uint32]: a block of bricks of 9 x 8 x 1 texels of four numbers. The texel (x, y) of a brick has two numbers for
+//   the vertices (x, y, 0..7), and two for (x, y + 1, 0..7): bit z of a number tells whether that vertex is stored, and its
+//   bits from 8 on the row of the first that is; the second number is that of the next brick along z, for the vertex z = 8;
+// - features [Int8]: rows of codes, four a texel, ROWS_A_LINE a line, as parts.js has them.
 import { coordOf, keyOf, popcount } from "./bricks.js";
 
 const MOST_DISTANCE = 31;
 export const MANY = 32;
-const NO_OWNER = 0xff00;
+export const NO_LEVEL = 255;
 export const DENSITY_BRICK = [8, 8, 10]; // texels
-export const INDEX_BRICK = [8, 8, 9];
+export const COLUMN_BRICK = [9, 8, 1];
 export const LINES_A_LAYER = 256;
 
 const AROUND = 9 ** 3; // vertices of a brick with its apron
@@ -42,7 +42,7 @@ const placeOf = (n, { across }) => [n % across, Math.floor(n / across) % across,
 // Nothing anywhere: what is shown before a scene is.
 export const NO_GRID = {
   resolution: 1, nb: 1, nSlots: 0, table: Uint8Array.of(0, 0, 0, 1), density: new Uint8Array(2560),
-  featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Uint16Array.of(0, NO_OWNER, 0, 0), indices: new Int16Array(2304),
+  featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Uint8Array.of(0, 0, 0, NO_LEVEL), columns: new Uint32Array(288),
   features: new Int8Array(0),
 };
 
@@ -56,10 +56,15 @@ export function arrangeDensities({ resolution, level_steps: levelSteps }, densit
   };
 }
 
-// What the features become: { featureResolution, nf, nHeld, nRows, owners, indices, features }.
+// What the features become: { featureResolution, nf, nHeld, nRows, owners, columns, features }.
 export function arrangeFeatures({ feature_resolution: featureResolution }, features) {
-  const held = heldBricks(features, featureResolution);
-  return { featureResolution, nf: held.n, nHeld: held.count, ...featureTexels(held, features) };
+  const { n, owners, held, count } = heldBricks(features, featureResolution);
+  return {
+    featureResolution, nf: n, nHeld: count, nRows: features.values.length / features.stride,
+    owners: ownerTexels(owners, count),
+    columns: columnTexels(held, count),
+    features: features.values,
+  };
 }
 
 // The bricks of each level that finer ones do not hide wholly, [{ level, first, bricks, numbers }], in `bricks` of the level
@@ -240,18 +245,6 @@ class ColumnReader {
       this.row8 = this.firstRow + firstRows[16 * next + word] + popcount(bits & ((1 << shift) - 1));
     }
   }
-
-  // How many vertices of the brick with its apron are stored.
-  count() {
-    let n = 0;
-    for (let x = 0; x < 9; x++) {
-      for (let y = 0; y < 9; y++) {
-        this.column(x, y);
-        n += popcount(this.mask);
-      }
-    }
-    return n;
-  }
 }
 
 // Which bricks hold the features' vertices, as `vertex_rows` in player/asset/grid.py says.
@@ -297,96 +290,41 @@ function withCorners({ keys, masks }, n, wanted) {
   return found;
 }
 
-// { nRows, owners, indices, features }.
-function featureTexels({ n, owners, held, count }, { values, stride }) {
-  const block = blockOf(count, INDEX_BRICK), [width, height, depth] = block.size;
-  const indices = new Int32Array(2 * width * height * depth), firstRows = new Uint32Array(count + 1);
-  const rows = new RowWriter(values, stride / 4, rowsAround(held)), around = new Int16Array(AROUND);
+function columnTexels(held, count) {
+  const block = blockOf(count, COLUMN_BRICK), [width, height, depth] = block.size;
+  const texels = new Uint32Array(4 * width * height * depth);
   let number = 0;
   for (const { vertices, keys, firstRow } of held) {
     const read = new ColumnReader(vertices, firstRow);
     for (const key of keys) {
       read.moveTo(key);
-      firstRows[number] = rows.n;
-      gatherRows(read, rows, around);
-      putIndices(around, indices, firstTexel(number++, block, INDEX_BRICK), width, height);
+      putColumns(read, texels, firstTexel(number++, block, COLUMN_BRICK), width);
     }
-  }
-  const features = new Int8Array(rows.rows.buffer);
-  return { nRows: rows.n, owners: ownerTexels(owners, n, block, firstRows), indices: new Int16Array(indices.buffer), features };
-}
-
-// Adds the rows of a brick with its apron; their numbers from its first one on, -1 where a vertex is not stored.
-function gatherRows(read, rows, around) {
-  const first = rows.n;
-  for (let x = 0; x < 9; x++) {
-    for (let y = 0; y < 9; y++) {
-      read.column(x, y);
-      let at = 9 * y + x, mask = read.mask, index = rows.n - first;
-      for (let z = 0; z < 9; z++, mask >>= 1, at += 81) around[at] = mask & 1 ? index++ : -1;
-      rows.add(read.row, popcount(read.mask & 255));
-      rows.add(read.row8, read.mask >> 8);
-    }
-  }
-}
-
-function putIndices(around, indices, begin, width, height) {
-  for (let z = 0, from = 0; z < 9; z++, from += 9) {
-    for (let y = 0; y < 8; y++) {
-      let to = 2 * (begin + (z * height + y) * width);
-      let pair = (around[from] & 0xffff) | (around[from + 9] << 16);
-      from++;
-      for (let end = to + 16; to < end; from++) {
-        const next = (around[from] & 0xffff) | (around[from + 9] << 16);
-        indices[to++] = pair;
-        indices[to++] = next;
-        pair = next;
-      }
-    }
-  }
-}
-
-function ownerTexels(owners, n, block, firstRows) {
-  const texels = new Uint16Array(4 * n ** 3);
-  for (let i = 0, to = 0; i < owners.length; i++, to += 4) {
-    const owner = owners[i];
-    if (owner < 0) {
-      texels[to + 1] = NO_OWNER;
-      continue;
-    }
-    const [x, y, z] = placeOf(owner >> 3, block), first = firstRows[owner >> 3];
-    texels[to] = x | (y << 8);
-    texels[to + 1] = z | ((owner & 7) << 8);
-    texels[to + 2] = first & 0xffff;
-    texels[to + 3] = first >>> 16;
   }
   return texels;
 }
 
-// How many rows all bricks with their aprons have.
-function rowsAround(held) {
-  let n = 0;
-  for (const { vertices, keys, firstRow } of held) {
-    const read = new ColumnReader(vertices, firstRow);
-    for (const key of keys) {
-      read.moveTo(key);
-      n += read.count();
+function putColumns(read, texels, begin, width) {
+  const put = (x, y, half, own, next) => {
+    const to = 4 * (begin + y * width + x) + half;
+    texels[to] = own;
+    texels[to + 1] = next;
+  };
+  for (let x = 0; x < 9; x++) {
+    for (let y = 0; y < 9; y++) {
+      read.column(x, y);
+      const { mask, row, row8 } = read, own = mask & 255 ? (row << 8) | (mask & 255) : 0, next = mask >> 8 ? (row8 << 8) | 1 : 0;
+      if (y < 8) put(x, y, 0, own, next);
+      if (y > 0) put(x, y - 1, 2, own, next);
     }
   }
-  return n;
 }
 
-// Copies rows of features, of so many words, one behind the other.
-class RowWriter {
-  constructor(values, nWords, nRows) {
-    this.values = new Int32Array(values.buffer, values.byteOffset, values.length / 4);
-    Object.assign(this, { n: 0, nWords, rows: new Int32Array(nRows * nWords) });
+function ownerTexels(owners, count) {
+  const block = blockOf(count, COLUMN_BRICK), texels = new Uint32Array(owners.length); // four bytes each, the first the lowest
+  for (let i = 0; i < owners.length; i++) {
+    const [x, y, z] = placeOf(owners[i] >> 3, block);
+    texels[i] = owners[i] < 0 ? NO_LEVEL << 24 : x | (y << 8) | (z << 16) | ((owners[i] & 7) << 24);
   }
-
-  // Adds some rows of the values, from `row` on.
-  add(row, nSome) {
-    const { values, rows, nWords } = this;
-    for (let from = row * nWords, to = this.n * nWords, end = from + nSome * nWords; from < end;) rows[to++] = values[from++];
-    this.n += nSome;
-  }
+  return new Uint8Array(texels.buffer);
 }

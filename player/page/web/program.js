@@ -1,5 +1,5 @@
 // Shaders put together for a scene, compiled when they are first needed.
-import { featureWords, LINES_A_LAYER, MANY, rowsALine } from "./grid.js";
+import { featureWords, LINES_A_LAYER, MANY, NO_LEVEL, rowsALine } from "./grid.js";
 import { headCode } from "./head.js";
 import { shaders } from "./shaders.js";
 
@@ -47,7 +47,7 @@ function filled(text, texts) {
 export function marchSource(scene, { layer, counting, mostSteps }) {
   const { manifest } = scene, nChannels = manifest.n_channels;
   const defines = {
-    LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, MANY,
+    LAYER: LAYERS.indexOf(layer), MOST_STEPS: mostSteps, KEPT, MANY, NO_LEVEL,
     WORDS: featureWords(nChannels), ROWS_A_LINE: rowsALine(nChannels), LINES_A_LAYER,
     ...(layer === "normals" ? { NORMALS: 1 } : {}), ...(counting ? { COUNTING: 1 } : {}),
   };

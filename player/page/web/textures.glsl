@@ -4,7 +4,7 @@
 uniform highp usampler3D uTable;
 uniform highp sampler3D uDensity;
 uniform highp usampler3D uOwners;
-uniform highp isampler3D uIndices;
+uniform highp usampler3D uColumns;
 uniform highp sampler2DArray uFeatures;
 
 uint nTexels = 0u;
@@ -30,9 +30,9 @@ ivec4 ownerAt(ivec3 brick) {
   return ivec4(texelFetch(uOwners, brick.zyx, 0));
 }
 
-ivec4 indicesAt(ivec3 at) {
+uvec4 columnsAt(ivec3 at) {
   COUNT;
-  return texelFetch(uIndices, at, 0);
+  return texelFetch(uColumns, at, 0);
 }
 
 // Where the first texel of a row of features is.

@@ -1,5 +1,5 @@
 // The arrays of a grid as textures of WebGL2.
-import { blockOf, DENSITY_BRICK, featureWords, INDEX_BRICK, LINES_A_LAYER, rowsALine } from "./grid.js";
+import { blockOf, COLUMN_BRICK, DENSITY_BRICK, featureWords, LINES_A_LAYER, rowsALine } from "./grid.js";
 
 const MOST_LAYERS = 256; // that every device has
 const MOST_ROWS = 2 ** 24; // that a shader can tell apart: see textures.glsl
@@ -16,20 +16,20 @@ function featureSize(n, nChannels) {
 const product = (numbers) => numbers.reduce((all, number) => all * number, 1);
 
 // Bytes of a grid's textures, and of what a tile of the picture takes. The twin of player/page/gpu_memory.py.
-export function gpuBytes({ nb, nf, density, indices, nRows }, nChannels) {
+export function gpuBytes({ nb, nf, density, columns, nRows }, nChannels) {
   const tile = TILE * TILE * (16 * Math.ceil(nChannels / 8) + 8 + 4);
-  return 4 * nb ** 3 + 8 * nf ** 3 + density.byteLength + indices.byteLength + 4 * product(featureSize(nRows, nChannels)) + tile;
+  return 4 * (nb ** 3 + nf ** 3) + density.byteLength + columns.byteLength + 4 * product(featureSize(nRows, nChannels)) + tile;
 }
 
 export function uploadGrid(gl, { nb, nf, nSlots, nHeld, nRows, ...grid }, nChannels) {
   const { TEXTURE_3D, TEXTURE_2D_ARRAY } = gl;
-  const density = blockOf(nSlots, DENSITY_BRICK).size, indices = blockOf(nHeld, INDEX_BRICK).size;
+  const density = blockOf(nSlots, DENSITY_BRICK).size, columns = blockOf(nHeld, COLUMN_BRICK).size;
   const features = featureSize(nRows, nChannels);
   const made = {
     uTable: [TEXTURE_3D, [nb, nb, nb], [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], grid.table],
     uDensity: [TEXTURE_3D, density, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], grid.density],
-    uOwners: [TEXTURE_3D, [nf, nf, nf], [gl.RGBA16UI, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT], grid.owners],
-    uIndices: [TEXTURE_3D, indices, [gl.RGBA16I, gl.RGBA_INTEGER, gl.SHORT], grid.indices],
+    uOwners: [TEXTURE_3D, [nf, nf, nf], [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], grid.owners],
+    uColumns: [TEXTURE_3D, columns, [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT], grid.columns],
     uFeatures: [TEXTURE_2D_ARRAY, features, [gl.RGBA8_SNORM, gl.RGBA, gl.BYTE], grid.features],
   };
   for (const [target, size] of Object.values(made)) checkSize(gl, target, size); // before any takes memory

@@ -50,7 +50,7 @@ globalThis.counts = async (view) => {
 };
 globalThis.arrays = () => {
   const grid = { ...renderer.scene.grid };
-  for (const name of ["table", "density", "owners", "indices", "features"]) grid[name] = base64(grid[name]);
+  for (const name of ["table", "density", "owners", "columns", "features"]) grid[name] = base64(grid[name]);
   return grid;
 };
 globalThis.sources = () => {

@@ -141,23 +141,15 @@ def test_the_arrays_are_the_players(scene: Scene) -> None:
     assert (texels[:, :, :, :9] == corners(codes)).all()
     live = texels[..., 9, 0]
     assert (live.reshape(-1) == grid.live).all()
-    owners = scene.page.array(found["owners"], np.uint16).astype(np.int64).reshape(-1, 4)
-    held = owners[:, 1] < 0xFF00
-    place = np.stack([owners[:, 0] & 255, owners[:, 0] >> 8, owners[:, 1] & 255], axis=-1)
-    numbers = number_of(place, found["nHeld"]) << 3 | owners[:, 1] >> 8
-    assert (np.where(held, numbers, -1) == grid.rows.bricks).all()
-    rows = grid.rows.rows.reshape(-1, 9, 9, 9)[: found["nHeld"]]
-    first = np.zeros(found["nHeld"], np.int64)
-    first[grid.rows.bricks[held] >> 3] = owners[held, 2] + (owners[held, 3] << 16)
-    indices = unblocked(scene.page.array(found["indices"], np.int16), found["nHeld"], (8, 8, 9))
-    wanted = corners(rows)
-    assert ((indices >= 0) == (wanted >= 0)).all()
+    owners = scene.page.array(found["owners"], np.uint8).astype(np.int64).reshape(-1, 4)
+    numbers = number_of(owners[:, :3], found["nHeld"]) << 3 | owners[:, 3]
+    assert (np.where(owners[:, 3] < 255, numbers, -1) == grid.rows.bricks).all()
+    texels = scene.page.array(found["columns"], np.uint32)
+    wanted = grid.rows.rows.reshape(-1, 9, 9, 9)[: found["nHeld"]]
+    assert (corners_of(unblocked(texels, found["nHeld"], (9, 8, 1))) == pairs(wanted)).all()
     n_channels, n_words = grid.n_channels, -(-grid.n_channels // 4)
     features = scene.page.array(found["features"], np.int8).reshape(-1, 4 * n_words)[:, :n_channels]
-    shown = np.unique(grid.rows.bricks[held] >> 3)  # of others nobody knows where their rows begin
-    stored = wanted[shown] >= 0
-    own = (indices[shown] + first[shown, None, None, None, None])[stored]
-    ARRAYS.holds(features[own] == grid.features[wanted[shown][stored]])
+    ARRAYS.holds(features == grid.features[: len(features)])
     assert scene.page.page.evaluate("() => vfr.info.gpuBytes") == gpu_bytes(scene.asset)
 
 
@@ -178,6 +170,22 @@ def unblocked(texels: np.ndarray, count: int, brick: tuple[int, int, int]) -> np
 def corners(values: np.ndarray) -> np.ndarray:
     """[n, 8, 8, 9, 4] of [n, 9, 9, 9]: the values at (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
     return np.stack([values[:, x : x + 8, y : y + 8] for x, y in ((0, 0), (0, 1), (1, 0), (1, 1))], axis=-1)
+
+
+def corners_of(columns: np.ndarray) -> np.ndarray:
+    """[n, 9, 8, 2, 9] the rows of the vertices (x, y, z) and (x, y + 1, z), -1 for those that are not stored,
+    of texels [n, 9, 8, 1, 4] of columns: see grid.js."""
+    split = columns.astype(np.int64).reshape(-1, 9, 8, 2, 2)
+    z = np.arange(8)
+    own = split[..., :1]
+    rows = (own >> 8) + np.bitwise_count(own & ((1 << z) - 1))
+    next_rows = np.where(split[..., 1:] & 1, split[..., 1:] >> 8, -1)
+    return np.concatenate([np.where(own >> z & 1, rows, -1), next_rows], axis=-1)
+
+
+def pairs(rows: np.ndarray) -> np.ndarray:
+    """[n, 9, 8, 2, 9] of [n, 9, 9, 9]: the rows of the vertices (x, y, z) and (x, y + 1, z)."""
+    return np.stack([rows[:, :, :8], rows[:, :, 1:]], axis=3)
 
 
 def entries_of(table: np.ndarray, count: int) -> np.ndarray:
