@@ -58,8 +58,8 @@ class BakeChoice:
     """Loss that the preset aims at, dB."""
     page_mb: float
     """Graphics memory that a page of the grids may take before any detail is dropped, MB, roughly: they are
-    as fine as fits, unless their resolution was given. The phone's pages are to take half of it: more than
-    half of its features' detail is dropped."""
+    as fine as fits, unless their resolution was given. The phone's pages are to take 256: more than half of
+    its features' detail is dropped."""
 
 
 PRESETS: dict[Preset, BakeChoice] = {
@@ -89,7 +89,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         n_channels=12, channel_loss_db=0.5, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.3, density_step=6, code_levels=50, head_width=32, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
-        page_mb=512,
+        page_mb=384,
     ),
 }  # fmt: skip
 

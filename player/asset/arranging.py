@@ -9,6 +9,7 @@ it is there at once; a tenth and half of the bytes end with a part, too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,6 +25,8 @@ from player.errors import FormatError
 
 SHARES = (0.025, 0.1, 0.25, 0.5, 1.0)
 """The most of all bytes that are read with the first part, with the first two, ..."""
+THREADS = 2
+"""Sections that are encoded at a time: each takes memory of its own."""
 
 
 class WrittenSection(NamedTuple):
@@ -53,14 +56,17 @@ def write_parts(
 
     Raises FormatError: values that the steps of the manifest do not reach.
     """
-    sections = [
-        *_sections("densities", densities, manifest.density_steps),
-        *_sections("features", features, manifest.feature_steps),
-    ]
+    with ThreadPoolExecutor(THREADS) as threads:
+        sections = [
+            *_sections("densities", densities, manifest.density_steps, threads),
+            *_sections("features", features, manifest.feature_steps, threads),
+        ]
     return list(_cut(sorted(sections, key=_turn), n_before, n_behind))
 
 
-def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterator[WrittenSection]:
+def _sections(
+    grid: Grid, stored: PyramidValues, steps: Sequence[int], threads: ThreadPoolExecutor
+) -> Iterator[WrittenSection]:
     pyramid = stored.pyramid
     symbols = symbols_of(pyramid.vertices, stored.values, steps, LIMITS[grid])
     again = values_of(pyramid.vertices, symbols, steps, LIMITS[grid])
@@ -81,8 +87,9 @@ def _sections(grid: Grid, stored: PyramidValues, steps: Sequence[int]) -> Iterat
         counts = {"n_bricks": len(bricks), "n_vertices": vertices.n}
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
         rows = level_rows(vertices)
-        for first, end in pairwise(channel_groups(stored.n_channels)):
-            data = encode_level(symbols[level][:, first:end], rows)
+        groups = list(pairwise(channel_groups(stored.n_channels)))
+        coded = threads.map(lambda group: encode_level(symbols[level][:, slice(*group)], rows), groups)  # noqa: B023
+        for (first, end), data in zip(groups, coded, strict=True):
             channels = {"first_channel": first, "n_channels": end - first}
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)
 

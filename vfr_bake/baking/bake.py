@@ -60,14 +60,14 @@ from vfr_bake.baking.limits import (
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, refinement_seconds
 from vfr_bake.baking.rate import (
+    AIM,
     FIRST_PRICE,
     LOWEST_PRICE,
     PRICES_TRIED,
-    RAISED,
     Prices,
     Spent,
+    highest_price,
     importance,
-    turning_point,
 )
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
@@ -323,33 +323,36 @@ class _Bake:
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
         kept: dict[float, GridArrays] = {}
-        """What is stored at the last price that lost little, which need not be found again."""
+        """What is stored at the highest price that lost little, or at the lowest: it need not be found again."""
 
         def at(price: float) -> Spent:
             tried.append(price)
             progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
             return prices.at(price)
 
-        def loses_little(price: float) -> bool:
+        def lost(price: float) -> float:
+            """What is lost, as a share of what may be."""
             arrays = at(price).arrays
             after = held_out.look("codes", layout.played(arrays), head, self.n_fetches)
-            if config.max_loss_db is not None:
-                loses = after.loss.db > config.max_loss_db
+            if left is not None:
+                share = (after.loss.db - refined.loss.db) / left if left > 0 else np.inf
             else:
-                loses = held_out.lost(refined.shown, after.shown).worst > allowed
-            if not loses:
+                share = held_out.lost(refined.shown, after.shown).worst / allowed
+            if share <= 1 or price < min(kept, default=np.inf):
                 kept.clear()
                 kept[price] = arrays
-            return not loses
+            return share
 
-        def is_too_large(price: float) -> bool:
-            n_bytes = others + at(price).n_bytes
-            return n_bytes + mesh_bytes(round(n_bytes), None) > 1e6 * (config.max_mb or np.inf)
+        def taken(rate: float) -> float:
+            """What the files take at a price of 1 / rate, as a share of what they may."""
+            n_bytes = others + at(1 / rate).n_bytes
+            return (n_bytes + mesh_bytes(round(n_bytes), None)) / (1e6 * (config.max_mb or np.inf))
 
+        left = None if config.max_loss_db is None else config.max_loss_db - refined.loss.db
         first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
-        price, _ = turning_point(loses_little, first, lowest if config.max_loss_db is None else 0.0)
-        if config.max_mb is not None and is_too_large(price):
-            _, price = turning_point(is_too_large, RAISED * price)
+        price = highest_price(lost, first, 0.0 if left is not None and left > 0 else lowest)
+        if config.max_mb is not None and (share := taken(1 / price)) > 1:
+            price = 1 / highest_price(taken, (AIM / share) ** 2 / price)
         return kept[price] if price in kept else prices.at(price).arrays
 
     def _agreement(

@@ -19,6 +19,7 @@ same place, because the density changes too fast at a surface for a mean to tell
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -70,15 +71,20 @@ TABLES = 1.04
 
 FIRST_PRICE = 6e-10
 """Price that is tried first, as a share of the model's mean square error."""
-RAISED = 4.0
-"""Factor from one price to the next until one is too high and one too low."""
-HALVINGS = 2
-"""How often the way between these two is halved then: the price is found within a factor of 1.4."""
-MOST_RAISES = 10
 LOWEST_PRICE = 3e-11
 """Price below which more bytes show next to nothing, as a share of the model's mean square error: fox's
 asset is twice as large there as at the first price, and loses 0.05 dB less."""
-PRICES_TRIED = 6
+SLOPE, SLOPES = 0.7, (0.25, 2.0)
+"""What a price loses grows with this power of it, before two prices tell the power; the least and the most
+that it may be."""
+FURTHEST = 16.0
+"""Factor from one price to the next, at most."""
+AIM, CLOSE = 0.9, 0.8
+"""The next price is to lose this share of what it may; one that loses so much of it is near enough."""
+NEAR = 1.2
+"""So are two prices with this factor between them, of which the higher one loses too much."""
+MOST_PRICES = 12
+PRICES_TRIED = 3
 """How many prices are tried, mostly."""
 
 
@@ -341,29 +347,39 @@ def _shown_importance(grid: Grid, wanted: Wanted, whole: Pyramid, finest: np.nda
     ]
 
 
-def turning_point(holds: Callable[[float], bool], first: float, lowest: float = 0.0) -> tuple[float, float]:
-    """Two prices close to each other: at the lower one something `holds`, at the higher one it does not.
+def highest_price(share: Callable[[float], float], first: float, lowest: float = 0.0) -> float:
+    """A price of which `share`, what is lost at it as a share of what may be, is little below 1.
 
-    Where it holds at all prices, or at none, both are far from `first`, but not below `lowest`.
+    It rises with the price, about as a power of it, so that few of them have to be tried. Where it is above 1
+    at all prices, or below it, the price found is far from `first`, but not below `lowest`.
 
-    >>> low, high = turning_point(lambda price: price < 0.3, 1.0)
-    >>> low < 0.3 <= high < 1.5 * low
+    >>> 0.25 < highest_price(lambda price: (price / 0.3) ** 0.5, 1.0) <= 0.3
     True
-    >>> turning_point(lambda price: False, 1.0, lowest=0.05)
-    (0.0625, 0.0625)
+    >>> highest_price(lambda price: 2.0, 1.0, lowest=0.05)
+    0.05
     """
-    factor = RAISED if holds(first) else 1 / RAISED
-    price = first
-    for _ in range(MOST_RAISES):
-        before, price = price, price * factor
-        if price < lowest:
-            return before, before
-        if holds(price) != (factor > 1):
+    tried: dict[float, float] = {}
+    price, low, high = first, 0.0, math.inf
+    while len(tried) < MOST_PRICES:
+        found = tried[price] = share(price)
+        low, high = (max(low, price), high) if found <= 1 else (low, min(high, price))
+        if CLOSE <= found <= 1 or high <= max(NEAR * low, lowest):
             break
-    else:
-        return price, price
-    low, high = min(before, price), max(before, price)
-    for _ in range(HALVINGS):
-        middle = (low * high) ** 0.5
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low, high
+        price = max(_next_price(tried, low, high, price), lowest)
+    return low or min(tried)
+
+
+def _next_price(tried: dict[float, float], low: float, high: float, last: float) -> float:
+    """Where the share is about AIM; it is known at `last`, and at `low` and `high` on either side of 1 where
+    these are not 0 and infinite."""
+    if low and high < math.inf:
+        little, much = tried[low], tried[high]
+        way = math.log(AIM / little) / math.log(much / little) if little > 0 else 0.5
+        return float(low * (high / low) ** np.clip(way, 0.2, 0.8))
+    found, slope = tried[last], SLOPE
+    if len(tried) > 1:
+        before = list(tried)[-2]
+        if min(found, tried[before]) > 0 and max(found, tried[before]) < math.inf:
+            slope = np.clip(math.log(found / tried[before]) / math.log(last / before), *SLOPES)
+    factor = (AIM / found) ** (1 / slope) if found > 0 else FURTHEST
+    return float(last * np.clip(factor, 1 / FURTHEST, FURTHEST))

@@ -68,8 +68,12 @@ AT_K = 0.25
 """Factor of the head's learning rate in the last round, where little is left to be learned."""
 N_HEAD = 1_000_000
 """Rays from which a head is trained alone, whose composites are found once."""
-SHARES = {"small head": 0.2, "refinement": 0.85, "head at k": 1.0, "refinement at k": 1.0}
+SHARES = {"small head": 0.2, "refinement": 0.8, "head at k": 1.0, "refinement at k": 1.0}
 """Share of the time that is left which a round may take."""
+HEAD_SECONDS = 20.0
+"""Seconds that the head may take in the last round in any case: it learns most of what it can in them."""
+FEATURES_SECONDS = 60.0
+"""Seconds that have to be left for the features to be trained in the last round: fewer gain nothing."""
 DIRECTION_SHARE = 0.1
 """A small head leaves the direction out where that loses no more than this share of the loss that the preset
 aims at."""
@@ -190,7 +194,7 @@ class Tuning:
         every = self._held_out.look("all", grid, runner(stored.head), 0)
         self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
         lost = self._held_out.lost(every.shown, self.kept.shown).most
-        if self.n_fetches and lost > WORTH_FEATURES:
+        if self.n_fetches and lost > WORTH_FEATURES and self._seconds_left() > FEATURES_SECONDS:
             return self._refined_at_k(stored, grid, teacher, AT_K * head_rate, code_rate)
         if lost > WORTH_A_ROUND:
             rays = collect_training_rays(teacher.some(N_HEAD), grid, self.n_fetches)
@@ -237,12 +241,17 @@ class Tuning:
     @contextmanager
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:
         """The steps of a round, which takes its share of the time that is left."""
-        seconds = SHARES[name] * (self._until - time.monotonic())
+        seconds = SHARES[name] * self._seconds_left()
+        if name == "head at k":
+            seconds = max(seconds, HEAD_SECONDS)
         yield (steps := Steps(asked, self._progress(name), seconds))
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (
                 f"{asked - steps.n:,} of {asked:,}: they would take too long"
             )
+
+    def _seconds_left(self) -> float:
+        return self._until - time.monotonic()
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
         """Whether less is lost than before, on pixels that nothing is trained on."""

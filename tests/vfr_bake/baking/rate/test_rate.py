@@ -20,15 +20,17 @@ from vfr_bake.baking.grids import latent, whole_codes
 from vfr_bake.baking.head import runner
 from vfr_bake.baking.rate import (
     AROUND,
+    CLOSE,
     EVERYWHERE,
-    MOST_RAISES,
-    RAISED,
+    FURTHEST,
+    MOST_PRICES,
+    NEAR,
     Choices,
     bits_of,
     first_bits,
+    highest_price,
     importance,
     importance_of_levels,
-    turning_point,
 )
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_coarser
@@ -240,15 +242,26 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
     assert np.corrcoef(np.log(found.features[some]), np.log(changes))[0, 1] > 0.5
 
 
-def test_a_price_is_found_from_either_side() -> None:
-    for first in (1e-5, 1.0, 1e4):
-        tried = []
+@pytest.mark.parametrize("power", [0.3, 0.7, 1.5])
+@pytest.mark.parametrize("first", [1e-5, 0.2, 1.0, 1e4])
+def test_a_price_is_found_from_either_side(first: float, power: float) -> None:
+    tried = []
 
-        def holds(price: float) -> bool:
-            tried.append(price)  # noqa: B023
-            return price < 0.3
+    def share(price: float) -> float:
+        tried.append(price)
+        return (price / 0.3) ** power
 
-        low, high = turning_point(holds, first)
-        assert low < 0.3 <= high <= 1.5 * low and len(tried) <= MOST_RAISES + 3
-    always, never = turning_point(lambda _: True, 1.0), turning_point(lambda _: False, 1.0)
-    assert always[0] == pytest.approx(RAISED**MOST_RAISES) and never[0] == pytest.approx(RAISED**-MOST_RAISES)
+    found = highest_price(share, first)
+    assert found in tried and len(tried) <= MOST_PRICES
+    assert CLOSE <= share(found) <= 1 or (found <= 0.3 <= NEAR * found)
+    assert len(tried) <= (4 if 0.1 < first < 3 else 9)
+
+
+def test_a_price_is_found_where_shares_are_no_power_of_it() -> None:
+    """Nothing is lost up to some price, and too much from there on."""
+    found = highest_price(lambda price: 0.0 if price < 0.3 else np.inf, 1.0)
+    assert found < 0.3 <= NEAR * found
+    assert highest_price(lambda _: -1.0, 1.0) == pytest.approx(FURTHEST ** (MOST_PRICES - 1))
+    for much in (5.0, np.inf):
+        assert highest_price(lambda _, much=much: much, 1.0, lowest=0.001) == 0.001
+    assert highest_price(lambda _: 5.0, 1.0) < 1e-5
