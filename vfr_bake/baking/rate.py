@@ -353,7 +353,7 @@ def highest_price(share: Callable[[float], float], first: float, lowest: float =
     It rises with the price, about as a power of it, so that few of them have to be tried. Where it is above 1
     at all prices, or below it, the price found is far from `first`, but not below `lowest`.
 
-    >>> 0.25 < highest_price(lambda price: (price / 0.3) ** 0.5, 1.0) <= 0.3
+    >>> 0.2 < highest_price(lambda price: (price / 0.3) ** 0.5, 1.0) <= 0.3
     True
     >>> highest_price(lambda price: 2.0, 1.0, lowest=0.05)
     0.05
