@@ -323,7 +323,7 @@ class _Bake:
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
         kept: dict[float, GridArrays] = {}
-        """What is stored at the highest price that lost little, or at the lowest: it need not be found again."""
+        """What is stored at the highest price that lost little, or at the lowest."""
 
         def at(price: float) -> Spent:
             tried.append(price)

@@ -20,7 +20,7 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError, FormatError
 from player.page import page
-from player.page.gpu_memory import MOST_CHANNELS
+from player.page.gpu_memory import MOST_CHANNELS, feature_bytes
 from player.page.modules import joined
 from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.rest import rest_camera
@@ -174,6 +174,14 @@ def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
     facts = export_asset(asset.folder, tmp_path / "scene.html")
     assert facts["bytes"] == (tmp_path / "scene.html").stat().st_size
     assert (tmp_path / "scene.html").read_bytes() == page(Asset.open(asset.folder))
+
+
+@pytest.mark.parametrize(("n_channels", "most"), [(4, 2**24), (32, 2**24), (33, 2**23), (40, 2**23)])
+def test_rows_that_no_texture_holds_are_refused(n_channels: int, most: int) -> None:
+    """A shader tells 2^24 rows apart, and WebGL 2 promises 256 layers of 256 lines."""
+    assert feature_bytes(most, n_channels) >= most * n_channels
+    with pytest.raises(FormatError, match=f"expected at most {most} rows of features, got {most + 1}"):
+        feature_bytes(most + 1, n_channels)
 
 
 def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Path) -> None:
