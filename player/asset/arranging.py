@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +88,8 @@ def _sections(
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
         rows = level_rows(vertices)
         groups = list(pairwise(channel_groups(stored.n_channels)))
-        coded = threads.map(lambda group: encode_level(symbols[level][:, slice(*group)], rows), groups)  # noqa: B023
+        some = [symbols[level][:, first:end] for first, end in groups]
+        coded = threads.map(encode_level, some, repeat(rows))
         for (first, end), data in zip(groups, coded, strict=True):
             channels = {"first_channel": first, "n_channels": end - first}
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)

@@ -322,38 +322,48 @@ class _Bake:
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
-        kept: dict[float, GridArrays] = {}
-        """What is stored at the highest price that lost little, or at the lowest."""
+        kept: dict[float, Spent] = {}
+        """What is stored at the price that is the best so far, which is not found again."""
 
         def at(price: float) -> Spent:
+            if price in kept:
+                return kept[price]
             tried.append(price)
             progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
             return prices.at(price)
 
+        def keep(price: float, spent: Spent) -> None:
+            kept.clear()
+            kept[price] = spent
+
         def lost(price: float) -> float:
             """What is lost, as a share of what may be."""
-            arrays = at(price).arrays
-            after = held_out.look("codes", layout.played(arrays), head, self.n_fetches)
+            spent = at(price)
+            after = held_out.look("codes", layout.played(spent.arrays), head, self.n_fetches)
             if left is not None:
                 share = (after.loss.db - refined.loss.db) / left if left > 0 else np.inf
             else:
                 share = held_out.lost(refined.shown, after.shown).worst / allowed
             if share <= 1 or price < min(kept, default=np.inf):
-                kept.clear()
-                kept[price] = arrays
+                keep(price, spent)
             return share
 
-        def taken(rate: float) -> float:
-            """What the files take at a price of 1 / rate, as a share of what they may."""
-            n_bytes = others + at(1 / rate).n_bytes
-            return (n_bytes + mesh_bytes(round(n_bytes), None)) / (1e6 * (config.max_mb or np.inf))
+        def taken(price: float, max_mb: float) -> float:
+            """What the files take, as a share of what they may."""
+            spent = at(price)
+            n_bytes = others + spent.n_bytes
+            share = (n_bytes + mesh_bytes(round(n_bytes), None)) / (1e6 * max_mb)
+            if share <= 1:
+                keep(price, spent)
+            return share
 
         left = None if config.max_loss_db is None else config.max_loss_db - refined.loss.db
         first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
         price = highest_price(lost, first, 0.0 if left is not None and left > 0 else lowest)
-        if config.max_mb is not None and (share := taken(1 / price)) > 1:
-            price = 1 / highest_price(taken, (AIM / share) ** 2 / price)
-        return kept[price] if price in kept else prices.at(price).arrays
+        if (max_mb := config.max_mb) is not None and (share := taken(price, max_mb)) > 1:
+            # Bytes fall about with the square root of the price.
+            price = 1 / highest_price(lambda rate: taken(1 / rate, max_mb), (AIM / share) ** 2 / price)
+        return at(price).arrays
 
     def _agreement(
         self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage
