@@ -82,9 +82,7 @@ void main() {
   for (int layer = 0; layer < N_LAYERS; layer++) {
     runLayer(uLayers[3 * layer], uLayers[3 * layer + 1], uLayers[3 * layer + 2].x > 0.0);
     if (layer != HARMONICS_LAYER) continue;
-    for (int p = 0; p < 4; p++) {
-      MULTIPLY_BY_HARMONICS
-    }
+    MULTIPLY_BY_HARMONICS
   }
   uvec4 found;
   for (int p = 0; p < 4; p++) {

@@ -111,7 +111,9 @@ function monomialsCode(monomials) {
   return [...found, ...texels].join("");
 }
 
+// Each encoded feature times its harmonic, for all four pixels at once: a column each.
 function multiplyCode(which) {
-  const read = (i) => `memory[HARMONICS_AT + ${i >> 2}][p].${XYZW[i & 3]}`;
-  return texelsOf(which.map(read)).map((texel, o) => `memory[ENCODED_AT + ${o}][p] *= ${texel};\n`).join("");
+  const columns = [0, 1, 2, 3].map((p) => texelsOf(which.map((i) => `memory[HARMONICS_AT + ${i >> 2}][${p}].${XYZW[i & 3]}`)));
+  const multiply = (_, o) => `memory[ENCODED_AT + ${o}] = matrixCompMult(memory[ENCODED_AT + ${o}], mat4(${columns.map((texels) => texels[o]).join(", ")}));\n`;
+  return columns[0].map(multiply).join("");
 }
