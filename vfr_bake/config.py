@@ -36,9 +36,10 @@ UNBOUNDED_FIELD = {
 number of levels: 32 double the time of a step on a CPU, most of which is spent on the grid's memory."""
 
 
-FIELD_BY_DEVICE = {"cpu": {}, "cuda": {"log2_table_size": 19}}
-"""Settings of the architecture that follow from the device: on a GPU, batches as large as the paper's fill
-tables as large as the paper's."""
+FIELD_BY_DEVICE = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
+"""Settings of the architecture that follow from the device. On a GPU, batches as large as the paper's fill
+tables as large as the paper's. On a CPU, the paper's head takes half of a step's time or more, and one of
+half its width leaves room for up to twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
@@ -132,8 +133,8 @@ class FieldOptions:
     compositing: Compositing = "features"
     """Sum features along the ray and evaluate the head once a pixel (volume feature rendering), or evaluate
     it at every sample and sum colours (standard volume rendering, the paper's baseline)."""
-    head_width: int = 256
-    """Width of every layer of the head, and of its bottleneck."""
+    head_width: int | None = None
+    """Width of every layer of the head, and of its bottleneck; CPU 128, GPU 256 as in the paper."""
     n_directional_layers: int = 4
     """Layers of the directional MLP behind the two spatial ones."""
     activation: Activation = "gelu"

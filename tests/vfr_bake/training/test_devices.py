@@ -163,7 +163,9 @@ def test_what_is_not_given_follows_from_the_device() -> None:
     assert (gpu.network_rate, gpu.grid_rate) == (0.01, 0.01)
     assert TrainConfig().for_device("cuda", True).steps == 40_000
     assert TrainConfig(batch_rays=64).for_device("cuda", True).batch_rays == 64
-    assert FieldOptions().resolved(False, "cuda").log2_table_size == 19
+    on_cpu, on_gpu = (FieldOptions().resolved(False, device) for device in ("cpu", "cuda"))
+    assert (on_cpu.log2_table_size, on_cpu.head_width) == (18, 128)
+    assert (on_gpu.log2_table_size, on_gpu.head_width) == (19, 256)
     assert FieldOptions(log2_table_size=15).resolved(False, "cuda").log2_table_size == 15
     assert FieldOptions().resolved(False) == FieldOptions().resolved(False, "cpu")
     for name, value in {"steps": 0, "batch_samples": 3, "network_rate": 1.0, "device": "tpu"}.items():
