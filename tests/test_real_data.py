@@ -38,7 +38,7 @@ def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--mesh-resolution",
         "64",
         "--refine-steps",
-        "200",
+        "60",
     ]
     assert bake_main(arguments) == 0
     cameras = str(lego_400 / "transforms_test.json")

@@ -49,7 +49,7 @@ def chosen(models: dict[str, Model], tmp_path_factory: pytest.TempPathFactory) -
     found = {}
     for kind, model in models.items():
         folder = tmp_path_factory.mktemp(kind) / "asset"
-        settings = BakeConfig(refine_steps=150, mesh_resolution=24, check_views=2, max_mb=MAX_MB)
+        settings = BakeConfig(refine_steps=40, mesh_resolution=24, check_views=2, max_mb=MAX_MB)
         bake(model, folder, settings, quiet)
         found[kind] = json.loads((folder / "report.json").read_text())
         found[kind]["manifest"] = Asset.open(folder, verify=True).manifest
