@@ -36,7 +36,7 @@ UNBOUNDED_FIELD = {
 number of levels: 32 double the time of a step on a CPU, most of which is spent on the grid's memory."""
 
 
-FIELD_BY_DEVICE = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
+FIELD_BY_DEVICE: dict[str, dict[str, Any]] = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
 """Settings of the architecture that follow from the device. On a GPU, batches as large as the paper's fill
 tables as large as the paper's. On a CPU, the paper's head takes half of a step's time or more, and one of
 half its width leaves room for up to twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
