@@ -38,8 +38,8 @@ number of levels: 32 double the time of a step on a CPU, most of which is spent 
 
 FIELD_BY_DEVICE: dict[str, dict[str, Any]] = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
 """Settings of the architecture that follow from the device. On a GPU, batches as large as the paper's fill
-tables as large as the paper's. On a CPU, the paper's head takes half of a step's time or more, and one of
-half its width leaves room for up to twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
+tables as large as the paper's. On a CPU, the paper's head takes about half of a step's time, and one of
+half its width leaves room for nearly twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
