@@ -69,6 +69,6 @@ def test_scatter_and_step_in_one_are_the_two_one_after_the_other() -> None:
     assert ours.table.grad is None
 
 
-def test_schedule_warms_up_and_steps_down() -> None:
+def test_schedule_warms_up_stays_and_falls_to_nothing() -> None:
     assert rate_factor(50, 0.01) == pytest.approx(0.505)
-    assert [round(rate_factor(1000, p), 6) for p in (0.49, 0.5, 0.75, 0.9)] == [1, 0.33, 0.1089, 0.035937]
+    assert [round(rate_factor(1000, p), 6) for p in (0.49, 0.5, 0.75, 0.9, 1.0)] == [1, 1, 0.5, 0.2, 0]

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from vfr_bake.training.length.witness_loss import WitnessLoss
+from vfr_bake.training.optimiser import HELD
 
 FIRST_LOOK = 60.0
 """Seconds of training before the first look."""
@@ -30,8 +31,6 @@ FLAT_DB = 0.15
 """Gain in dB, by twice the time, below which the error counts as flat."""
 FLAT_LOOKS = 2
 """So many looks in a row must find the error flat."""
-FIRST_HALF = 0.5
-"""Share of a training with the high learning rate."""
 
 
 class Duration:
@@ -63,7 +62,7 @@ class Duration:
 
         `measure` gives the witnesses, and their errors [n_witnesses] by now.
         """
-        if seconds < self._next_look or self.progress(step, seconds) >= FIRST_HALF:
+        if seconds < self._next_look or self.progress(step, seconds) >= HELD:
             return
         self._next_look = seconds * GROWTH
         witnesses, errors = measure()
@@ -74,7 +73,7 @@ class Duration:
         self._errors.append(errors)
         if self._n_flat == FLAT_LOOKS:
             self.ended_early = True
-            self._seconds = min(self._seconds, seconds / FIRST_HALF)
+            self._seconds = min(self._seconds, seconds / HELD)
 
     def state(self) -> dict[str, Any]:
         """All that later looks depend on, in tensors and plain values; not the length that was asked for."""
