@@ -13,8 +13,11 @@ from torch import Tensor
 from vfr_bake.field.hash_grid import HashGrid, zeros
 from vfr_bake.kernels.adam import Pace, adam_step, scatter_and_step
 
-BETAS, EPSILON = (0.9, 0.95), 1e-15
-"""Adam's decay rates and its smallest denominator, of grids and networks alike."""
+BETAS, EPSILON = (0.9, 0.99), 1e-15
+"""Adam's decay rates and its smallest denominator (instant-ngp)."""
+GRID_BETAS = 0.9, 0.95
+"""The decay rates of hash grids, which learn more with a shorter memory of squared gradients; networks do not
+(docs/notes/2026-11-25-learning-rates.md)."""
 WARMUP_STEPS = 100
 HELD = 0.5
 """Share of a training with the whole rate."""
@@ -70,7 +73,7 @@ class DeviceGridAdam(TableAdam):
 
     def __init__(self, table: Tensor) -> None:
         super().__init__(table)
-        self._adam = torch.optim.Adam([table], betas=BETAS, eps=EPSILON, fused=True)
+        self._adam = torch.optim.Adam([table], betas=GRID_BETAS, eps=EPSILON, fused=True)
 
     def step(self, rate: float) -> None:
         self._adam.param_groups[0]["lr"] = rate
@@ -106,7 +109,7 @@ class GridAdam(TableAdam):
     def _next_pace(self, rate: float) -> Pace:
         """Count a step, and return its numbers."""
         self.n_steps += 1
-        beta1, beta2 = BETAS
+        beta1, beta2 = GRID_BETAS
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
         return Pace(*map(np.float32, (rate * correction, beta1, beta2, EPSILON)))
 

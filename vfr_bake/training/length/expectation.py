@@ -13,7 +13,7 @@ from itertools import pairwise
 
 TIMED_FROM, EXPECTED_AT = 300, 400
 """The speed is that of the steps between these two: before them the pilot network learns."""
-DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.3)}
+DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.7)}
 """Gain in dB at the least and at the most, by whether the scene is unbounded: of lego and the built-in scene,
 and of fox and can, from 400 steps to the end of 2 to 10 minutes."""
 
