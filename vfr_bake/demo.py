@@ -22,6 +22,8 @@ from player.files.files import check_target, write_bytes
 TRAIN_MINUTES = 2.0
 """Training time by default: it leaves room for compiling, baking and playing within five minutes on two
 cores."""
+REFINE_STEPS = 400
+"""Steps of each round of refinement: more of them take a minute longer and gain nothing here."""
 N_SHOWN = 4
 """Number of test views in the side-by-side picture."""
 
@@ -68,7 +70,8 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
     seconds = {
         "train": run("vfr-train", train_main, "demo", model, "--minutes", str(minutes),
                      "--json", f"{output}/train.json"),
-        "bake": run("vfr-bake", bake_main, model, asset, "--json", f"{output}/bake.json"),
+        "bake": run("vfr-bake", bake_main, model, asset, "--refine-steps", str(REFINE_STEPS),
+                    "--json", f"{output}/bake.json"),
         "play": run("vfr-play", play, asset, "--cameras", f"{output}/cameras_test.json", "--output", frames,
                     "--json", f"{output}/play.json"),
         "export": run("vfr-export", export, asset, f"{output}/mesh.glb")
