@@ -269,9 +269,10 @@ class Trainer:
             self._adam.zero_grad(set_to_none=True)
             if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
-            factor = rate_factor(step if pilot else step - self._head_begins, progress)
+            factor = rate_factor(step, progress)
+            network_factor = rate_factor(step if pilot else step - self._head_begins, progress)
             for group in self._adam.param_groups:
-                group["lr"] = self.pace.network_rate * factor
+                group["lr"] = self.pace.network_rate * network_factor
             self._adam.step()
             for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
