@@ -27,8 +27,7 @@ def rate_factor(step: int, progress: float) -> float:
     """The factor of the learning rates: linear warm-up from 1 % over 100 steps, 1 for the first half of the
     training, then in a straight line to 0.
 
-    `step` counts from the first one of the network that gives the colours: a head that begins at the whole
-    rate may never learn. `progress` in [0, 1] is the share of the training that is done.
+    `progress` in [0, 1] is the share of the training that is done.
 
     >>> rate_factor(0, 0.0), rate_factor(100, 0.1), rate_factor(5000, 0.75)
     (0.01, 1.0, 0.5)

@@ -135,8 +135,6 @@ class Trainer:
             self._use_torch(scene)
         else:
             self._use_numba(scene)
-        self._head_begins = config.pilot_steps if self._field.config.compositing == "features" else 0
-        """The first step in which the head gives the colours, and not the pilot."""
         self._second = SecondThread()
         self._next: Sampled | None = None
         """The rays and samples of the next step, if they have been taken."""
@@ -270,9 +268,8 @@ class Trainer:
             if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
             factor = rate_factor(step, progress)
-            network_factor = rate_factor(step if pilot else step - self._head_begins, progress)
             for group in self._adam.param_groups:
-                group["lr"] = self.pace.network_rate * network_factor
+                group["lr"] = self.pace.network_rate * factor
             self._adam.step()
             for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
@@ -282,7 +279,7 @@ class Trainer:
 
     def _is_pilot(self, step: int) -> bool:
         """Whether the pilot gives the colours; where they are composited anyway the head needs none."""
-        return step < self._head_begins
+        return step < self.config.pilot_steps and self._field.config.compositing == "features"
 
     def _sampled(self, step: int) -> Sampled:
         """A new batch for a step, with its samples in the field as it is."""

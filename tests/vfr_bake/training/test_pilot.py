@@ -69,7 +69,7 @@ def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
     # About every second seed fails; the field stays nearly empty then, and the picture white. With the pilot
-    # all reach some 11 dB more.
+    # all reach some 10 dB more: the head begins when its rate, which is high for so many layers, is falling.
     failed = next((seed for seed in (2, 0, 3, 1, 4, 5, 6, 7, 8, 9) if psnr(scene, 0, seed) < blank + 3), None)
     assert failed is not None
-    assert psnr(scene, 150, failed) > blank + 6
+    assert psnr(scene, 200, failed) > blank + 6
