@@ -170,8 +170,9 @@ def test_keys_turn_zoom_and_fly(chromium: Browser) -> None:
         page.keyboard.press("Home")
         assert np.allclose(c2w(still(page)), c2w(before), atol=1e-9)
         assert elevation(pressed("ArrowUp")) > elevation(before) + 0.03
-        assert distance(pressed("+")) < 0.97 * distance(before)
-        assert distance(pressed("-")) > 0.97 * distance(before)
+        near = pressed("+")  # farther than a tap goes where a busy machine lets the key up late
+        assert distance(near) < 0.97 * distance(before)
+        assert distance(pressed("-")) > 1.03 * distance(near)
         at = c2w(pressed("Home"))
         for key, axis in (
             ("d", [1, 0, 0]), ("a", [-1, 0, 0]), ("e", [0, 1, 0]), ("q", [0, -1, 0]),
