@@ -1,5 +1,5 @@
-"""Volume feature rendering against standard volume rendering: same data, same 6x256 head, same batch, the
-same minutes, in one run.
+"""Volume feature rendering against standard volume rendering: same data, the paper's head (6x256), same
+batch, the same minutes, in one run.
 
     python tests/benchmarks/bench_compositing.py ../shared/data/lego_400 --minutes 4
 
@@ -30,7 +30,7 @@ class Turns:
     """A training that is given the machine for some seconds at a time."""
 
     def __init__(self, scene: Scene, compositing: Compositing, options: argparse.Namespace) -> None:
-        field = FieldOptions(compositing=compositing)
+        field = FieldOptions(compositing=compositing, head_width=256)
         given = {name: getattr(options, name) for name in ("batch_samples", "step_cells")}
         settings = {name: value for name, value in given.items() if value is not None}
         self.trainer = Trainer(scene, TrainConfig(minutes=options.minutes, field=field, **settings))
