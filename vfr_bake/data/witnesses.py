@@ -11,14 +11,12 @@ on pixels of the training split that are kept apart before training begins, of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from player.cameras.camera import Camera
-from player.march.pixels import rays_of_pixels
 from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.view_pixels import ViewPixels, spread
 
 N_WITNESSES = 60_000
 """Number of witnesses at most; half of them are of whole views, where there are any."""
@@ -31,42 +29,15 @@ SEED = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
+class Witnesses(ViewPixels):
     """Pixels that training has not learned from, view after view."""
 
-    counts: np.ndarray
-    """[n_views] int32: number of witnesses of each training view."""
-    pixels: np.ndarray
-    """[n_witnesses] int32: row * width + column within their view, ascending in each view."""
-    rgba: np.ndarray
-    """[n_witnesses, 4] uint8: their colours, sRGB and straight alpha."""
     whole: np.ndarray
     """[n_whole] int32, ascending: the views of which training draws no pixel at all."""
-
-    def views(self) -> np.ndarray:
-        """[n_witnesses] int64: the number of each witness's view."""
-        return np.repeat(np.arange(len(self.counts)), self.counts)
 
     def learned(self) -> np.ndarray:
         """[n_learned] int64, ascending: the views that training draws from."""
         return np.setdiff1d(np.arange(len(self.counts)), self.whole)
-
-    def rays(self, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions of the witnesses' rays, [n_witnesses, 3] float32 each, in the frame of
-        the `cameras`, one for each training view."""
-        of_views = np.split(self.pixels, np.cumsum(self.counts)[:-1])
-        rays = []
-        for camera, pixels in zip(cameras, of_views, strict=True):
-            rows, columns = np.divmod(pixels, camera.width)
-            rays.append(rays_of_pixels(camera, columns, rows, 0.0))
-        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
-        return rays_o, rays_d
-
-    def some(self, n: int) -> Witnesses:
-        """About `n` of the witnesses, spread evenly, or all if there are fewer."""
-        kept = np.arange(0, len(self.pixels), max(1, len(self.pixels) // n))
-        counts = np.bincount(self.views()[kept], minlength=len(self.counts)).astype(np.int32)
-        return Witnesses(counts, self.pixels[kept], self.rgba[kept], self.whole)
 
 
 def choose_witnesses(views: PosedImages) -> Witnesses:
@@ -92,7 +63,7 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     most = (MOST_OF_A_VIEW * n_pixels[learned]).astype(int)
     counts[learned] = np.minimum(_shares(N_WITNESSES - n_of_whole, len(learned)), most)
     random = np.random.default_rng(SEED)
-    pixels = [_spread(n, of, random) for n, of in zip(counts.tolist(), n_pixels.tolist(), strict=True)]
+    pixels = [spread(n, of, random) for n, of in zip(counts.tolist(), n_pixels.tolist(), strict=True)]
     rgba = [views.pixels(view, rows) for view, rows in enumerate(pixels)]
     return Witnesses(counts, np.concatenate(pixels).astype(np.int32), np.concatenate(rgba), whole)
 
@@ -111,9 +82,3 @@ def whole_views(n_views: int) -> np.ndarray:
 def _shares(total: int, n: int) -> np.ndarray:
     """[n] int64: whole numbers that differ by at most one and sum to `total`."""
     return np.diff(np.arange(n + 1) * total // max(n, 1))
-
-
-def _spread(n: int, of: int, random: np.random.Generator) -> np.ndarray:
-    """[n] int64, ascending: one of each of `n` equally long runs of the numbers below `of`, at random."""
-    edges = np.arange(n + 1) * of // max(n, 1)
-    return random.integers(edges[:-1], edges[1:])

@@ -4,12 +4,12 @@ only, and loads with `weights_only=True`.
 Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
 the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
 frame, as transforms.json text), sampler (below), state (the field's tensors), figures (what training
-measured), since version 2.1 witnesses (`vfr_bake.training.witness_tensors`), which are missing in older
-files, and since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where
-all pictures have the same. The sampler of an object is its occupancy grid: step (march step in model units),
-occupied (bits), resolution; that of an unbounded scene its proposals: near (model units), state (their
-tensors) and, since version 2.4, layouts (levels and finest resolution of each round's grid; 10 and 128, 10
-and 512 in older files).
+measured), since version 2.1 witnesses (`vfr_bake.training.pixel_tensors`), which are missing in older
+files, since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where all
+pictures have the same, and since version 2.5 training_pixels (`vfr_bake.training.pixel_tensors`). The
+sampler of an object is its occupancy grid: step (march step in model units), occupied (bits), resolution;
+that of an unbounded scene its proposals: near (model units), state (their tensors) and, since version 2.4,
+layouts (levels and finest resolution of each round's grid; 10 and 128, 10 and 512 in older files).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from player.cameras.transforms import parse_transforms, transforms_cameras, writ
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
 from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.data.view_pixels import ViewPixels
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
@@ -43,15 +44,15 @@ from vfr_bake.training.captures.picture_colours import (
     fitted,
     restore_colours,
 )
+from vfr_bake.training.pixel_tensors import pixel_content, restore_training_pixels, restore_witnesses
 from vfr_bake.training.tensor_files import check_kinds, check_plain, read_tensors, write_tensors
-from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 if TYPE_CHECKING:
     from vfr_bake.data.scene import Scene
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 4)
+VERSION = (2, 5)
 N_MEAN_VIEWS = 16
 """Cameras, spread over all, whose pictures give the mean colour of a scene."""
 
@@ -78,6 +79,9 @@ class Model:
     were any."""
     exposure: PictureColours | None = None
     """How the training views show the field's colours; None where all show them as they are."""
+    training_pixels: ViewPixels | None = None
+    """Pixels of the training views that training has learned from, and a bake learns from, too; None in the
+    models of before there were any."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -119,6 +123,15 @@ class Model:
             return self.witnesses
         return self.exposure.neutral(self.witnesses)
 
+    def training_pixel_rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins and unit directions of the training pixels' rays, [n, 3] float32 each, model frame, and the
+        colours that the field should have there, [n, 4] uint8; none of a model without training pixels."""
+        if self.training_pixels is None:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint8)
+        pixels = self.training_pixels
+        rgba = (pixels if self.exposure is None else self.exposure.neutral(pixels)).rgba
+        return *pixels.rays(self._in_model_frame()), rgba
+
     def _in_model_frame(self) -> list[Camera]:
         model_from_world = np.linalg.inv(self.world_from_model)
         return [camera.transformed(model_from_world) for camera in self.cameras]
@@ -135,6 +148,7 @@ def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Mo
         train={"data": scene.name} | trainer.settings,
         figures=figures,
         witnesses=trainer.witnesses,
+        training_pixels=trainer.training_pixels(),
     )
     if not trainer.effects.exposure_on:
         return model
@@ -172,7 +186,9 @@ def save_model(path: Path, model: Model) -> None:
         "figures": model.figures,
     }
     if model.witnesses is not None:
-        content["witnesses"] = witness_content(model.witnesses)
+        content["witnesses"] = pixel_content(model.witnesses)
+    if model.training_pixels is not None:
+        content["training_pixels"] = pixel_content(model.training_pixels)
     if model.exposure is not None:
         content["exposure"] = colours_content(model.exposure)
     write_tensors(path, content)
@@ -206,6 +222,10 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
     witnesses = None
     if "witnesses" in content:
         witnesses = restore_witnesses(content["witnesses"], cameras, f"{path}: witnesses")
+    training_pixels = None
+    if "training_pixels" in content:
+        where = f"{path}: training_pixels"
+        training_pixels = restore_training_pixels(content["training_pixels"], cameras, where)
     exposure = None
     if "exposure" in content:
         exposure = restore_colours(content["exposure"], len(cameras), f"{path}: exposure")
@@ -219,6 +239,7 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
         figures=content["figures"],
         witnesses=witnesses,
         exposure=exposure,
+        training_pixels=training_pixels,
     )
 
 

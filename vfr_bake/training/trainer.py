@@ -17,6 +17,7 @@ from player.cameras.camera import Camera
 from player.errors import ConfigError, TrainingError
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.view_pixels import ViewPixels, choose_training_pixels
 from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
@@ -28,7 +29,6 @@ from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
 from vfr_bake.training.ahead import Sampled, SecondThread
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
-from vfr_bake.training.captures.unmasked import unmasked_witnesses
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
 from vfr_bake.training.gradients import chosen_rays, scale_near_gradients
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
@@ -44,10 +44,10 @@ from vfr_bake.training.optimiser import (
     TableAdam,
     rate_factor,
 )
+from vfr_bake.training.pixel_tensors import pixel_content, restore_witnesses
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import Batch, DevicePixelSampler, PixelSampler
 from vfr_bake.training.scores.between import WitnessPsnr, witness_psnr
-from vfr_bake.training.witness_tensors import restore_witnesses, witness_content
 
 SOLID = 0.9
 """Opacity above which the exposure of a picture is looked at."""
@@ -122,7 +122,7 @@ class Trainer:
         # the batches of a GPU have detail enough.
         self._by_detail = scene.has_alpha and self.device.type == "cpu"
         witnesses = choose_witnesses(scene.train)
-        self._keep_apart(unmasked_witnesses(witnesses) if scene.masked else witnesses)
+        self._keep_apart(witnesses.opaque() if scene.masked else witnesses)
         self.minutes = config.minutes_for(self.device.type, scene.unbounded)
         """Minutes of training at most."""
         self.duration = Duration(self.pace.steps, self.minutes)
@@ -177,6 +177,20 @@ class Trainer:
         self._probe: WitnessErrors | None = None
         self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
         """Changing exposure, and things that move; its pictures are the views that are learned from."""
+
+    def training_pixels(self) -> ViewPixels:
+        """Pixels for a bake to learn from: of those that this training draws and learns from, too."""
+        learned = self.witnesses.learned()
+        found = choose_training_pixels(self._views, self.witnesses, learned)
+        if self._masked:
+            found = found.opaque()
+        views = found.views()
+        width, height = np.array([(camera.width, camera.height) for camera in self.cameras])[views].T
+        rows, columns = np.divmod(found.pixels, width)
+        places = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=1)
+        pictures = torch.from_numpy(np.searchsorted(learned, views))
+        still = self.effects.learned(pictures.to(self.device), torch.from_numpy(places).to(self.device))
+        return found if still is None else found.chosen(still.cpu().numpy())
 
     def _step_length(self) -> float:
         return 2.0 * self.config.step_cells / self._field.config.max_resolution
@@ -426,7 +440,7 @@ class Trainer:
             "adam": self._adam.state_dict(),
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
-            "witnesses": witness_content(self.witnesses),
+            "witnesses": pixel_content(self.witnesses),
             "pixels": self._pixels.position,
             "effects": self.effects.state(),
             "duration": self.duration.state(),

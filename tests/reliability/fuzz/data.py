@@ -114,6 +114,7 @@ def model_target(work: Path) -> Target:
     import torch
 
     from vfr_bake.config import FieldConfig
+    from vfr_bake.data.view_pixels import ViewPixels
     from vfr_bake.data.witnesses import Witnesses
     from vfr_bake.field.field import VfrField
     from vfr_bake.rendering.occupancy import OccupancyGrid
@@ -126,8 +127,10 @@ def model_target(work: Path) -> Target:
     counts[0] = 3
     rgba, whole = np.zeros((3, 4), np.uint8), np.array([len(cameras) - 1], np.int32)
     witnesses = Witnesses(counts, np.arange(3, dtype=np.int32), rgba, whole)
+    learned = ViewPixels(counts, np.arange(3, 6, dtype=np.int32), rgba)
     grid = OccupancyGrid(8, 0.2, seed=0)
-    save_model(path, Model(field, grid, np.eye(4), cameras, False, {}, {}, witnesses))
+    model = Model(field, grid, np.eye(4), cameras, False, {}, {}, witnesses, training_pixels=learned)
+    save_model(path, model)
     load_model(path)  # compiles, or reads what was compiled before
     whole = path.read_bytes()
     content = torch.load(path, weights_only=True)

@@ -13,13 +13,14 @@ import torch
 from player.cameras.camera import Camera
 from player.errors import ConfigError, FormatError, VersionError
 from vfr_bake.config import FieldConfig
+from vfr_bake.data.view_pixels import ViewPixels
 from vfr_bake.data.witnesses import N_WITNESSES, Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import FIRST_LAYOUTS, ProposalSampler
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model, load_model, save_model
-from vfr_bake.training.witness_tensors import witness_content
+from vfr_bake.training.pixel_tensors import pixel_content
 
 CONFIG = FieldConfig(n_levels=2, base_resolution=4, max_resolution=8, log2_table_size=10, head_width=8)
 
@@ -90,6 +91,22 @@ def test_a_model_of_before_there_were_witnesses_still_loads(saved: Path) -> None
         again.witness_rays()
 
 
+def test_training_pixels_come_back(model: Model, saved: Path) -> None:
+    """And are missing in a model of before there were any."""
+    assert load_model(saved).training_pixels is None
+    assert len(load_model(saved).training_pixel_rays()[2]) == 0
+    pixels = model.witnesses
+    assert pixels is not None
+    kept = ViewPixels(pixels.counts, pixels.pixels, pixels.rgba)
+    save_model(saved, replace(model, training_pixels=kept))
+    again = load_model(saved)
+    for name in ("counts", "pixels", "rgba"):
+        one, other = getattr(kept, name), getattr(again.training_pixels, name)
+        assert np.array_equal(one, other) and one.dtype == other.dtype
+    for found, expected in zip(again.training_pixel_rays(), (*model.witness_rays(), kept.rgba), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_as_many_witnesses_as_there_may_be_take_less_than_500_kb(model: Model, tmp_path: Path) -> None:
     camera = Camera("large", np.eye(4), 1000, 1000, 900.0, 900.0, 500.0, 500.0)
     counts, pixels = np.array([N_WITNESSES, 0], np.int32), np.arange(N_WITNESSES, dtype=np.int32)
@@ -102,7 +119,7 @@ def test_as_many_witnesses_as_there_may_be_take_less_than_500_kb(model: Model, t
     assert 0 < sizes[0] - sizes[1] < 500_000
     content = torch.load(tmp_path / "m.pt", weights_only=True)
     more = {"pixels": torch.arange(N_WITNESSES + 1, dtype=torch.int32)}
-    torch.save(content | {"witnesses": witness_content(many) | more}, tmp_path / "m.pt")
+    torch.save(content | {"witnesses": pixel_content(many) | more}, tmp_path / "m.pt")
     with pytest.raises(FormatError, match="pixels: expected at most 60,000, got 60,001"):
         load_model(tmp_path / "m.pt")
 
@@ -199,6 +216,11 @@ def test_cut_short(saved: Path, share: float) -> None:
         ({"witnesses": witnesses(whole=[-1])}, "whole: expected ascending numbers"),
         ({"witnesses": witnesses(whole=[0, 1])}, "whole: expected ascending numbers"),
         ({"witnesses": witnesses(whole=[[0]])}, "whole: expected ascending numbers"),
+        ({"training_pixels": None}, "training_pixels: expected dict, got NoneType"),
+        ({"training_pixels": witnesses(counts=[2.0, 3.0])}, "training_pixels: counts: expected a plain"),
+        ({"training_pixels": witnesses(counts=[6, -1])}, "training_pixels: counts: expected 5 pixels"),
+        ({"training_pixels": witnesses(pixels=[0, 47, 0, 1, 56])}, "training_pixels: pixels: expected ascen"),
+        ({"training_pixels": witnesses(rgba=torch.zeros(4, 4).byte())}, r"training_pixels: rgba: expected"),
     ],
 )
 def test_a_broken_key_is_named(saved: Path, values: dict, message: str) -> None:

@@ -232,6 +232,25 @@ def test_a_run_goes_on_with_the_witnesses_that_it_began_with(
     assert model.witnesses is again.witnesses and len(model.model_cameras()) == 19
 
 
+def test_pixels_for_a_bake_are_those_that_training_learns_from(scene: Scene) -> None:
+    """None of a witness, of what moves, or of what is masked."""
+    trainer = Trainer(scene, config(steps=3))
+    learned, every = trainer.witnesses.learned(), trainer.training_pixels()
+    assert (every.counts[learned] > 0).all() and not every.counts[trainer.witnesses.whole].any()
+    trainer.effects.moving_on = True
+    trainer.effects._left_out = trainer.effects._left_out.clone()
+    n_rows = trainer.effects._left_out.shape[1]
+    trainer.effects._left_out[5, n_rows // 2] = True  # cells across the middle of the sixth picture
+    camera, still = scene.train.cameras[learned[5]], trainer.training_pixels()
+    row_of_cells = (every.pixels // camera.width + 0.5) * n_rows // camera.height
+    moves = (every.views() == learned[5]) & (row_of_cells == n_rows // 2)
+    assert moves.any() and np.array_equal(still.pixels, every.pixels[~moves])
+    masked = Trainer(replace(scene, masked=True), config(steps=3)).training_pixels()
+    opaque = every.rgba[:, 3] == 255
+    assert 0 < len(masked.pixels) < len(every.pixels) and (masked.rgba[:, 3] == 255).all()
+    assert len(masked.pixels) >= opaque.sum(), "witnesses that are masked are none"
+
+
 def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:
     trainer = Trainer(scene, config(steps=3))
     save_checkpoint(tmp_path / "c", trainer)

@@ -7,7 +7,7 @@ Keys in the file: gains [n_views, 3] and offsets [n_views, 3], float32, of the t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 
 from player.errors import FormatError
 from player.files.json_files import brief
-from vfr_bake.data.witnesses import Witnesses
+from vfr_bake.data.view_pixels import SomePixels
 from vfr_bake.training.captures.exposure import fit, products
 from vfr_bake.training.tensor_files import check_kinds, check_plain
 
@@ -33,18 +33,18 @@ class PictureColours:
     offsets: np.ndarray
     """[n_views, 3] float32, of mean 0 over them; colours are 0 to 1."""
 
-    def neutral(self, witnesses: Witnesses) -> Witnesses:
-        """The same `witnesses` with the colours that the field would show: (y - o) / g, within 0 to 255.
+    def neutral(self, pixels: SomePixels) -> SomePixels:
+        """The same `pixels` with the colours that the field would show: (y - o) / g, within 0 to 255.
 
         >>> ones = np.ones((1, 3), np.float32)
-        >>> one = Witnesses(np.array([1]), np.array([0]), np.array([[90, 190, 50, 255]]), np.array([]))
+        >>> one = ViewPixels(np.array([1]), np.array([0]), np.array([[90, 190, 50, 255]]))
         >>> PictureColours(0.5 * ones, 0 * ones).neutral(one).rgba.tolist()
         [[180, 255, 100, 255]]
         """
-        views = witnesses.views()
-        rgb = (witnesses.rgba[:, :3] - 255 * self.offsets[views]) / self.gains[views]
-        rgba = np.concatenate([rgb.round().clip(0, 255), witnesses.rgba[:, 3:]], axis=1)
-        return Witnesses(witnesses.counts, witnesses.pixels, rgba.astype(np.uint8), witnesses.whole)
+        views = pixels.views()
+        rgb = (pixels.rgba[:, :3] - 255 * self.offsets[views]) / self.gains[views]
+        rgba = np.concatenate([rgb.round().clip(0, 255), pixels.rgba[:, 3:]], axis=1)
+        return replace(pixels, rgba=rgba.astype(np.uint8))
 
 
 def fitted(colours: np.ndarray, opacity: np.ndarray, rgba: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

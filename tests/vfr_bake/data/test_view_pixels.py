@@ -1,0 +1,65 @@
+"""Which pixels a model keeps for a bake to learn from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from tests.vfr_bake.data.test_witnesses import numbered_views
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.view_pixels import N_TRAINING_PIXELS, NEAR, ViewPixels, choose_training_pixels
+from vfr_bake.data.witnesses import choose_witnesses
+
+
+def opaque(views: PosedImages) -> PosedImages:
+    return replace(views, images=[image | np.array([0, 0, 0, 255], np.uint8) for image in views.images])
+
+
+def test_training_pixels_are_those_of_learned_views_but_for_witnesses() -> None:
+    views = opaque(numbered_views(24, 300, 260))
+    witnesses = choose_witnesses(views)
+    chosen = choose_training_pixels(views, witnesses, witnesses.learned())
+    counts = chosen.counts[witnesses.learned()]
+    assert not chosen.counts[witnesses.whole].any() and len(witnesses.whole)
+    assert (counts == N_TRAINING_PIXELS // len(counts)).all(), "alike many of every view"
+    kept, apart = (
+        set(zip(of.views().tolist(), of.pixels.tolist(), strict=True)) for of in (chosen, witnesses)
+    )
+    assert len(kept) == len(chosen.pixels) == chosen.counts.sum() <= N_TRAINING_PIXELS and not kept & apart
+    rgba = chosen.rgba.astype(np.int64)
+    assert np.array_equal(rgba[:, 0] + 256 * rgba[:, 1] + 65536 * rgba[:, 2], chosen.pixels)
+    again = choose_training_pixels(views, witnesses, witnesses.learned())
+    assert np.array_equal(again.pixels, chosen.pixels)
+
+
+def test_a_small_scene_keeps_every_pixel_but_its_witnesses() -> None:
+    views = opaque(numbered_views(3, 40, 30))
+    witnesses = choose_witnesses(views)
+    chosen = choose_training_pixels(views, witnesses, witnesses.learned())
+    assert len(chosen.pixels) + len(witnesses.pixels) == 3 * 40 * 30 and len(witnesses.pixels)
+
+
+@pytest.mark.parametrize("at", [(0, 0), (29, 99), (15, 50), (29, 3)])
+def test_of_a_transparent_view_only_what_is_near_something_is_kept(at: tuple[int, int]) -> None:
+    views = opaque(numbered_views(2, 100, 30))
+    alpha = np.zeros((30, 100), np.uint8)
+    alpha[at] = 1
+    views.images[1][..., 3] = alpha  # type: ignore[index]
+    none = ViewPixels(np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
+    radius = round(100 * NEAR)
+    around = binary_dilation(alpha, np.ones((2 * radius + 1, 2 * radius + 1)))
+    chosen = choose_training_pixels(views, none, np.array([1]))
+    assert np.array_equal(chosen.pixels, np.flatnonzero(around)) and chosen.counts.tolist() == [
+        0,
+        around.sum(),
+    ]
+
+
+def test_a_view_of_nothing_keeps_nothing() -> None:
+    views = opaque(numbered_views(2, 10, 10))
+    views.images[0][..., 3] = 0
+    none = ViewPixels(np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
+    assert choose_training_pixels(views, none, np.array([0, 1])).counts.tolist() == [0, 100]

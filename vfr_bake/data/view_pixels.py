@@ -1,0 +1,119 @@
+"""Pixels of training views with their colours, as a model file keeps them: the witnesses
+(`vfr_bake.data.witnesses`), and the training pixels, from which a bake learns what the photographs show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from player.cameras.camera import Camera
+from player.march.pixels import rays_of_pixels
+from vfr_bake.data.capture import PosedImages
+
+N_TRAINING_PIXELS = 1_000_000
+"""Number of training pixels at most: 8 MB of a model file."""
+NEAR = 1 / 32
+"""Of a view with transparent pixels only those are kept that are not farther than this share of its longer
+side from one that is not: farther away there is nothing to learn."""
+SEED = 21
+"""Seed of the choice of training pixels."""
+
+SomePixels = TypeVar("SomePixels", bound="ViewPixels")
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPixels:
+    """Pixels of some views, view after view."""
+
+    counts: np.ndarray
+    """[n_views] int32: number of the pixels of each training view."""
+    pixels: np.ndarray
+    """[n_pixels] int32: row * width + column within their view, ascending in each view."""
+    rgba: np.ndarray
+    """[n_pixels, 4] uint8: their colours, sRGB and straight alpha."""
+
+    def views(self) -> np.ndarray:
+        """[n_pixels] int64: the number of each pixel's view."""
+        return np.repeat(np.arange(len(self.counts)), self.counts)
+
+    def of_views(self) -> list[np.ndarray]:
+        """`pixels` of each view."""
+        return np.split(self.pixels, np.cumsum(self.counts)[:-1])
+
+    def rays(self, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions of the pixels' rays, [n_pixels, 3] float32 each, in the frame of the
+        `cameras`, one for each training view."""
+        rays = []
+        for camera, pixels in zip(cameras, self.of_views(), strict=True):
+            rows, columns = np.divmod(pixels, camera.width)
+            rays.append(rays_of_pixels(camera, columns, rows, 0.0))
+        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
+        return rays_o, rays_d
+
+    def chosen(self: SomePixels, kept: np.ndarray) -> SomePixels:
+        """The pixels with the numbers `kept`, ascending, or where `kept` [n_pixels] bool is true.
+
+        >>> rgba = np.array([[9, 9, 9, 255], [9, 9, 9, 0]], np.uint8)
+        >>> two = ViewPixels(np.array([0, 2], np.int32), np.array([3, 5], np.int32), rgba)
+        >>> second = two.chosen(np.array([1]))
+        >>> second.counts.tolist(), second.pixels.tolist(), two.opaque().pixels.tolist()
+        ([0, 1], [5], [3])
+        """
+        counts = np.bincount(self.views()[kept], minlength=len(self.counts)).astype(np.int32)
+        return replace(self, counts=counts, pixels=self.pixels[kept], rgba=self.rgba[kept])
+
+    def opaque(self: SomePixels) -> SomePixels:
+        """The pixels that are opaque."""
+        return self.chosen(self.rgba[:, 3] == 255)
+
+    def some(self: SomePixels, n: int) -> SomePixels:
+        """About `n` of the pixels, spread evenly, or all if there are fewer."""
+        return self.chosen(np.arange(0, len(self.pixels), max(1, len(self.pixels) // n)))
+
+
+def choose_training_pixels(views: PosedImages, witnesses: ViewPixels, learned: np.ndarray) -> ViewPixels:
+    """Choose pixels of training `views` that are no `witnesses`, as many of each of the views in `learned`,
+    spread evenly over it.
+
+    >>> from vfr_bake.data.demo import demo_views
+    >>> train, _ = demo_views(16, 3, 1)
+    >>> none = ViewPixels(np.zeros(3, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
+    >>> chosen = choose_training_pixels(train, none, np.array([0, 2]))
+    >>> chosen.counts[1], bool(chosen.counts[0] > 64), len(chosen.rgba) == chosen.counts.sum()
+    (np.int32(0), True, True)
+    """
+    random = np.random.default_rng(SEED)
+    counts, pixels = np.zeros(len(views.cameras), np.int32), []
+    of_views = witnesses.of_views()
+    for view in learned:
+        candidates = np.setdiff1d(_near_something(views, view), of_views[view])
+        n = min(N_TRAINING_PIXELS // len(learned), len(candidates))
+        kept = candidates[spread(n, len(candidates), random)]
+        counts[view] = len(kept)
+        pixels.append(kept)
+    rgba = [views.pixels(view, some) for view, some in zip(learned, pixels, strict=True)]
+    return ViewPixels(counts, np.concatenate(pixels).astype(np.int32), np.concatenate(rgba))
+
+
+def spread(n: int, of: int, random: np.random.Generator) -> np.ndarray:
+    """[n] int64, ascending: one of each of `n` equally long runs of the numbers below `of`, at random."""
+    edges = np.arange(n + 1) * of // max(n, 1)
+    return random.integers(edges[:-1], edges[1:])
+
+
+def _near_something(views: PosedImages, view: int) -> np.ndarray:
+    """[n] int64: the numbers of a view's pixels that are not far from all that is not transparent."""
+    camera = views.cameras[view]
+    if views.opaque(view):
+        return np.arange(camera.width * camera.height)
+    near, radius = views.images[view][..., 3] > 0, round(NEAR * max(camera.width, camera.height))
+    for axis in (0, 1):
+        wider = [(0, 0), (0, 0)]
+        wider[axis] = (radius + 1, radius)
+        before = np.cumsum(np.pad(near, wider), axis=axis)
+        behind = np.roll(before, -2 * radius - 1, axis=axis)
+        near = np.take(behind > before, np.arange(near.shape[axis]), axis=axis)
+    return np.flatnonzero(near)
