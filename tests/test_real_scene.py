@@ -101,5 +101,5 @@ def test_the_command_writes_the_view_that_the_renderer_makes(out: Path) -> None:
 def test_the_bake_says_what_it_lost(out: Path) -> None:
     figures = json.loads((out / "bake.json").read_text())
     assert figures["psnr_to_full_model"] > 28.5, "29.9 where it was measured"
-    assert -0.3 < figures["loss_db"] < 0.7 and 0 < figures["loss_db_spread"] < 0.3
+    assert -1.5 < figures["loss_db"] < 0.3 and 0 < figures["loss_db_spread"] < 0.3
     assert {"grid", "files"} <= {stage["name"] for stage in figures["stages"]}

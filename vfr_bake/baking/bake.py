@@ -32,7 +32,12 @@ from vfr_bake import __version__
 from vfr_bake.baking.agreement import compared_views, fitting_agreement
 from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
-from vfr_bake.baking.distillation import TeacherRays, render_teacher, with_field_features
+from vfr_bake.baking.distillation import (
+    TeacherRays,
+    photographed_rays,
+    render_teacher,
+    with_field_features,
+)
 from vfr_bake.baking.grids import (
     Layout,
     Parts,
@@ -58,7 +63,7 @@ from vfr_bake.baking.limits import (
     unwritten_asset,
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
-from vfr_bake.baking.plan import make_plan, refinement_seconds
+from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
 from vfr_bake.baking.rate import (
     AIM,
     FIRST_PRICE,
@@ -247,8 +252,14 @@ class _Bake:
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
-            views = cameras + views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
-            teacher = render_teacher(model, views, n_rays, 0, self._progress("teacher"))
+            views = views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
+            n_photographed = photographed(model, n_rays)
+            if not n_photographed:
+                views = cameras + views
+            teacher = render_teacher(model, views, n_rays - n_photographed, 0, self._progress("teacher"))
+            if n_photographed:
+                progress = self._progress("photographs")
+                teacher = teacher.and_those(photographed_rays(model, n_photographed, progress))
         with self._part("grid"):
             density = evaluate_densities(model, layout, self._progress("densities"))
             projection = self._projection(teacher)

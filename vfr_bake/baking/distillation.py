@@ -1,5 +1,5 @@
-"""Training data of the distillation: what the full model shows on rays, and what the player composes there,
-taken apart so that it can be trained.
+"""Training data of the refinement: what the full model and photographs show on rays, and what the player
+composes there, taken apart so that it can be trained.
 
 Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
 densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
@@ -33,7 +33,7 @@ from vfr_bake.training.model_file import Model
 RAYS_AT_ONCE = 1 << 12
 """Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 FIELD_RAYS_AT_ONCE = 1 << 13
-"""Rays whose field features are evaluated at once."""
+"""Rays on which the field is evaluated at once."""
 N_TYPICAL = 4096
 """Training rays that tell the typical size of composites."""
 
@@ -75,16 +75,17 @@ class Fetches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TeacherRays:
-    """n rays and what the full model shows on them."""
+    """n rays and what is to be shown on them: what the full model shows there, alone or in the mean with a
+    photograph."""
 
     rays_o: np.ndarray
     """[n, 3] float32, model frame."""
     rays_d: np.ndarray
     """[n, 3] float32, of unit length."""
     colours: np.ndarray
-    """[n, 3] float32 colours of the model times its opacity."""
+    """[n, 3] float32 colours times opacity."""
     opacity: np.ndarray
-    """[n] float32 opacity of the model."""
+    """[n] float32 opacity."""
 
     def some(self, n: int) -> TeacherRays:
         """n of the rays, spread evenly; all where there are no more."""
@@ -96,6 +97,11 @@ class TeacherRays:
     def chosen(self, rays: np.ndarray | slice) -> TeacherRays:
         """The rays with these numbers."""
         return TeacherRays(*(column[rays] for column in vars(self).values()))
+
+    def and_those(self, others: TeacherRays) -> TeacherRays:
+        """These rays and the `others` behind them."""
+        both = zip(vars(self).values(), vars(others).values(), strict=True)
+        return TeacherRays(*(np.concatenate(columns) for columns in both))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +155,27 @@ class TrainingRays:
         return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
 
 
+def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRays:
+    """At most `most` of the rays through the model's training pixels, spread evenly, and the mean of what the
+    photographs and the full model show there.
+
+    A photograph has what the model has not learned, and what no other photograph shows: noise, or a camera
+    that is a little wrong. The model's errors are others, so that the mean of both is nearer to what other
+    views show than either (docs/notes/2026-11-26-photographs-in-refinement.md).
+    """
+    rays_o, rays_d, rgba = model.training_pixel_rays()
+    shown = rgba.astype(np.float32) / 255
+    rays = TeacherRays(rays_o, rays_d, shown[:, :3] * shown[:, 3:], shown[:, 3].copy()).some(most)
+    n = len(rays.opacity)
+    for first in range(0, n, FIELD_RAYS_AT_ONCE):
+        some = slice(first, first + FIELD_RAYS_AT_ONCE)
+        colours, opacity = _shown(model, rays.rays_o[some], rays.rays_d[some])
+        rays.colours[some] += (colours - rays.colours[some]) / 2
+        rays.opacity[some] += (opacity - rays.opacity[some]) / 2
+        progress(min(first + FIELD_RAYS_AT_ONCE, n), n)
+    return rays
+
+
 def render_teacher(
     model: Model, cameras: list[Camera], n_rays: int, seed: int, progress: Progress
 ) -> TeacherRays:
@@ -160,13 +187,19 @@ def render_teacher(
         n_pixels = camera.width * camera.height
         some = random.choice(n_pixels, min(n_pixels, max(n_rays // len(cameras), 1)), replace=False)
         rays_o, rays_d = camera.rays_through(some)
-        features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
+        colours, opacity = _shown(model, rays_o, rays_d)
         met = np.flatnonzero(opacity > 0)
-        rays_o, rays_d, features, opacity = rays_o[met], rays_d[met], features[met], opacity[met]
-        colours = head_colours(model.field, features, rays_d) * opacity[:, None]
-        parts.append((rays_o, rays_d, colours, opacity))
+        parts.append((rays_o[met], rays_d[met], colours[met], opacity[met]))
         progress(done + 1, len(cameras))
     return TeacherRays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _shown(model: Model, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The full model's colours times opacity [n, 3] and opacity [n] float32 on rays [n, 3]."""
+    features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
+    colours, met = np.zeros((len(opacity), 3), np.float32), np.flatnonzero(opacity > 0)
+    colours[met] = head_colours(model.field, features[met], rays_d[met]) * opacity[met, None]
+    return colours, opacity
 
 
 def collect_training_rays(

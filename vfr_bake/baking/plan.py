@@ -32,20 +32,23 @@ from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
 """Bytes that Python, torch, numba and the model itself take."""
-N_RAYS = 8_000_000
-"""Rays that head and stored values are trained on, where there is memory for them: a third of them meets
+N_RAYS = 4_000_000
+"""Rays that head and stored values are trained on, where there is memory for them: half of them meet
 something. The fewer they are, the more what is stored suits them alone."""
 UNBOUNDED_RAYS = 1_000_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
+PHOTOGRAPHED = {False: 1 / 4, True: 1 / 2}
+"""Share of the rays that go through training pixels, where the model has so many, by whether the scene is
+unbounded: as many as of the others meet something."""
 RAYS_SHARE = 0.3
 """Share of the memory for cells and rays that rays may take at least, if they need it."""
 FEWEST_RAYS = 100_000
-RAYS_OF_CELL = 2.7
+RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
-RAY_BYTES = {False: 40, True: 120}
-"""Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what the model shows,
-twice that for those that meet something in the grid, too, and as much again while they are put together. A
-third of an object's rays meets something."""
+RAY_BYTES = {False: 60, True: 120}
+"""Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what is to be shown,
+twice that for those that meet something in the grid, too, and as much again while they are put together.
+Half of an object's rays meet something."""
 CHANNEL_BYTES = 8.5
 """Bytes that a stored channel takes in a cell, which has about 1.3 vertices, when codes are chosen: the two
 of what was trained, and one each of the codes that are tried, of the best ones so far, and of those that are
@@ -182,6 +185,12 @@ def _cells(model: Model, resolution: int) -> float:
     return float(np.count_nonzero(occupied_cells(model, resolution)))
 
 
+def photographed(model: Model, n_rays: int) -> int:
+    """How many of so many training rays go through training pixels of the model."""
+    n_pixels = 0 if model.training_pixels is None else len(model.training_pixels.pixels)
+    return min(int(PHOTOGRAPHED[model.field.config.unbounded] * n_rays), n_pixels)
+
+
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     """How long the bake will take, seconds, from how long the teacher takes for some rays here."""
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
@@ -193,15 +202,17 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     shown = render_teacher(model, views, n_rays, 1, lambda done, of: None)
     ray_seconds = (time.perf_counter() - begin) / n_rays
     fine, coarse = plan.resolutions
-    n_all = plan.n_rays(plan.n_cells)
+    n_all, met = plan.n_rays(plan.n_cells), len(shown.opacity) / n_rays
+    n_photographed = photographed(model, n_all)
+    n_met = n_photographed + met * (n_all - n_photographed)
     n_vertices = plan.n_cells * (1 + (fine / coarse) ** 3)
-    work = n_all + VERTEX_COST[unbounded] * n_vertices
+    work = n_met / max(met, 1e-3) + VERTEX_COST[unbounded] * n_vertices
     if unbounded:
         work += SEEN_COST[True] * rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
         steps = max(model.occupancy.step * coarse / 2, 1.0)
         work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
-    n_steps = refined_steps(config, choice, n_all * len(shown.opacity) / n_rays)
+    n_steps = refined_steps(config, choice, n_met)
     refined = n_steps * BATCH * STEP_COST[unbounded]
     refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)

@@ -1,9 +1,9 @@
 """Head, stored features and densities adapted to each other, and what they are tuned for: how many lookups a
 ray, and a head in 8 bits or not.
 
-Grid, projection, 8-bit codes and the choice of k samples change the composited features a little. The full
-model is the teacher of a distillation: the folded head is trained, from its exact weights on, to give the
-full model's colours from the features that the player composes out of the baked arrays, and the stored
+Grid, projection, 8-bit codes and the choice of k samples change the composited features a little. So the
+folded head is trained, from its exact weights on, to give the colours of the full model, and those of
+photographs, from the features that the player composes out of the baked arrays, and the stored
 features with it. Codes are rounded where they are composed, and are trained as if they were not (straight
 through).
 """

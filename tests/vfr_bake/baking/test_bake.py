@@ -250,7 +250,7 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     share: float, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=8, k=4, refine_steps=20)
-    work = _Bake(model, config, quiet)
+    work = _Bake(replace(model, training_pixels=None), config, quiet)  # so that 8 bits do lose something
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
     monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)

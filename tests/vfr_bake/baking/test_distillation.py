@@ -1,19 +1,41 @@
-"""Training rays out of teacher rays: those that meet nothing are left out, and none at all is an error."""
+"""What a bake learns from: rays through photographs, and training rays out of teacher rays, of which those
+that meet nothing are left out, and none at all is an error."""
 
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from player.asset.asset import Asset
+from player.cameras.views import asset_cameras
 from player.errors import TrainingError
+from player.render import Renderer
 from tests.numerics.fog import FEATURE, fog
-from vfr_bake.baking.distillation import TeacherRays, collect_training_rays
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.distillation import TeacherRays, collect_training_rays, photographed_rays
 from vfr_bake.baking.grids import latent
+from vfr_bake.config import BakeConfig
+from vfr_bake.data.view_pixels import ViewPixels
+from vfr_bake.rendering.render import head_colours, render_image
+from vfr_bake.training.captures.picture_colours import PictureColours
+from vfr_bake.training.model_file import Model
 
 ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
 """Where rays along x begin that meet the box, and that pass it."""
+DARKER = 0.2
+"""Share of the colours that the model has learned which photographs show here."""
+
+
+def quiet(done: int, of: int) -> None:
+    pass
+
+
+def darker(pixels: ViewPixels) -> np.ndarray:
+    return (pixels.rgba * np.array([DARKER, DARKER, DARKER, 1])).astype(np.uint8)
 
 
 def teacher_rays(origins: list[tuple[float, float, float]]) -> TeacherRays:
@@ -73,3 +95,58 @@ def test_some_rays_are_spread_evenly() -> None:
     rays = teacher_rays([ALONG] * 10)
     assert rays.some(4).colours[:, 0].tolist() == [0, 6, 15, 21]
     assert rays.some(10) is rays and rays.some(99) is rays
+
+
+def test_an_asset_shows_what_the_photographs_show(model: Model, tmp_path: Path) -> None:
+    """Their colours are darker here than those that the model has learned."""
+    assert model.witnesses is not None and model.training_pixels is not None
+    other = replace(
+        model,
+        witnesses=replace(model.witnesses, rgba=darker(model.witnesses)),
+        training_pixels=replace(model.training_pixels, rgba=darker(model.training_pixels)),
+    )
+    config = BakeConfig(resolution=48, feature_resolution=32, mesh_resolution=16, refine_steps=200)
+    result = bake(other, tmp_path / "asset", replace(config, check_views=1), lambda stage, done, of: None)
+    assert result.loss.db < -1.5, "it shows less error than the model does"
+    with Renderer(Asset.open(tmp_path / "asset")) as renderer:
+        played = renderer.render(asset_cameras(renderer.asset)[0], background=(0.0, 0.0, 0.0)).rgb
+    shown = render_image(model.field, model.sampler, model.model_cameras()[0], np.zeros(3))
+    assert (1 + DARKER) / 2 - 0.1 < played.sum() / shown.sum() < 0.9, "their mean, and the model"
+
+
+def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) -> None:
+    pixels = model.training_pixels
+    assert pixels is not None
+    rays = photographed_rays(model, 10**9, quiet)
+    shown = pixels.rgba / 255
+    views, rows = pixels.views(), pixels.of_views()
+    for view in (0, int(views[-1])):
+        camera = model.cameras[view].transformed(np.linalg.inv(model.world_from_model))
+        origins, directions = camera.rays_through(rows[view])
+        features, opacity, _ = model.sampler.composited_features(model.field, origins, directions)
+        colours = head_colours(model.field, features, directions) * opacity[:, None]
+        of_view = views == view
+        np.testing.assert_allclose(rays.rays_o[of_view], origins, atol=1e-6)
+        np.testing.assert_allclose(rays.rays_d[of_view], directions, atol=1e-6)
+        np.testing.assert_allclose(rays.opacity[of_view], (opacity + shown[of_view, 3]) / 2, atol=1e-5)
+        photographed = shown[of_view, :3] * shown[of_view, 3:]
+        np.testing.assert_allclose(rays.colours[of_view], (colours + photographed) / 2, atol=1e-4)
+    assert len(photographed_rays(model, 100, quiet).opacity) == 100
+
+
+def test_photographs_of_another_exposure_show_what_the_field_has(model: Model) -> None:
+    assert model.training_pixels is not None
+    n = len(model.training_pixels.counts)
+    exposure = PictureColours(np.full((n, 3), 0.5, np.float32), np.zeros((n, 3), np.float32))
+    dim = replace(
+        model.training_pixels, rgba=(model.training_pixels.rgba * [0.5, 0.5, 0.5, 1]).astype(np.uint8)
+    )
+    rays, expected = (
+        photographed_rays(replace(model, training_pixels=dim, exposure=exposure), 10**9, quiet),
+        photographed_rays(model, 10**9, quiet),
+    )
+    np.testing.assert_allclose(rays.colours, expected.colours, atol=2.01 / 255)
+
+
+def test_a_model_without_training_pixels_has_no_photographed_rays(model: Model) -> None:
+    assert len(photographed_rays(replace(model, training_pixels=None), 100, quiet).opacity) == 0
