@@ -75,23 +75,24 @@ class ViewPixels:
 
 
 def choose_training_pixels(views: PosedImages, witnesses: ViewPixels, learned: np.ndarray) -> ViewPixels:
-    """Choose pixels of training `views` that are no `witnesses`, as many of each of the views in `learned`,
-    spread evenly over it.
+    """Choose pixels of training `views`, as many of each of the views in `learned`, spread evenly over it;
+    leave out those that are `witnesses`.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 3, 1)
     >>> none = ViewPixels(np.zeros(3, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
     >>> chosen = choose_training_pixels(train, none, np.array([0, 2]))
-    >>> chosen.counts[1], bool(chosen.counts[0] > 64), len(chosen.rgba) == chosen.counts.sum()
-    (np.int32(0), True, True)
+    >>> chosen.counts[1] == 0, chosen.counts[0] > 64, len(chosen.rgba) == chosen.counts.sum()
+    (np.True_, np.True_, np.True_)
     """
     random = np.random.default_rng(SEED)
     counts, pixels = np.zeros(len(views.cameras), np.int32), []
     of_views = witnesses.of_views()
     for view in learned:
-        candidates = np.setdiff1d(_near_something(views, view), of_views[view])
-        n = min(N_TRAINING_PIXELS // len(learned), len(candidates))
-        kept = candidates[spread(n, len(candidates), random)]
+        near = None if views.opaque(view) else _near_something(views.images[view][..., 3])
+        of = views.cameras[view].width * views.cameras[view].height if near is None else len(near)
+        kept = spread(min(N_TRAINING_PIXELS // len(learned), of), of, random)
+        kept = np.setdiff1d(kept if near is None else near[kept], of_views[view])
         counts[view] = len(kept)
         pixels.append(kept)
     rgba = [views.pixels(view, some) for view, some in zip(learned, pixels, strict=True)]
@@ -104,16 +105,14 @@ def spread(n: int, of: int, random: np.random.Generator) -> np.ndarray:
     return random.integers(edges[:-1], edges[1:])
 
 
-def _near_something(views: PosedImages, view: int) -> np.ndarray:
-    """[n] int64: the numbers of a view's pixels that are not far from all that is not transparent."""
-    camera = views.cameras[view]
-    if views.opaque(view):
-        return np.arange(camera.width * camera.height)
-    near, radius = views.images[view][..., 3] > 0, round(NEAR * max(camera.width, camera.height))
+def _near_something(alpha: np.ndarray) -> np.ndarray:
+    """[n] int64: the numbers of those pixels of a view with this `alpha` [height, width] that are not far
+    from all that is not transparent."""
+    near, radius = alpha > 0, round(NEAR * max(alpha.shape))
     for axis in (0, 1):
         wider = [(0, 0), (0, 0)]
         wider[axis] = (radius + 1, radius)
-        before = np.cumsum(np.pad(near, wider), axis=axis)
+        before = np.cumsum(np.pad(near, wider), axis=axis, dtype=np.int32)
         behind = np.roll(before, -2 * radius - 1, axis=axis)
         near = np.take(behind > before, np.arange(near.shape[axis]), axis=axis)
     return np.flatnonzero(near)

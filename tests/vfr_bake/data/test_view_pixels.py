@@ -24,7 +24,8 @@ def test_training_pixels_are_those_of_learned_views_but_for_witnesses() -> None:
     chosen = choose_training_pixels(views, witnesses, witnesses.learned())
     counts = chosen.counts[witnesses.learned()]
     assert not chosen.counts[witnesses.whole].any() and len(witnesses.whole)
-    assert (counts == N_TRAINING_PIXELS // len(counts)).all(), "alike many of every view"
+    most = N_TRAINING_PIXELS // len(counts)
+    assert (counts <= most).all() and (counts > 0.95 * most).all(), "alike many of every view"
     kept, apart = (
         set(zip(of.views().tolist(), of.pixels.tolist(), strict=True)) for of in (chosen, witnesses)
     )

@@ -36,6 +36,7 @@ class PictureColours:
     def neutral(self, pixels: SomePixels) -> SomePixels:
         """The same `pixels` with the colours that the field would show: (y - o) / g, within 0 to 255.
 
+        >>> from vfr_bake.data.view_pixels import ViewPixels
         >>> ones = np.ones((1, 3), np.float32)
         >>> one = ViewPixels(np.array([1]), np.array([0]), np.array([[90, 190, 50, 255]]))
         >>> PictureColours(0.5 * ones, 0 * ones).neutral(one).rgba.tolist()
