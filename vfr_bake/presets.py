@@ -78,17 +78,17 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=512,
     ),
     "fast": BakeChoice(
-        cells_per_pixel=1.3, contracted_resolution=640, feature_share=0.58, culled_loss_db=0.1,
-        n_channels=12, channel_loss_db=0.5, n_fetches=12, sample_loss_db=0.15,
-        code_loss_db=0.15, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=112, target_loss_db=1.0,
+        cells_per_pixel=1.45, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
+        n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.15,
+        code_loss_db=0.2, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        head_bands=3, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=112, target_loss_db=1.2,
         page_mb=512,
     ),
     "phone": BakeChoice(
-        cells_per_pixel=1.3, contracted_resolution=896, feature_share=0.58, culled_loss_db=0.1,
-        n_channels=12, channel_loss_db=0.5, n_fetches=8, sample_loss_db=0.3,
-        code_loss_db=0.3, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
+        cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
+        n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
+        code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        head_bands=3, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
         page_mb=384,
     ),
 }  # fmt: skip
@@ -106,8 +106,14 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "head_bands": 5,
         "target_loss_db": 0.5,
     },
-    "fast": {"refine_steps": 800},
-    "phone": {"contracted_resolution": 1280, "refine_steps": 800, "feature_share": 1.0, "n_channels": 16},
+    "fast": {
+        "refine_steps": 800,
+        "feature_share": 0.58,
+        "n_channels": 12,
+        "channel_loss_db": 0.5,
+        "code_loss_db": 0.15,
+    },
+    "phone": {"refine_steps": 800, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.3},
 }
 """What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
 which take their time; its features are most of what a grid of so few cells loses."""
