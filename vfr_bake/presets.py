@@ -79,16 +79,16 @@ PRESETS: dict[Preset, BakeChoice] = {
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.45, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
-        n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.15,
+        n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.2, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=112, target_loss_db=1.2,
+        head_bands=3, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.2,
         page_mb=512,
     ),
     "phone": BakeChoice(
         cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
+        head_bands=3, head_bits=8, refine_steps=1800, minutes=8, mesh_resolution=64, target_loss_db=1.5,
         page_mb=384,
     ),
 }  # fmt: skip
@@ -111,6 +111,7 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "feature_share": 0.58,
         "n_channels": 12,
         "channel_loss_db": 0.5,
+        "sample_loss_db": 0.15,
         "code_loss_db": 0.15,
     },
     "phone": {"refine_steps": 800, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.3},
