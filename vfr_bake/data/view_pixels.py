@@ -16,8 +16,8 @@ from vfr_bake.data.capture import PosedImages
 N_TRAINING_PIXELS = 1_000_000
 """Number of training pixels at most: 8 MB of a model file."""
 NEAR = 1 / 32
-"""Of a view with transparent pixels only those are kept that are not farther than this share of its longer
-side from one that is not: farther away there is nothing to learn."""
+"""Share of a view's longer side. If a view has transparent pixels, those that are farther than this from
+everything else are not kept: there is nothing to learn from them."""
 SEED = 21
 """Seed of the choice of training pixels."""
 

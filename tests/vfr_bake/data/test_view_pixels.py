@@ -48,7 +48,7 @@ def test_of_a_transparent_view_only_what_is_near_something_is_kept(at: tuple[int
     views = opaque(numbered_views(2, 100, 30))
     alpha = np.zeros((30, 100), np.uint8)
     alpha[at] = 1
-    views.images[1][..., 3] = alpha  # type: ignore[index]
+    views.images[1][..., 3] = alpha
     none = ViewPixels(np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
     radius = round(100 * NEAR)
     around = binary_dilation(alpha, np.ones((2 * radius + 1, 2 * radius + 1)))
