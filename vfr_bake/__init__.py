@@ -5,6 +5,10 @@ import os
 __version__ = "0.1.0"
 
 # OpenMP's threads, torch's and numba's alike, wait for work in a busy loop unless told otherwise, and take
-# the cores from whatever else runs: two trainings at once on two cores took 151 s instead of 24. Alone, a
-# training is no slower without it. OpenMP reads this once, when torch or numba is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# the cores from whatever else runs: two trainings at once on two cores took 151 s instead of 24. Threads that
+# sleep at once come too late for the next of many small operations, and refinement takes 1.4 times as long.
+# So they look some 20 microseconds for work, and then sleep. OpenMP reads this once, when torch or numba is
+# imported.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
