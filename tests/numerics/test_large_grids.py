@@ -28,7 +28,14 @@ from tests.player.march.test_march import random_rays
 from vfr_bake.baking.distillation import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.density import Limits
-from vfr_bake.kernels.stored_features import PARTS, compose, descend, descend_density
+from vfr_bake.kernels.latent_rows import PARTS
+from vfr_bake.kernels.stored_features import (
+    compose,
+    descend,
+    descend_density,
+    interpolate,
+    padded,
+)
 
 F32 = np.float32
 N_CHANNELS = 10
@@ -170,7 +177,8 @@ def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
     far = near + np.int32(n_rows - 1000)
     shares = rng.uniform(0, 1, (50, 8)).astype(F32)
     starts, weights = np.arange(0, 51, 10), rng.uniform(0, 1, 50).astype(F32)
-    gradient = rng.normal(size=(5, N_CHANNELS)).astype(F32)
+    gradient = np.zeros((5, padded(N_CHANNELS)), F32)
+    gradient[:, :N_CHANNELS] = rng.normal(size=(5, N_CHANNELS))
     small = rng.integers(0, 100 * PARTS, (1000, N_CHANNELS)).astype(np.int16)
     codes = rng.uniform(0, 100, 1000).astype(F32)
     large, large_codes = zeros((n_rows, N_CHANNELS), np.int16), zeros(MOST_ROWS, F32)
@@ -179,8 +187,10 @@ def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
     for latent, rows in ((small, near), (large, far)):
         composites, steepness = np.empty((5, N_CHANNELS), F32), zeros(len(latent), F32)
         compose(starts, rows, shares, weights, latent, composites)
+        interpolated = np.empty((50, padded(N_CHANNELS)), F32)
+        interpolate(rows, shares, weights, latent, interpolated)
         descend(starts, rows, shares, weights, gradient, F32(0.5), 2, latent, steepness, 3)
-        out.append((composites, latent[-1000:], steepness[-1000:]))
+        out.append((composites, interpolated[:, :N_CHANNELS], latent[-1000:], steepness[-1000:]))
     for latent, offset in ((codes, 0), (large_codes, MOST_ROWS - 1000)):
         steepness = zeros(len(latent), F32)
         descend_density(near + np.int32(offset), shares, weights, F32(0.5), 2, latent, steepness)

@@ -26,7 +26,7 @@ from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
 from player.march.march import MIN_OPACITY, MarchResult
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, unit_points
-from vfr_bake.kernels.stored_features import compose, corner_rows
+from vfr_bake.kernels.stored_features import compose, composite, corner_rows, interpolate, padded, take_runs
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
@@ -34,6 +34,8 @@ RAYS_AT_ONCE = 1 << 12
 """Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
 FIELD_RAYS_AT_ONCE = 1 << 13
 """Rays on which the field is evaluated at once."""
+MOST_KEPT = 20_000_000
+"""Samples of training rays that are kept at most: 320 MB. Memory is taken for those alone that there are."""
 N_TYPICAL = 4096
 """Training rays that tell the typical size of composites."""
 
@@ -72,6 +74,18 @@ class Fetches(NamedTuple):
         compose(self.starts, *self.features, self.weights, features, out)
         return out
 
+    def interpolate(self, features: np.ndarray) -> np.ndarray:
+        """[n_fetches, `padded(n_channels)`] float32: latent features at each fetch, rounded to codes."""
+        out = np.empty((len(self.weights), padded(features.shape[1])), np.float32)
+        interpolate(*self.features, self.weights, features, out)
+        return out
+
+    def composite(self, values: np.ndarray, n_channels: int) -> np.ndarray:
+        """[n, n_channels] float32 composites of what `interpolate` gives."""
+        out = np.empty((len(self.opacity), n_channels), np.float32)
+        composite(self.starts, self.weights, values, out)
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class TeacherRays:
@@ -107,8 +121,8 @@ class TeacherRays:
 @dataclass(frozen=True, eq=False)
 class TrainingRays:
     """n of the teacher's rays, and the baked grid, in which all of them meet something. What a ray fetches is
-    found whenever a batch needs it: that takes a tenth of a step's time, and the samples of all rays would
-    take more memory than the grid where there is fog."""
+    found whenever a batch needs it, for the samples of all rays would take more memory than the grid where
+    there is fog. Where there is none they are kept, which saves a quarter of a step's time."""
 
     teacher: TeacherRays
     grid: SparseGrid
@@ -117,6 +131,8 @@ class TrainingRays:
     """The player's k, 0 for every sample."""
     densities: VertexRows | None
     """Rows of the stored densities where they are trained too."""
+    samples: KeptSamples | None = None
+    """Where all rays have samples, if that is kept."""
 
     def __len__(self) -> int:
         return len(self.teacher.opacity)
@@ -125,19 +141,38 @@ class TrainingRays:
         """n of the rays, spread evenly; all where there are no more."""
         return replace(self, teacher=self.teacher.some(n))
 
+    def with_samples(self) -> TrainingRays:
+        """The rays with all their samples kept, for whoever needs them many times and weighs them himself.
+        Without where they are too many, and in contracted space, where the grid takes the memory."""
+        return self if self.grid.contracted else replace(self, samples=_all_samples(self))
+
     def fetches(self, some: np.ndarray) -> Fetches:
-        """The fetches of the rays whose numbers are in `some`, in that order."""
+        """The fetches of the rays whose numbers are in `some`, in that order. With kept `samples` the weights
+        and the opacity are left for `weigh` to fill in."""
+        if self.samples is not None:
+            starts, points, lengths = self.samples.of(some)
+            weights, opacity = np.empty_like(lengths), np.empty(len(some), np.float32)
+            return self._placed(starts, points, weights, lengths, opacity)
         rays_o, rays_d = self.teacher.rays_o[some], self.teacher.rays_d[some]
         found = player_fetches(self.grid, rays_o, rays_d, self.n_fetches)
         counts, opacity = np.zeros(len(some), np.int64), np.zeros(len(some), np.float32)
         counts[found.hits], opacity[found.hits] = found.counts, found.opacity
         starts = np.concatenate([[0], np.cumsum(counts)])
-        of_features = corners(self.grid.rows, found.points * self.grid.feature_scale, MIN_TOTAL)
+        return self._placed(starts, found.points, found.weights, found.lengths, opacity)
+
+    def _placed(
+        self,
+        starts: np.ndarray,
+        points: np.ndarray,
+        weights: np.ndarray,
+        lengths: np.ndarray,
+        opacity: np.ndarray,
+    ) -> Fetches:
+        """The fetches at `points` [n_fetches, 3], cells of the densities' grid."""
+        of_features = corners(self.grid.rows, points * self.grid.feature_scale, MIN_TOTAL)
         none = Corners(np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32))
-        of_densities = (
-            none if self.densities is None else corners(self.densities, found.points, np.float32(0))
-        )
-        return Fetches(starts, of_features, of_densities, found.weights, found.lengths, opacity)
+        of_densities = none if self.densities is None else corners(self.densities, points, np.float32(0))
+        return Fetches(starts, of_features, of_densities, weights, lengths, opacity)
 
     def composed(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """([n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded; [n]
@@ -153,6 +188,41 @@ class TrainingRays:
         """[n_channels] mean size of the composites of `codes` over some of the rays; never 0."""
         composites, _ = self.some(N_TYPICAL).composed(codes)
         return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
+
+
+class KeptSamples(NamedTuple):
+    """Where n rays have samples, at every one of which the player fetches."""
+
+    starts: np.ndarray
+    """[n + 1] int64: ray i has the samples starts[i] to starts[i + 1]."""
+    points: np.ndarray
+    """[n_samples, 3] float32 places, cells of the densities' grid."""
+    lengths: np.ndarray
+    """[n_samples] float32 length of the ray that a sample stands for, model units."""
+
+    def of(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(starts, points, lengths) of the rays whose numbers are in `some`, in that order."""
+        starts = np.concatenate([[0], np.cumsum(self.starts[some + 1] - self.starts[some])])
+        points, lengths = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
+        take_runs(some, self.starts, self.points, self.lengths, starts, points, lengths)
+        return starts, points, lengths
+
+
+def _all_samples(rays: TrainingRays) -> KeptSamples | None:
+    """All samples of `rays`; None where they are more than MOST_KEPT."""
+    n_rays, n = len(rays), 0
+    counts = np.zeros(n_rays, np.int64)
+    points, lengths = np.empty((MOST_KEPT, 3), np.float32), np.empty(MOST_KEPT, np.float32)
+    for first in range(0, n_rays, RAYS_AT_ONCE):
+        some = slice(first, first + RAYS_AT_ONCE)
+        found = player_fetches(rays.grid, rays.teacher.rays_o[some], rays.teacher.rays_d[some], 0)
+        end = n + len(found.lengths)
+        if end > MOST_KEPT:
+            return None
+        points[n:end], lengths[n:end] = found.points, found.lengths
+        counts[first + found.hits] = found.counts
+        n = end
+    return KeptSamples(np.concatenate([[0], np.cumsum(counts)]), points[:n], lengths[:n])
 
 
 def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRays:

@@ -31,7 +31,8 @@ from player.asset.single_level import VertexBricks, from_vertices
 from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels.stored_features import LARGEST_LATENT, PARTS, PARTS_BITS, table
+from vfr_bake.kernels.latent_rows import LARGEST_LATENT, PARTS, PARTS_BITS
+from vfr_bake.kernels.stored_features import table
 from vfr_bake.training.model_file import Model
 
 SLAB = 64

@@ -45,10 +45,10 @@ RAYS_SHARE = 0.3
 FEWEST_RAYS = 100_000
 RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
-RAY_BYTES = {False: 60, True: 120}
+RAY_BYTES = {False: 130, True: 120}
 """Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what is to be shown,
 twice that for those that meet something in the grid, too, and as much again while they are put together.
-Half of an object's rays meet something."""
+Half of an object's rays meet something, and their samples are kept, eight or nine of 16 bytes."""
 CHANNEL_BYTES = 8.5
 """Bytes that a stored channel takes in a cell, which has about 1.3 vertices, when codes are chosen: the two
 of what was trained, and one each of the codes that are tried, of the best ones so far, and of those that are
@@ -65,7 +65,7 @@ VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
 fast as the millions of a bake."""
-STEP_COST, HEAD_COST = {False: 6.0, True: 0.8}, {False: 1.3, True: 0.6}
+STEP_COST, HEAD_COST = {False: 3.8, True: 0.7}, {False: 1.3, True: 0.6}
 """Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
 unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
 and the following count what one thread waits for on two cores

@@ -44,7 +44,7 @@ from vfr_bake.baking.distillation import TeacherRays, collect_training_rays
 from vfr_bake.baking.grids import Layout, codes
 from vfr_bake.baking.head import FoldedHead
 from vfr_bake.baking.refinement import Stored
-from vfr_bake.kernels.stored_features import slants
+from vfr_bake.kernels.stored_features import padded, slants
 from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_coarser
 
 RAYS_AT_ONCE = 1 << 12
@@ -127,27 +127,30 @@ def importance(
     head, random = FoldedHead(stored.head, ranges=ranges), np.random.default_rng(0)
     of_densities, of_features = (np.zeros(len(v), np.float32) for v in (stored.density, stored.features))
     changed = np.zeros_like(of_densities), np.zeros_like(of_features)
-    of_channels = np.zeros(stored.features.shape[1])
+    n_channels = stored.features.shape[1]
+    of_channels = np.zeros(n_channels)
     behind = torch.from_numpy(background.astype(np.float32))
     for first in range(0, len(rays), RAYS_AT_ONCE):
         some = np.arange(first, min(first + RAYS_AT_ONCE, len(rays)))
         fetches = rays.fetches(some)
-        composed = torch.from_numpy(fetches.compose(stored.features)).requires_grad_()
+        values = fetches.interpolate(stored.features)
+        composed = torch.from_numpy(fetches.composite(values, n_channels)).requires_grad_()
         opacity = torch.from_numpy(fetches.opacity).requires_grad_()
         shown = (head(composed, torch.from_numpy(rays.teacher.rays_d[some])) - behind) * opacity[:, None]
         signs = torch.from_numpy(random.choice(np.array([-1, 1], np.float32), (len(some), 3)))
         along, along_opacity = torch.autograd.grad((shown * signs).sum(), (composed, opacity))
-        gradient = np.ascontiguousarray(along.numpy())
-        squares = gradient.astype(np.float64) ** 2
+        gradient = np.zeros((len(some), padded(n_channels)), np.float32)
+        gradient[:, :n_channels] = along.numpy()
+        squares = gradient[:, :n_channels].astype(np.float64) ** 2
         of_channels += squares.sum(axis=0)
         size = np.sqrt(squares.sum(axis=1)).astype(np.float32)
         slopes = np.repeat(size, np.diff(fetches.starts)) * fetches.weights
         add_squares(fetches.starts, *fetches.features, slopes, changed[1], of_features)
         slopes = np.empty(len(fetches.weights), np.float32)
         slants(
-            fetches.starts, *fetches.features, *fetches.densities, fetches.weights, fetches.opacity,
-            stored.features, gradient, along_opacity.numpy(), grid.density_low, grid.density_slope,
-            fetches.lengths, stored.density, slopes,
+            fetches.starts, *fetches.densities, fetches.weights, fetches.opacity, values, gradient,
+            along_opacity.numpy(), grid.density_low, grid.density_slope, fetches.lengths, stored.density,
+            slopes,
         )  # fmt: skip
         add_squares(fetches.starts, *fetches.densities, slopes, changed[0], of_densities)
     n = np.float32(3 * len(rays))

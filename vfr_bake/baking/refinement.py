@@ -32,7 +32,7 @@ from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
 from vfr_bake.config import BakeConfig
-from vfr_bake.kernels.stored_features import descend, descend_density, slants, weigh
+from vfr_bake.kernels.stored_features import descend, descend_density, padded, slants, weigh
 from vfr_bake.presets import BakeChoice
 from vfr_bake.training.muon import Muon
 
@@ -382,7 +382,9 @@ def refine(
     features, density = stored.features, stored.density.copy()
     squares, density_squares = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     low, slope = decode_constants(density_range or (0.0, 0.0))
-    n_parts = get_num_threads()
+    n_channels, n_parts = features.shape[1], get_num_threads()
+    if density_range is not None:
+        rays = rays.with_samples()
     muon = Muon(head.parameters())
     for step in steps:
         falling = steps.falling(step)
@@ -394,23 +396,34 @@ def refine(
                 fetches.starts, *fetches.densities, density, low, slope, fetches.lengths, MAX_TAU,
                 fetches.weights, fetches.opacity,
             )  # fmt: skip
-        composed = torch.from_numpy(fetches.compose(features)).requires_grad_()
+        values = fetches.interpolate(features)
+        composed = torch.from_numpy(fetches.composite(values, n_channels)).requires_grad_()
         opacity = torch.from_numpy(fetches.opacity).requires_grad_()
         _loss(head, composed, opacity, rays.teacher.chosen(some)).backward()
         muon.step(head_rate * falling)
         assert composed.grad is not None and opacity.grad is not None
-        composed_gradient = composed.grad.numpy()
-        where = (fetches.starts, *fetches.features)
+        gradient = np.zeros((BATCH, padded(n_channels)), np.float32)
+        gradient[:, :n_channels] = composed.grad.numpy()
         if density_range is not None:
             fetch_gradient = np.empty(len(fetches.weights), np.float32)
             slants(
-                *where, *fetches.densities, fetches.weights, fetches.opacity, features, composed_gradient,
+                fetches.starts, *fetches.densities, fetches.weights, fetches.opacity, values, gradient,
                 opacity.grad.numpy(), low, slope, fetches.lengths, density, fetch_gradient,
             )  # fmt: skip
             rate = np.float32(DENSITY_RATE * moving)
             descend_density(*fetches.densities, fetch_gradient, rate, n_parts, density, density_squares)
         rate = np.float32(code_rate * moving)
-        descend(*where, fetches.weights, composed_gradient, rate, n_parts, features, squares, step)
+        descend(
+            fetches.starts,
+            *fetches.features,
+            fetches.weights,
+            gradient,
+            rate,
+            n_parts,
+            features,
+            squares,
+            step,
+        )
         if step == 0:
             _damp(squares)
             _damp(density_squares)

@@ -22,33 +22,34 @@ from numba.extending import overload
 
 from player.compiled.prefetch import prefetch
 from vfr_bake.kernels import njit
+from vfr_bake.kernels.latent_rows import (
+    CHANNELS,
+    GOLDEN,
+    PARTS,
+    PARTS_BITS,
+    interpolate_row,
+    move_row,
+)
 
 BLOCK = 64
 """Rays that a thread takes at a time."""
 OWN = 6
-"""Vertices belong to the parts in turns of 2^OWN, so that two threads hardly ever write to one line of the
-cache."""
+"""2^OWN vertices behind each other belong to one part."""
 AHEAD = 6
 """Fetches by which memory is prefetched ahead: the rows of one lie all over the grid."""
 LINE = 64
 """Bytes of a line of the cache."""
-PARTS_BITS = 8
-PARTS = 1 << PARTS_BITS
-"""Parts of a code that a latent feature counts."""
-LARGEST_LATENT = 127 * PARTS
-GOLDEN = np.uint32(0x9E3779B9)
-"""The golden ratio's part of 2^32: its multiples, modulo that, are spread evenly."""
 
 
 def table(n_rows: int, n_columns: int) -> np.ndarray:
     """[n_rows, n_columns] int16 that has no values yet and begins with a line of the cache: rows of 16
-    numbers never lie in two.
+    numbers never lie in two. CHANNELS numbers and more are there behind it.
 
     >>> table(3, 16).shape, table(3, 16).ctypes.data % LINE
     ((3, 16), 0)
     """
     n = n_rows * n_columns
-    memory = np.empty(n + LINE // 2, np.int16)
+    memory = np.empty(n + LINE // 2 + CHANNELS, np.int16)
     first = -memory.ctypes.data % LINE // 2
     return memory[first : first + n].reshape(n_rows, n_columns)
 
@@ -101,6 +102,61 @@ def compose(starts, rows, shares, weights, latent, out):
                         out[i, c] += share * _shown(latent[row, c])
 
 
+def padded(n_channels: int) -> int:
+    """`n_channels` and what fills the last register of them.
+
+    >>> [padded(n) for n in (1, 16, 22)]
+    [16, 16, 32]
+    """
+    return -(-n_channels // CHANNELS) * CHANNELS
+
+
+@njit(parallel=True, cache=True)
+def interpolate(rows, shares, weights, latent, out):
+    """f_j of all fetches into `out` [n_fetches, `padded(n_channels)`], from `latent` features as `table`
+    makes them; columns beyond n_channels are of no meaning, and fetches without weight are 0."""
+    for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
+        for j in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
+            _prefetch_rows(rows, j + AHEAD, latent.reshape(-1), latent.shape[1])
+            for first in range(0, out.shape[1], CHANNELS):
+                if weights[j] == 0:
+                    out[j, first : first + CHANNELS] = np.float32(0)
+                else:
+                    interpolate_row(latent, rows, shares, j, first, out)
+
+
+@njit(parallel=True, cache=True)
+def composite(starts, weights, values, out):
+    """x of all rays into `out` [n, n_channels], from f_j in `values` [n_fetches, n_channels or more]."""
+    for i in prange(out.shape[0]):
+        out[i] = np.float32(0)
+        for j in range(starts[i], starts[i + 1]):
+            for c in range(out.shape[1]):
+                out[i, c] += weights[j] * values[j, c]
+
+
+@njit(cache=True)
+def _owner(row, n_parts):
+    """The part to which a vertex belongs: that of the 2^OWN vertices behind each other, so that two threads
+    hardly ever write to one line of the cache. By a product of 32 bits, because every thread asks for every
+    vertex, and a remainder takes several times as long."""
+    spread = np.uint32(np.uint32(row >> OWN) * np.uint32(GOLDEN))
+    return (np.uint64(spread) * np.uint64(n_parts)) >> np.uint64(32)
+
+
+@njit(cache=True)
+def _prefetch_own(rows, j, part, n_parts, table, numbers):
+    """Prefetch what fetch j will read of `table` and `numbers` in rows that are of a part."""
+    if j < rows.shape[0]:
+        flat, n_columns = table.reshape(-1), table.shape[1]
+        for corner in range(8):
+            row = rows[j, corner]
+            if _owner(row, n_parts) == part:
+                prefetch(numbers, row)
+                for number in range(row * n_columns, (row + 1) * n_columns, LINE // table.itemsize):
+                    prefetch(flat, number)
+
+
 @njit(cache=True)
 def _mixed(step, fetch):
     """A number of 32 bits, as random as the rounding of a gradient needs, from two others."""
@@ -117,13 +173,13 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
     A move of 3.25 parts of a code is one of 4 parts in a quarter of all cases, and else one of 3, so that
     small moves are not lost: by a number that follows from the step, the fetch and the channel.
 
-    `gradient` [n, n_channels] is that of the composites; `steepness` [n_vertices] collects the mean square of
-    what a vertex has seen, over its channels, so that vertices that few rays meet move as fast as the others.
-    Each of `n_parts` goes through all fetches, in their order, and moves the vertices that are its own: the
-    result does not depend on their number.
+    `latent` is as `table` makes it; `gradient` [n, `padded(n_channels)`] is that of the composites, 0 beyond
+    n_channels; `steepness` [n_vertices] collects the mean square of what a vertex has seen, over its
+    channels, so that vertices that few rays meet move as fast as the others. Each of `n_parts` goes through
+    all fetches, in their order, and moves the vertices that are its own: the result does not depend on their
+    number.
     """
-    n_channels, flat = latent.shape[1], latent.reshape(-1)
-    low, high = np.float32(-LARGEST_LATENT), np.float32(LARGEST_LATENT)
+    n_channels = latent.shape[1]
     for part in prange(n_parts):
         for i in range(gradient.shape[0]):
             square = np.float32(0)
@@ -133,24 +189,19 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                 continue
             square /= np.float32(n_channels)
             for j in range(starts[i], starts[i + 1]):
-                _prefetch_rows(rows, j + AHEAD, flat, n_channels)
-                _prefetch_rows(rows, j + AHEAD, steepness, 1)
+                _prefetch_own(rows, j + AHEAD, part, n_parts, latent, steepness)
                 for corner in range(8):
                     row = rows[j, corner]
                     share = weights[j] * shares[j, corner]
-                    if share == 0 or (row >> OWN) % n_parts != part:
+                    if share == 0 or _owner(row, n_parts) != part:
                         continue
                     steepness[row] += share * share * square
                     if steepness[row] == 0:  # the square of next to nothing is nothing
                         continue
                     length = np.float32(PARTS) * rate * share / np.sqrt(steepness[row])
                     random = _mixed(np.uint32(step), np.uint32(8 * j + corner))
-                    for c in range(n_channels):
-                        moved = np.float32(latent[row, c]) - length * gradient[i, c]
-                        part_of_one = np.float32(random >> np.uint32(8)) * np.float32(2.0**-24)
-                        moved = np.floor(min(max(moved, low), high) + part_of_one)
-                        latent[row, c] = np.int16(moved)
-                        random = np.uint32(random + GOLDEN)
+                    for first in range(0, n_channels, CHANNELS):
+                        move_row(latent, row, first, length, gradient, i, random)
 
 
 @njit(parallel=True, cache=True)
@@ -177,29 +228,24 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
 # sums over channels in any order: a quarter faster
 @njit(parallel=True, cache=True, fastmath={"reassoc", "nsz", "contract"})
 def slants(
-    starts, rows, shares, density_rows, density_shares, weights, opacity, values, gradient,
-    gradient_of_opacity, low, slope, lengths, latent, out,
+    starts, density_rows, density_shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope,
+    lengths, latent, out,
 ):  # fmt: skip
     """The gradient of each fetch's interpolated density code into `out` [n_fetches].
 
-    dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_vertices,
-    n_channels] are the latent features, at `rows` by `shares`; `gradient` [n, n_channels] and
+    dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_fetches,
+    `padded(n_channels)`] are the f_j, as `interpolate` finds them; `gradient`, of as many columns, and
     `gradient_of_opacity` [n] are those of x and A; `latent` are the density codes [n_densities].
     """
-    n_channels, flat = values.shape[1], values.reshape(-1)
     for chunk in prange((gradient.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
             behind = np.float32(0)
             for j in range(starts[i], starts[i + 1]):
-                _prefetch_rows(rows, j + AHEAD, flat, n_channels)
                 _prefetch_rows(density_rows, j + AHEAD, latent, 1)
                 along = np.float32(0)
-                for corner in range(8):
-                    row = rows[j, corner]
-                    dot = np.float32(0)
-                    for c in range(n_channels):
-                        dot += gradient[i, c] * _shown(values[row, c])
-                    along += shares[j, corner] * dot
+                for first in range(0, values.shape[1], CHANNELS):
+                    for c in range(CHANNELS):
+                        along += gradient[i, first + c] * values[j, first + c]
                 out[j] = along
                 behind += weights[j] * along
             trans = np.float32(1)
@@ -231,7 +277,7 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
             for corner in range(8):
                 row = rows[j, corner]
                 slant = shares[j, corner] * slants[j]
-                if slant == 0 or (row >> OWN) % n_parts != part:
+                if slant == 0 or _owner(row, n_parts) != part:
                     continue
                 steepness[row] += slant * slant
                 if steepness[row] == 0:  # the square of next to nothing is nothing
@@ -277,3 +323,15 @@ def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, 
             scale = one / total if total >= least else np.float32(0)
             for corner in range(8):
                 shares[i, corner] *= scale
+
+
+@njit(parallel=True, cache=True)
+def take_runs(rays, starts, points, lengths, taken_starts, taken_points, taken_lengths):
+    """The runs starts[ray] to starts[ray + 1] of `points` [m, 3] and `lengths` [m] of each of the `rays` [n],
+    behind each other from taken_starts[i] on, into the last two arrays."""
+    for i in prange(len(rays)):
+        first, to = starts[rays[i]], taken_starts[i]
+        for j in range(starts[rays[i] + 1] - first):
+            taken_lengths[to + j] = lengths[first + j]
+            for axis in range(3):
+                taken_points[to + j, axis] = points[first + j, axis]

@@ -52,7 +52,7 @@ from vfr_bake.baking.refinement import (
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
 from vfr_bake.field.networks import Head
-from vfr_bake.kernels.stored_features import PARTS
+from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model

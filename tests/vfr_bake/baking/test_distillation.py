@@ -74,6 +74,23 @@ def test_training_rays_are_those_that_meet_something(
     assert len(one) == 1 and np.array_equal(one.composed(latent(grid.features))[0], composed[:1])
 
 
+def test_kept_samples_are_those_that_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each ray, in any order; where they are too many none are kept."""
+    monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 2)
+    grid, rays = fog(0.1), teacher_rays([ALONG, (-0.5, 0.3, 0.2), PAST, ALONG])  # the second begins inside
+    training_rays = collect_training_rays(rays, grid, 0, grid.rows)
+    kept, some = training_rays.with_samples(), np.array([2, 0, 1, 1])
+    assert kept.samples is not None and len(kept.samples.lengths) > 3 * 60
+    anew, found = training_rays.fetches(some), kept.fetches(some)
+    for name in ("starts", "lengths"):
+        assert np.array_equal(getattr(found, name), getattr(anew, name))
+    for name in ("features", "densities"):
+        for a, b in zip(getattr(found, name), getattr(anew, name), strict=True):
+            assert np.array_equal(a, b)
+    monkeypatch.setattr("vfr_bake.baking.distillation.MOST_KEPT", 100)
+    assert training_rays.with_samples().samples is None
+
+
 def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays through fog have hundreds: theirs would take more memory than the grid."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 100)

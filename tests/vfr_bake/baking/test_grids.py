@@ -16,7 +16,7 @@ from vfr_bake.baking.grids import (
     make_layout,
     unit_points,
 )
-from vfr_bake.kernels.stored_features import PARTS
+from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.training.model_file import Model
 
 COARSE = 40

@@ -13,7 +13,7 @@ from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, thinned
 from vfr_bake.baking.detail.shown import take_rows
 from vfr_bake.baking.grids import Layout, make_layout
 from vfr_bake.data.demo import demo_cameras
-from vfr_bake.kernels.stored_features import PARTS
+from vfr_bake.kernels.latent_rows import PARTS
 
 
 def quiet(*_: object) -> None:
