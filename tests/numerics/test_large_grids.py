@@ -28,13 +28,14 @@ from tests.player.march.test_march import random_rays
 from vfr_bake.baking.distillation import corners
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.density import Limits
-from vfr_bake.kernels.latent_rows import PARTS
+from vfr_bake.kernels.latent_rows import CHANNELS, PARTS
 from vfr_bake.kernels.stored_features import (
     compose,
     descend,
     descend_density,
     interpolate,
     padded,
+    table,
 )
 
 F32 = np.float32
@@ -179,9 +180,11 @@ def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
     starts, weights = np.arange(0, 51, 10), rng.uniform(0, 1, 50).astype(F32)
     gradient = np.zeros((5, padded(N_CHANNELS)), F32)
     gradient[:, :N_CHANNELS] = rng.normal(size=(5, N_CHANNELS))
-    small = rng.integers(0, 100 * PARTS, (1000, N_CHANNELS)).astype(np.int16)
+    small = table(1000, N_CHANNELS)
+    small[:] = rng.integers(0, 100 * PARTS, small.shape)
     codes = rng.uniform(0, 100, 1000).astype(F32)
-    large, large_codes = zeros((n_rows, N_CHANNELS), np.int16), zeros(MOST_ROWS, F32)
+    large = zeros(n_rows * N_CHANNELS + CHANNELS, np.int16)[:-CHANNELS].reshape(n_rows, N_CHANNELS)
+    large_codes = zeros(MOST_ROWS, F32)
     large[-1000:], large_codes[-1000:] = small, codes
     out = []
     for latent, rows in ((small, near), (large, far)):
