@@ -65,7 +65,7 @@ VIEWS_TIMED = 4
 """Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
 rays than those for which it was compiled. What these have read is in cache, which makes them several times as
 fast as the millions of a bake."""
-STEP_COST, HEAD_COST = {False: 3.8, True: 0.7}, {False: 1.3, True: 0.6}
+STEP_COST, HEAD_COST = {False: 4.8, True: 0.7}, {False: 1.3, True: 0.6}
 """Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
 unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
 and the following count what one thread waits for on two cores
@@ -74,7 +74,7 @@ VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 """Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
 OWN_HEAD = 2
 """How many times as long a step takes with the model's own head."""
-REST_COST, OWN_REST_COST = {False: 8_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
+REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
 """Time of all else, which hardly depends on the scene, in the same unit: what is measured, the mesh, the
 files; and by how much it is longer with the model's own head."""
 CHOSEN_COST = {False: 0.36, True: 0.12}
