@@ -75,7 +75,7 @@ def test_training_rays_are_those_that_meet_something(
 
 
 def test_kept_samples_are_those_that_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each ray, in any order; where they are too many none are kept."""
+    """Every ray has the same fetches either way, in any order; where samples are too many none are kept."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 2)
     grid, rays = fog(0.1), teacher_rays([ALONG, (-0.5, 0.3, 0.2), PAST, ALONG])  # the second begins inside
     training_rays = collect_training_rays(rays, grid, 0, grid.rows)
