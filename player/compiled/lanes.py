@@ -22,6 +22,7 @@ LANES = 16 if has_wide_registers() else 8
 """Numbers in a vector: as many as a register of the processor holds, or two where it holds four."""
 
 FLOAT, INT, LONG, BYTE = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(8)
+SHORT = ir.IntType(16)
 _SIZES = {FLOAT: "f32", INT: "i32"}
 
 EXP = (
@@ -237,7 +238,7 @@ def splat(builder: Any, scalar: Any) -> Lanes:
 def load(builder: Any, base: Any, first: Any, element: Any = FLOAT) -> Lanes:
     """LANES numbers from `first` on."""
     place = builder.bitcast(builder.gep(base, [first]), ir.PointerType(vector(element)))
-    return Lanes(builder, builder.load(place, align=4))
+    return Lanes(builder, builder.load(place, align=2 if element == SHORT else 4))
 
 
 def store(base: Any, first: Any, values: Lanes) -> None:

@@ -105,8 +105,8 @@ def compose(starts, rows, shares, weights, latent, out):
 def padded(n_channels: int) -> int:
     """`n_channels` and what fills the last register of them.
 
-    >>> [padded(n) for n in (1, 16, 22)]
-    [16, 16, 32]
+    >>> [padded(n) // CHANNELS for n in (1, CHANNELS, CHANNELS + 1)]
+    [1, 1, 2]
     """
     return -(-n_channels // CHANNELS) * CHANNELS
 
