@@ -32,7 +32,7 @@ class BakeChoice:
     sample_loss_db: float
     """Fewer lookups are taken where they lose no more than this, dB."""
     code_loss_db: float
-    """Stored values are chosen that lose no more than this by themselves, dB: the more, the fewer bytes."""
+    """Stored values are chosen that lose about this by themselves, dB: the more, the fewer bytes."""
     density_step: int
     """Density codes, of 256, from one that is stored to the next."""
     code_levels: int
@@ -71,23 +71,23 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=1024,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.55, contracted_resolution=1408, feature_share=0.71, culled_loss_db=0.04,
+        cells_per_pixel=1.8, contracted_resolution=1408, feature_share=0.71, culled_loss_db=0.04,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
-        code_loss_db=0.04, density_step=4, code_levels=50, head_width=64, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        code_loss_db=0.05, density_step=4, code_levels=50, head_width=64, head_layers=3,
+        head_bands=4, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
     "fast": BakeChoice(
-        cells_per_pixel=1.45, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
+        cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
-        code_loss_db=0.2, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.2,
+        code_loss_db=0.14, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        head_bands=3, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
         page_mb=512,
     ),
     "phone": BakeChoice(
         cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
-        code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        code_loss_db=0.2, density_step=6, code_levels=50, head_width=32, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=1800, minutes=8, mesh_resolution=64, target_loss_db=1.5,
         page_mb=384,
     ),
@@ -101,7 +101,7 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "n_channels": 24,
         "channel_loss_db": 0.03,
         "sample_loss_db": 0.02,
-        "code_loss_db": 0.02,
+        "code_loss_db": 0.03,
         "code_levels": 64,
         "head_bands": 5,
         "target_loss_db": 0.5,
@@ -112,9 +112,9 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "n_channels": 12,
         "channel_loss_db": 0.5,
         "sample_loss_db": 0.15,
-        "code_loss_db": 0.15,
+        "code_loss_db": 0.1,
     },
-    "phone": {"refine_steps": 800, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.3},
+    "phone": {"refine_steps": 800, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
 }
 """What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
 which take their time; its features are most of what a grid of so few cells loses."""

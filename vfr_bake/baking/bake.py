@@ -291,8 +291,8 @@ class _Bake:
 
     def _allowed(self, most_db: float, now: Stage) -> float:
         """What a choice may lose by what it takes away, dB: `most_db`, or less where the asset as it is `now`
-        has already lost what the preset aims at."""
-        return most_db if now.loss.db + most_db <= self.choice.target_loss_db else SPARING * most_db
+        has already lost nearly what the preset aims at."""
+        return float(np.clip(self.choice.target_loss_db - now.loss.db, SPARING * most_db, most_db))
 
     def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
@@ -354,7 +354,7 @@ class _Bake:
             if left is not None:
                 share = (after.loss.db - refined.loss.db) / left if left > 0 else np.inf
             else:
-                share = held_out.lost(refined.shown, after.shown).worst / allowed
+                share = held_out.loss_of_change(refined.shown, after.shown).db / allowed
             if share <= 1 or price < min(kept, default=np.inf):
                 keep(price, spent)
             return share

@@ -56,6 +56,8 @@ SEED = 2
 FAR_OFF = 0.1
 """By how much a pixel that stands out differs, in one of three channels of 0 to 1, as specks do in
 `vfr_bake.bench.specks`."""
+EXPECTED_SPREAD = 0.5
+"""Standard error of the loss that is expected of a small change, as a share of it."""
 DEFAULT_PSNR = 30.0
 """PSNR that is assumed for a model whose training has measured nothing."""
 
@@ -203,6 +205,23 @@ class HeldOut:
             return self._witnesses.loss(before.errors, after.errors)
         first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
         return Loss(second - first, None)
+
+    def loss_of_change(self, before: Shown, after: Shown) -> Loss:
+        """What a small change of the pictures loses, such as rounding, which knows nothing of photographs.
+
+        Its errors then have nothing to do with those that the pictures have already, and add up with them:
+        that is what is expected, give or take half of it (EXPECTED_SPREAD). It differs far less from pixel to
+        pixel than what the witnesses measure, where the two errors multiply. Both count by how well they are
+        known: the mean is weighted with 1 / spread^2.
+        """
+        measured = self.lost(before, after)
+        if self._witnesses is None or before.errors is None or not measured.spread:
+            return measured
+        a, b = (np.clip(shown.rgb[self._n_between :], 0.0, 1.0, dtype=float) for shown in (before, after))
+        expected = self._witnesses.loss(before.errors, before.errors + ((b - a) ** 2).mean(axis=1)).db
+        weights = np.array([measured.spread, max(EXPECTED_SPREAD * expected, 1e-9)]) ** -2.0
+        db = float(weights @ (measured.db, expected) / weights.sum())
+        return Loss(db, float(weights.sum() ** -0.5))
 
     def is_better(self, before: Shown, after: Shown) -> bool:
         """Whether `after` loses less than `before`; where the witnesses see no difference beyond chance,

@@ -110,6 +110,34 @@ def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
     assert held_out.is_better(dimmed, own) and not held_out.is_better(own, dimmed)
 
 
+def test_what_a_small_change_loses_is_known_better_than_the_witnesses_alone_measure_it(model: Model) -> None:
+    """Noise that knows nothing of the photographs: its mean square adds to the errors that are there."""
+    held_out = HeldOut(model, 1)
+    own = held_out._own
+    noise, found, added = np.random.default_rng(0), [], []
+    for _ in range(8):
+        rgb = (own.rgb + noise.normal(0, 0.01, own.rgb.shape)).astype(np.float32)
+        shown = held_out._compared(rgb)
+        measured, change = held_out.lost(own, shown), held_out.loss_of_change(own, shown)
+        assert measured.spread is not None and change.spread is not None and change.spread < measured.spread
+        found.append(change.db)
+        added.append(((np.clip(rgb, 0, 1) - np.clip(own.rgb, 0, 1))[held_out._n_between :] ** 2).mean(axis=1))
+    assert held_out._witnesses is not None and own.errors is not None
+    expected = held_out._witnesses.loss(own.errors, own.errors + np.mean(added, axis=0)).db
+    assert np.mean(found) == pytest.approx(expected, rel=0.1)
+
+
+def test_a_change_that_knows_the_photographs_is_measured(model: Model) -> None:
+    """Half of the opacity loses decibels, beside which what independent errors would lose is little known."""
+    held_out = HeldOut(model, 1)
+    features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
+    own, dimmed = (held_out.compare(features, share * opacity) for share in (1.0, 0.5))
+    measured, change = held_out.lost(own, dimmed), held_out.loss_of_change(own, dimmed)
+    assert measured.spread is not None
+    assert abs(change.db - measured.db) < measured.spread
+    assert held_out.loss_of_change(own, own) == held_out.lost(own, own)
+
+
 @pytest.mark.parametrize(
     ("lost", "closer", "better"),
     [
