@@ -69,7 +69,7 @@ TABLES = 1.04
 """How many times as much symbols take in a file as they would with tables that are known: the tables."""
 
 
-FIRST_PRICE = 1e-9
+FIRST_PRICE = 1.5e-9
 """Price that is tried first, as a share of the model's mean square error."""
 LOWEST_PRICE = 1e-10
 """Price below which more bytes show next to nothing, as a share of the model's mean square error: at 3e-10 of
