@@ -81,7 +81,7 @@ FURTHEST = 16.0
 """Factor from one price to the next, at most."""
 AIM, CLOSE = 0.9, 0.8
 """The next price is to lose this share of what it may; one that loses so much of it is near enough."""
-NEAR = 1.2
+NEAR = 1.4
 """So are two prices with this factor between them, of which the higher one loses too much."""
 MOST_PRICES = 12
 PRICES_TRIED = 3
