@@ -14,7 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.compiled.lanes import INT, LANES, LONG, SHORT, Lanes, load, splat, store, vector
+from player.compiled.lanes import INT, LANES, LONG, SHORT, Lanes, address, load, splat, store, vector
 
 CHANNELS = LANES
 """Channels at a time; fewer are read together with what follows them in memory."""
@@ -35,8 +35,8 @@ def _table(context: Any, builder: Any, kind: Any, array: Any) -> tuple[Any, Any]
 def _interpolate_row(_: Any, latent: Any, rows: Any, shares: Any, fetch: Any, first: Any, out: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         latents, n_channels = _table(context, builder, latent, arguments[0])
-        of_rows, _ = _table(context, builder, rows, arguments[1])
-        of_shares, _ = _table(context, builder, shares, arguments[2])
+        of_rows = address(context, builder, rows, arguments[1])
+        of_shares = address(context, builder, shares, arguments[2])
         fetch, first = arguments[3:5]
         to, n_stored = _table(context, builder, out, arguments[5])
         terms = []
