@@ -354,7 +354,7 @@ class _Bake:
             if left is not None:
                 share = (after.loss.db - refined.loss.db) / left if left > 0 else np.inf
             else:
-                share = held_out.loss_of_change(refined.shown, after.shown).db / allowed
+                share = held_out.loss_of_change(refined.shown, after.shown) / allowed
             if share <= 1 or price < min(kept, default=np.inf):
                 keep(price, spent)
             return share

@@ -206,22 +206,22 @@ class HeldOut:
         first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
         return Loss(second - first, None)
 
-    def loss_of_change(self, before: Shown, after: Shown) -> Loss:
-        """What a small change of the pictures loses, such as rounding, which knows nothing of photographs.
+    def loss_of_change(self, before: Shown, after: Shown) -> float:
+        """The dB that a small change of the pictures loses, such as rounding, which knows no photographs.
 
         Its errors then have nothing to do with those that the pictures have already, and add up with them:
         that is what is expected, give or take half of it (EXPECTED_SPREAD). It differs far less from pixel to
-        pixel than what the witnesses measure, where the two errors multiply. Both count by how well they are
-        known: the mean is weighted with 1 / spread^2.
+        pixel than what the witnesses measure, where the two errors multiply. The mean of both is weighted
+        with 1 / spread^2.
         """
         measured = self.lost(before, after)
         if self._witnesses is None or before.errors is None or not measured.spread:
-            return measured
+            return measured.db
         a, b = (np.clip(shown.rgb[self._n_between :], 0.0, 1.0, dtype=float) for shown in (before, after))
         expected = self._witnesses.loss(before.errors, before.errors + ((b - a) ** 2).mean(axis=1)).db
-        weights = np.array([measured.spread, max(EXPECTED_SPREAD * expected, 1e-9)]) ** -2.0
-        db = float(weights @ (measured.db, expected) / weights.sum())
-        return Loss(db, float(weights.sum() ** -0.5))
+        noise = measured.spread**2
+        share = noise / (noise + (EXPECTED_SPREAD * expected) ** 2)
+        return measured.db + share * (expected - measured.db)
 
     def is_better(self, before: Shown, after: Shown) -> bool:
         """Whether `after` loses less than `before`; where the witnesses see no difference beyond chance,
