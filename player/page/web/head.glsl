@@ -34,10 +34,12 @@ vec4 rounded(vec4 x, float perStep, float zero) {
   return clamp(roundEven(x * perStep) + zero, 0.0, 255.0) - zero;
 }
 
-vec4 activated(vec4 x, vec4 after) {
+mat4 activated(mat4 x, vec4 scale, vec4 after) {
+  x = mat4(x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale);
   if (after.y < GELU) return x;
-  x = gelu(x);
-  return after.y < ROUNDED ? x : rounded(x, after.z, after.w);
+  x = mat4(gelu(x[0]), gelu(x[1]), gelu(x[2]), gelu(x[3]));
+  if (after.y < ROUNDED) return x;
+  return mat4(rounded(x[0], after.z, after.w), rounded(x[1], after.z, after.w), rounded(x[2], after.z, after.w), rounded(x[3], after.z, after.w));
 }
 
 mat4 weights(int k) {
@@ -60,10 +62,8 @@ void runLayer(vec4 sizes, vec4 after, bool add) {
       nextSum += weights(k + 4) * inputs;
       k += 8;
     }
-    for (int p = 0; p < 4; p++) {
-      memory[y][p] = activated(sum[p] * scale, after);
-      memory[y + 1][p] = activated(nextSum[p] * nextScale, after);
-    }
+    memory[y] = activated(sum, scale, after);
+    memory[y + 1] = activated(nextSum, nextScale, after);
   }
 }
 
