@@ -198,8 +198,8 @@ async function decodeChildren(data, octants, refined, where) {
   const classes = new Uint8Array(n);
   const hasLive = new Uint8Array(n);
   for (let child = 0; child < N_CHILDREN; child++) {
-    classes.fill(0);
-    [4, 2, 1].forEach((bit, axis) => addClasses(classes, known[child ^ bit], beside[axis][child & bit ? 1 : 0]));
+    const [x, y, z] = [4, 2, 1].map((bit, axis) => ({ own: known[child ^ bit], beside: beside[axis][child & bit ? 1 : 0] }));
+    setClasses(classes, x.own, x.beside, y.own, y.beside, z.own, z.beside);
     if (child === N_CHILDREN - 1) setMust(classes, hasLive);
     const found = known[child].subarray(0, n);
     decoder.channel(classes, found);
@@ -210,8 +210,10 @@ async function decodeChildren(data, octants, refined, where) {
   return childBricks(octants, refined, parents, known);
 }
 
-function addClasses(classes, known, beside) {
-  for (let i = 0; i < classes.length; i++) classes[i] += COUNT[known[i]] + COUNT[known[beside[i]]];
+function setClasses(classes, ownX, besideX, ownY, besideY, ownZ, besideZ) {
+  for (let i = 0; i < classes.length; i++) {
+    classes[i] = COUNT[ownX[i]] + COUNT[ownX[besideX[i]]] + COUNT[ownY[i]] + COUNT[ownY[besideY[i]]] + COUNT[ownZ[i]] + COUNT[ownZ[besideZ[i]]];
+  }
 }
 
 function setMust(classes, hasLive) {
