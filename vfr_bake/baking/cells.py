@@ -31,9 +31,10 @@ from vfr_bake.training.model_file import Model
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
 """Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
 is taken, and where none does, nothing is left out."""
-HITS, CONTRACTED_HITS = 8, 24
+HITS, CONTRACTED_HITS = 5, 24
 """Rays that meet a surface cell of a box, and a block of cells at the unit sphere of an unbounded scene, over
-all views, on average. The cells of a box that still escape are gaps to be closed."""
+all views, on average. The cells of a box that still escape are gaps to be closed: with 8 rays for 5, lego has
+4 % more cells, and its pictures without the others agree to 56.5 dB for 55.7."""
 MOST_SEEING = 2_000_000
 """Rays that look for the cells of an unbounded scene, at most: so its minutes are bounded, however many views
 there are and wherever they stand. Fox needs 1.2 million for as many hits."""
@@ -179,13 +180,12 @@ def cull(
     held = occupied_cells(model, resolution)
     floors = FLOORS if floor is None else (floor,)
     marks = marked_cells(model, resolution, floors, progress)
-    least = _shown(model, held_out, held)
     lost: dict[float, float] = {}
     for level, tried in enumerate(floors):
         visible = close_gaps(np.ascontiguousarray(marks[..., level]).view(bool))
         if not visible.any():
             continue
-        loss = held_out.lost(least, _shown(model, held_out, visible))
+        loss = held_out.lost(held_out.own, _shown(model, held_out, visible))
         lost[tried] = loss.db
         if loss.most <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)

@@ -181,7 +181,8 @@ class HeldOut:
         self.wanted = (1 - opacity[:, None]) * self.background
         self.wanted[self._hits] += self._opacity * self._colours(self._features)
         self._witnesses = None if witnesses is None else WitnessLoss(witnesses, self.background)
-        self._own = self._compared(self.wanted)
+        self.own = self._compared(self.wanted)
+        """The model's own pictures."""
         self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
         self.stages: list[Stage] = []
 
@@ -251,7 +252,7 @@ class HeldOut:
         """The loss if the rays that hit had these colours [n_hits, 3] instead of the model's."""
         rgb = self.wanted.copy()
         rgb[self._hits] += self._opacity * (colours - self._colours(self._features))
-        return self.lost(self._own, self._compared(rgb))
+        return self.lost(self.own, self._compared(rgb))
 
     def compare(self, features: np.ndarray, opacity: np.ndarray) -> Shown:
         """What is seen if every ray composites `features` [n, n_channels] and `opacity` [n], with the model's
@@ -298,7 +299,7 @@ class HeldOut:
         return Stage(
             name,
             -10 * float(np.log10(max(shown.error, 1e-12))),
-            self.lost(self._own, shown),
+            self.lost(self.own, shown),
             float(np.median(samples)),
             float(np.percentile(samples, 95)),
             shown,

@@ -132,10 +132,9 @@ def test_with_witnesses_a_floor_must_not_lose_more_even_by_chance(model: Model) 
     held_out = HeldOut(model, 1)
     everything = cull(model, 64, held_out, None, -9.0, quiet)
     assert everything.floor == 0 and list(everything.lost) == list(FLOORS), "no floor gains 9 dB"
-    shown = [_shown(model, held_out, occupied_cells(model, 64))]
     marks = marked_cells(model, 64, FLOORS[:1], quiet)
-    shown.append(_shown(model, held_out, close_gaps(marks[..., 0].view(bool))))
-    loss = held_out.lost(*shown)
+    visible = close_gaps(marks[..., 0].view(bool))
+    loss = held_out.lost(held_out.own, _shown(model, held_out, visible))
     assert loss.spread and everything.lost[FLOORS[0]] == loss.db
     for most_db, taken in ((loss.most + 1e-6, True), (loss.most - 1e-6, False)):
         chosen = cull(model, 64, held_out, None, most_db, quiet)

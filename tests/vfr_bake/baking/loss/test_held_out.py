@@ -113,7 +113,7 @@ def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
 def test_what_a_small_change_loses_is_known_better_than_the_witnesses_alone_measure_it(model: Model) -> None:
     """Noise that knows nothing of the photographs: its mean square adds to the errors that are there."""
     held_out = HeldOut(model, 1)
-    own = held_out._own
+    own = held_out.own
     noise, measured, found, added = np.random.default_rng(0), [], [], []
     for _ in range(8):
         rgb = (own.rgb + noise.normal(0, 0.01, own.rgb.shape)).astype(np.float32)
