@@ -81,7 +81,7 @@ ROUNDING_LEFT = 0.5
 """Share of what a head loses by 8 bits that is left after it was tuned with them, as far as that helps."""
 BITS_SHARE = 0.5
 """Share of the loss that the preset aims at which a head in 8 bits may lose by them after it was tuned."""
-WORTH_A_ROUND = 0.03
+WORTH_A_ROUND = 0.1
 """Loss in dB by fewer lookups and a head in 8 bits for which the head is trained with them."""
 WORTH_FEATURES = 0.15
 """The same for which the features are trained with them, too: where rays have a hundred samples with weight,
