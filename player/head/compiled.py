@@ -23,7 +23,9 @@ from player.head.dense_tiles import (
     MOST_BYTES,
     ROWS,
     WIDTH,
+    dense_bytes_narrow_tile,
     dense_bytes_tile,
+    dense_narrow_tile,
     dense_tile,
     multiply_lanes,
 )
@@ -104,11 +106,15 @@ def _dense(memory, weights, step, n):
     in_memory, scale, out, pitch, depth = step.starts_in_memory, step.scale, step.out, step.pitch, step.depth
     for first in range(0, pitch, WIDTH):
         for row in range(0, n, ROWS):
-            dense_tile(
-                memory, weights, (x + row * x_pitch, x_pitch), (w + first, pitch),
-                (start + first + row * start_pitch, start_pitch, in_memory), scale + first,
-                (out + first + row * pitch, pitch), depth,
-            )  # fmt: skip
+            rows = x + row * x_pitch, x_pitch
+            starts = start + first + row * start_pitch, start_pitch, in_memory
+            outputs = out + first + row * pitch, pitch
+            if first + WIDTH <= pitch:
+                dense_tile(memory, weights, rows, (w + first, pitch), starts, scale + first, outputs, depth)
+            else:
+                dense_narrow_tile(
+                    memory, weights, rows, (w + first, pitch), starts, scale + first, outputs, depth
+                )
     _activate(memory, out, n * pitch, step.activation)
 
 
@@ -117,12 +123,17 @@ def _dense_bytes(codes, memory, packed, starts, weights, step, n):
     """One layer of n pixels whose inputs and weights are codes in bytes, tile by tile."""
     x, w, start, scale, out, pitch = step.x, step.w, step.start, step.scale, step.out, step.pitch
     depth = step.depth
+    tables = packed, starts, weights
     for first in range(0, pitch, WIDTH):
+        tile, places = w + first * QUAD * depth, (start + first, scale + first)
         for row in range(0, n, ROWS):
-            dense_bytes_tile(
-                codes, memory, (packed, starts, weights), x + row * MOST_BYTES, w + first * QUAD * depth,
-                (start + first, scale + first), (out + first + row * pitch, pitch), depth,
-            )  # fmt: skip
+            outputs = out + first + row * pitch, pitch
+            if first + WIDTH <= pitch:
+                dense_bytes_tile(codes, memory, tables, x + row * MOST_BYTES, tile, places, outputs, depth)
+            else:
+                dense_bytes_narrow_tile(
+                    codes, memory, tables, x + row * MOST_BYTES, tile, places, outputs, depth
+                )
     _activate(memory, out, n * pitch, step.activation)
 
 
@@ -135,9 +146,13 @@ def _activate(memory, at, n, kind):
 
 @compiled
 def _multiply(memory, step, n):
-    x, out = step.x, step.out
-    for i in range(0, n * step.pitch, LANES):
-        multiply_lanes(memory, out + i, out + i, x + i)
+    x, x_pitch, out, pitch = step.x, step.x_pitch, step.out, step.pitch
+    for _ in range(n):
+        k = 0
+        for i in range(0, pitch, LANES):
+            multiply_lanes(memory, out + i, out + i, x + k)
+            k = k + LANES if k + LANES < x_pitch else 0
+        x, out = x + x_pitch, out + pitch
 
 
 @compiled

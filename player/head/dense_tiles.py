@@ -1,7 +1,8 @@
 """Tiles of dense layers in registers, which `player.head.compiled` puts together.
 
-A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold; in float32,
-and in 8 bits where the processor multiplies bytes. Compiled code alone imports this.
+A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold, or by one
+where a layer ends with one; in float32, and in 8 bits where the processor multiplies bytes. Compiled code
+alone imports this.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ ROWS = 12 if LANES == 16 else 6
 """Pixels of a tile. A processor has 32 registers of 16 numbers, or 16 of 8: two vectors of sums for each
 pixel leave some for inputs and weights."""
 WIDTH = 2 * LANES
-"""Outputs of a tile."""
+"""Outputs of a tile of two vectors."""
 
 QUAD = 4
 """Products of bytes that the processor adds up in one instruction."""
@@ -36,34 +37,38 @@ _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
 later versions turn them into theirs."""
 
 
-def _dense(
-    _: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, scale: Any, out: Any, depth: Any
-) -> Any:
+def _dense(n_vectors: int) -> Any:
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        here, there = (address(context, builder, signature.args[index], arguments[index]) for index in (0, 1))
-        in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
-        first = builder.select(in_memory, here, there)
-        start_at, start_pitch = _pair(builder, arguments[4])
-        sums = _Sums(builder, FLOAT)
-        for row in range(ROWS):
-            at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
-            for half in range(2):
-                sums.set(row, half, load(builder, first, builder.add(at, LONG(half * LANES))))
-        _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[7])
-        out, scale_at = _pair(builder, arguments[6]), arguments[5]
-        with builder.if_else(builder.icmp_signed(">=", scale_at, LONG(0))) as (scaled, unscaled):
-            with scaled:
-                sums.write(here, out, _scales(builder, there, scale_at))
-            with unscaled:
-                sums.write(here, out)
-        return context.get_dummy_value()
+    def typed(
+        _: Any, memory: Any, weights: Any, x: Any, w: Any, start: Any, scale: Any, out: Any, depth: Any
+    ) -> Any:
 
-    long, two, three = types.int64, types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
-    return types.void(memory, weights, two, two, three, long, two, long), generate
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            here, there = (address(context, builder, signature.args[n], arguments[n]) for n in (0, 1))
+            in_memory = builder.icmp_signed("!=", builder.extract_value(arguments[4], 2), LONG(0))
+            first = builder.select(in_memory, here, there)
+            start_at, start_pitch = _pair(builder, arguments[4])
+            sums = _Sums(builder, FLOAT, n_vectors)
+            for row in range(ROWS):
+                at = builder.add(start_at, builder.mul(start_pitch, LONG(row)))
+                for number in range(n_vectors):
+                    sums.set(row, number, load(builder, first, builder.add(at, LONG(number * LANES))))
+            _add_products(builder, sums, (here, arguments[2]), (there, arguments[3]), arguments[7])
+            out, scale_at = _pair(builder, arguments[6]), arguments[5]
+            with builder.if_else(builder.icmp_signed(">=", scale_at, LONG(0))) as (scaled, unscaled):
+                with scaled:
+                    sums.write(here, out, _scales(builder, there, scale_at, n_vectors))
+                with unscaled:
+                    sums.write(here, out)
+            return context.get_dummy_value()
+
+        long, two, three = types.int64, types.UniTuple(types.int64, 2), types.UniTuple(types.int64, 3)
+        return types.void(memory, weights, two, two, three, long, two, long), generate
+
+    return intrinsic(typed)
 
 
-dense_tile: Any = intrinsic(_dense)
+dense_tile: Any = _dense(2)
 """dense_tile(memory, weights, x, w, start, scale, out, depth): ROWS by WIDTH outputs of one layer.
 
 `memory` and `weights` are flat float32. `x`, `w` and `out` are (index of the first number, numbers from row
@@ -74,6 +79,8 @@ multiplied by, below 0 for none. `depth`: inputs of the layer.
 Inputs and weights may be 8-bit codes that are floats: sums below 2^24 are then exact, as those of
 `dense_bytes_tile` are.
 """
+dense_narrow_tile: Any = _dense(1)
+"""The same for ROWS by LANES outputs."""
 
 
 def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, Any], depth: Any) -> None:
@@ -85,67 +92,74 @@ def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, A
     w_at, w_pitch = _pair(builder, w[1])
     with cgutils.for_range(builder, depth) as loop:
         at = builder.add(w_at, builder.mul(w_pitch, loop.index))
-        columns = [load(builder, w[0], builder.add(at, LONG(half * LANES))) for half in range(2)]
+        columns = [load(builder, w[0], builder.add(at, LONG(n * LANES))) for n in range(sums.n_vectors)]
         for row in range(ROWS):
             value = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index])))
-            for half in range(2):
-                sums.set(row, half, value.call("fma", columns[half], sums.get(row, half)))
+            for number, column in enumerate(columns):
+                sums.set(row, number, value.call("fma", column, sums.get(row, number)))
 
 
-def _dense_bytes(
-    _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any
-) -> Any:
-    packed, starts, scales = weights
+def _dense_bytes(n_vectors: int) -> Any:
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
+    def typed(
+        _: Any, codes: Any, memory: Any, weights: Any, x: Any, w: Any, places: Any, out: Any, n: Any
+    ) -> Any:
+        packed, starts, scales = weights
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
+                return context.get_dummy_value()
+            bytes_here, here = (address(context, builder, signature.args[n], arguments[n]) for n in (0, 1))
+            parts = [builder.extract_value(arguments[2], index) for index in range(3)]
+            packed_there, starts_there, scales_there = (
+                address(context, builder, kind, part)
+                for kind, part in zip((packed, starts, scales), parts, strict=True)
+            )
+            out, depth = _pair(builder, arguments[6]), arguments[7]
+            start_at, scale_at = _pair(builder, arguments[5])
+            sums = _Sums(builder, INT, n_vectors)
+            for number in range(n_vectors):
+                start = load(builder, starts_there, builder.add(start_at, LONG(number * LANES)), INT)
+                for row in range(ROWS):
+                    sums.set(row, number, start)
+            quads = ir.PointerType(INT)
+            x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
+            x_rows = [builder.bitcast(row, quads) for row in x_rows]
+            words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
+            lanes = vector(INT)
+            dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
+            with cgutils.for_range(builder, depth) as loop:
+                columns = []
+                for number in range(n_vectors):
+                    quad = builder.add(builder.mul(depth, LONG(number)), loop.index)
+                    columns.append(load(builder, words, builder.mul(quad, LONG(LANES)), INT))
+                for row in range(ROWS):
+                    quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
+                    for number, column in enumerate(columns):
+                        total = builder.call(dot, [sums.get(row, number).value, quad.value, column.value])
+                        sums.set(row, number, Lanes(builder, total))
+            sums.write(here, out, _scales(builder, scales_there, scale_at, n_vectors))
             return context.get_dummy_value()
-        bytes_here, here = (
-            address(context, builder, signature.args[index], arguments[index]) for index in (0, 1)
-        )
-        parts = [builder.extract_value(arguments[2], index) for index in range(3)]
-        packed_there, starts_there, scales_there = (
-            address(context, builder, kind, part)
-            for kind, part in zip((packed, starts, scales), parts, strict=True)
-        )
-        out = _pair(builder, arguments[6])
-        start_at, scale_at = _pair(builder, arguments[5])
-        sums = _Sums(builder, INT)
-        for half in range(2):
-            start = load(builder, starts_there, builder.add(start_at, LONG(half * LANES)), INT)
-            for row in range(ROWS):
-                sums.set(row, half, start)
-        quads = ir.PointerType(INT)
-        x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
-        x_rows = [builder.bitcast(row, quads) for row in x_rows]
-        words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
-        lanes = vector(INT)
-        dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
-        with cgutils.for_range(builder, arguments[7]) as loop:
-            at = builder.mul(loop.index, LONG(WIDTH))
-            columns = [load(builder, words, builder.add(at, LONG(half * LANES)), INT) for half in range(2)]
-            for row in range(ROWS):
-                quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
-                for half in range(2):
-                    total = builder.call(dot, [sums.get(row, half).value, quad.value, columns[half].value])
-                    sums.set(row, half, Lanes(builder, total))
-        sums.write(here, out, _scales(builder, scales_there, scale_at))
-        return context.get_dummy_value()
 
-    long, two = types.int64, types.UniTuple(types.int64, 2)
-    return types.void(codes, memory, weights, long, long, two, two, long), generate
+        long, two = types.int64, types.UniTuple(types.int64, 2)
+        return types.void(codes, memory, weights, long, long, two, two, long), generate
+
+    return intrinsic(typed)
 
 
-dense_bytes_tile: Any = intrinsic(_dense_bytes)
+dense_bytes_tile: Any = _dense_bytes(2)
 """dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): ROWS by WIDTH outputs of a layer of
 8-bit codes. It computes nothing unless MULTIPLIES_BYTES.
 
 `codes` are flat uint8, `memory` is flat float32. `weights` is (int8 codes: QUAD inputs of one output beside
-each other, WIDTH outputs after one another, n_quads times; int32 that sums begin with; float32 that they are
-multiplied by). `x`: index of the first code of the first pixel, MOST_BYTES before the next pixel's. `w`:
-index of the tile's first code of a weight. `places`: indices of (what the sums begin with, what they are
-multiplied by). `out`: (index of the first output in `memory`, numbers from row to row).
+each other, LANES outputs after one another, n_quads times, and then the next LANES outputs; int32 that sums
+begin with; float32 that they are multiplied by). `x`: index of the first code of the first pixel, MOST_BYTES
+before the next pixel's. `w`: index of the tile's first code of a weight. `places`: indices of (what the sums
+begin with, what they are multiplied by). `out`: (index of the first output in `memory`, numbers from row to
+row).
 """
+dense_bytes_narrow_tile: Any = _dense_bytes(1)
+"""The same for ROWS by LANES outputs."""
 
 
 def _multiply(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
@@ -167,41 +181,42 @@ The compiler does not do so by itself: it cannot know that the three do not over
 
 
 class _Sums:
-    """ROWS by two vectors of sums, which a loop adds to."""
+    """ROWS by some vectors of sums, which a loop adds to."""
 
-    def __init__(self, builder: Any, element: Any) -> None:
+    def __init__(self, builder: Any, element: Any, n_vectors: int) -> None:
+        self.n_vectors = n_vectors
         self._builder = builder
         self._places = [
-            [cgutils.alloca_once(builder, vector(element)) for _ in range(2)] for _ in range(ROWS)
+            [cgutils.alloca_once(builder, vector(element)) for _ in range(n_vectors)] for _ in range(ROWS)
         ]
 
-    def get(self, row: int, half: int) -> Lanes:
-        return Lanes(self._builder, self._builder.load(self._places[row][half]))
+    def get(self, row: int, number: int) -> Lanes:
+        return Lanes(self._builder, self._builder.load(self._places[row][number]))
 
-    def set(self, row: int, half: int, value: Lanes) -> None:
-        self._builder.store(value.value, self._places[row][half])
+    def set(self, row: int, number: int, value: Lanes) -> None:
+        self._builder.store(value.value, self._places[row][number])
 
     def write(self, array: Any, out: tuple[Any, Any], scales: list[Lanes] | None = None) -> None:
-        """Write the sums to `array`, a row at a time, multiplied by the `scales` of the two halves of a row.
+        """Write the sums to `array`, a row at a time, multiplied by the `scales` of a row's vectors.
 
         `out`: (index of the first number, numbers from row to row).
         """
         at, pitch = out
         for row in range(ROWS):
             start = self._builder.add(at, self._builder.mul(pitch, LONG(row)))
-            for half in range(2):
-                place = self._builder.add(start, LONG(half * LANES))
-                total = self.get(row, half)
-                store(array, place, total if scales is None else total.to_float() * scales[half])
+            for number in range(self.n_vectors):
+                place = self._builder.add(start, LONG(number * LANES))
+                total = self.get(row, number)
+                store(array, place, total if scales is None else total.to_float() * scales[number])
 
 
 def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
     return builder.extract_value(pair, 0), builder.extract_value(pair, 1)
 
 
-def _scales(builder: Any, array: Any, at: Any) -> list[Lanes]:
-    """The two vectors of numbers from the index `at` on."""
-    return [load(builder, array, builder.add(at, LONG(half * LANES))) for half in range(2)]
+def _scales(builder: Any, array: Any, at: Any, n_vectors: int) -> list[Lanes]:
+    """Vectors of numbers from the index `at` on."""
+    return [load(builder, array, builder.add(at, LONG(number * LANES))) for number in range(n_vectors)]
 
 
 def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:

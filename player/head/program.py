@@ -1,6 +1,6 @@
 """From the numbers of a head in 8 bits to a program: the instructions that `player.head.compiled` runs.
 
-Every value of the head is a table in memory of BLOCK pixels by its width, padded to whole tiles. All places
+Every value of the head is a table in memory of BLOCK pixels by its width, padded to whole vectors. All places
 and sizes follow from the widths that `player.head.graph` has checked. What is rounded to 8 bits is kept in
 bytes where the processor multiplies those (`player.head.dense_tiles`). Elsewhere codes are kept as floats:
 sums of their products are the same integers, added up more slowly.
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from player.head.activations import GELU, LINEAR
-from player.head.dense_tiles import MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED, WIDTH
+from player.head.dense_tiles import LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED
 from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
 BLOCK = 4 * ROWS
@@ -57,7 +57,7 @@ class Step(NamedTuple):
     zero: int = 0
     """QUANTIZE, ROUND: the code of 0."""
     out: int = 0
-    """MULTIPLY: place of the table that is multiplied by `x`."""
+    """MULTIPLY: place of the table that is multiplied by `x`, whose rows may be shorter and begin again."""
     pitch: int = 0
     activation: int = LINEAR
 
@@ -113,11 +113,14 @@ class _Compiler:
             h = self._dense(h, layer, GELU)
         rounding, *roundings = head.roundings
         h = self._rounded(h, rounding)
-        encoded = self._dense_rounded(h, head.to_sh, rounding)
-        harmonics = self._harmonics(dirs)
-        self._steps.append(Step(MULTIPLY, x=harmonics.place, out=encoded.place, pitch=encoded.pitch))
+        order, harmonics = _ordered(head.harmonics)
+        encoded = self._dense_rounded(h, Layer(*(part[..., order] for part in head.to_sh)), rounding)
+        sh = self._harmonics(dirs, harmonics)
+        self._steps.append(
+            Step(MULTIPLY, x=sh.place, x_pitch=sh.pitch, out=encoded.place, pitch=encoded.pitch)
+        )
         z = self._dense_rounded(h, head.bottleneck, rounding)
-        z = self._dense(encoded, Layer(head.from_sh, np.zeros(0)), GELU, start=z)
+        z = self._dense(encoded, Layer(head.from_sh[order], np.zeros(0)), GELU, start=z)
         for layer, rounding in zip(head.directional, roundings, strict=True):
             z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, GELU)
         rgb = self._dense(z, head.output)
@@ -159,10 +162,10 @@ class _Compiler:
             ))  # fmt: skip
             return out
         starts = bias - rounding.zero * codes.sum(axis=0, dtype=np.int64)
-        n_quads, tiles = -(-x.width // QUAD), _padded(width) // WIDTH
-        table = np.zeros((n_quads * QUAD, tiles * WIDTH), np.int8)
+        n_quads, n_vectors = -(-x.width // QUAD), _padded(width) // LANES
+        table = np.zeros((n_quads * QUAD, n_vectors * LANES), np.int8)
         table[: x.width, :width] = codes
-        table = table.reshape(n_quads, QUAD, tiles, WIDTH).transpose(2, 0, 3, 1)
+        table = table.reshape(n_quads, QUAD, n_vectors, LANES).transpose(2, 0, 3, 1)
         self._steps.append(Step(
             DENSE_BYTES, x=x.place, depth=n_quads, w=self._packed.add(table.reshape(1, -1)),
             start=self._starts.add(starts[None]), scale=scale, out=out.place, pitch=out.pitch,
@@ -170,14 +173,13 @@ class _Compiler:
         ))  # fmt: skip
         return out
 
-    def _harmonics(self, dirs: Value) -> Value:
+    def _harmonics(self, dirs: Value, layer: Layer) -> Value:
         """The spherical harmonics of directions."""
-        weight = self._head.harmonics.weight
-        terms = self._floats(len(weight))
+        terms = self._floats(len(layer.weight))
         self._steps.append(
             Step(MONOMIALS, x=dirs.place, x_pitch=dirs.pitch, out=terms.place, pitch=terms.pitch)
         )
-        return self._dense(terms, self._head.harmonics)
+        return self._dense(terms, layer)
 
     def _rounded(self, x: Value, rounding: Rounding) -> Value:
         """`x` as codes: in bytes, or in floats from which the code of 0 is taken off."""
@@ -194,6 +196,20 @@ class _Compiler:
         return out
 
 
+def _ordered(harmonics: Layer) -> tuple[np.ndarray, Layer]:
+    """An order of the encoded features in which the harmonics that they are multiplied by begin again and
+    again, and these harmonics, each once: so they are found once for several features. If they fill no whole
+    vectors, the features' own order and all of their harmonics."""
+    columns = np.vstack([harmonics.bias, harmonics.weight])
+    distinct, which = np.unique(columns, axis=1, return_inverse=True)
+    n, n_all = distinct.shape[1], columns.shape[1]
+    by_harmonic = np.argsort(which.reshape(-1), kind="stable")
+    if n % LANES or (np.bincount(which.reshape(-1)) != n_all // n).any():
+        return np.arange(n_all), harmonics
+    order = by_harmonic.reshape(n, -1).T.reshape(-1)
+    return order, Layer(harmonics.weight[:, order[:n]], harmonics.bias[order[:n]])
+
+
 def _pairs(order: int) -> list[tuple[int, int]]:
     """The monomial, by its place among all from order 1 on, and the axis that each of an order multiplies."""
     _, parents, axes = monomials(order)
@@ -202,7 +218,7 @@ def _pairs(order: int) -> list[tuple[int, int]]:
 
 
 class _Constants:
-    """Tables of one type after one another, their rows padded with zeros to whole tiles."""
+    """Tables of one type after one another, their rows padded with zeros to whole vectors."""
 
     def __init__(self, kind: Any) -> None:
         self._kind = kind
@@ -222,4 +238,4 @@ class _Constants:
 
 
 def _padded(width: int) -> int:
-    return -(-width // WIDTH) * WIDTH
+    return -(-width // LANES) * LANES
