@@ -15,23 +15,9 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.compiled.lanes import (
-    BYTE,
-    FLOAT,
-    INT,
-    LANES,
-    SHORT,
-    Lanes,
-    address,
-    choose,
-    load,
-    splat,
-    store,
-    vector,
-)
+from player.compiled.lanes import BYTE, FLOAT, INT, Lanes, address, choose, load, splat, store, vector
 
 LINEAR, GELU = range(2)
 
@@ -76,18 +62,11 @@ def _polynomial(coefficients: tuple[float, ...], x: Lanes) -> Lanes:
 def _inverse(x: Lanes) -> Lanes:
     """1 / x of ordinary numbers, in half the time of a division.
 
-    A guess is wrong by 2^-14 where the processor has an instruction for it, and by 5 % if it is made of the
-    bits alone; each step of Newton squares the relative error.
+    The bits give a guess that is 5 % wrong; each of three steps of Newton squares the relative error.
     """
-    if LANES == 16:
-        vectors = [vector(FLOAT)] * 2
-        kind = ir.FunctionType(vector(FLOAT), [*vectors, SHORT])
-        function = cgutils.get_or_insert_function(x.b.module, kind, "llvm.x86.avx512.rcp14.ps.512")
-        guess, n_steps = Lanes(x.b, x.b.call(function, [x.value, x.value, SHORT(-1)])), 1
-    else:
-        bits = Lanes(x.b, x.b.bitcast(x.value, vector(INT)))
-        guess, n_steps = (0x7EF311C7 - bits).as_float(), 3
-    for _ in range(n_steps):
+    bits = Lanes(x.b, x.b.bitcast(x.value, vector(INT)))
+    guess = (0x7EF311C7 - bits).as_float()
+    for _ in range(3):
         guess = guess * (-x).call("fma", guess, 2.0)
     return guess
 

@@ -114,7 +114,10 @@ class _Compiler:
         rounding, *roundings = head.roundings
         h = self._rounded(h, rounding)
         order, harmonics = _ordered(head.harmonics)
-        encoded = self._dense_rounded(h, Layer(*(part[..., order] for part in head.to_sh)), rounding)
+        weight, bias, scale = head.to_sh
+        assert scale is not None
+        to_sh = Layer(weight[:, order], bias[order], scale[order])
+        encoded = self._dense_rounded(h, to_sh, rounding)
         sh = self._harmonics(dirs, harmonics)
         self._steps.append(
             Step(MULTIPLY, x=sh.place, x_pitch=sh.pitch, out=encoded.place, pitch=encoded.pitch)
