@@ -335,6 +335,8 @@ class _Bake:
         tried: list[float] = []
         kept: dict[float, Spent] = {}
         """What is stored at the price that is the best so far, which is not found again."""
+        losses: dict[float, float] = {}
+        """dB that are lost at the prices that were tried."""
 
         def at(price: float) -> Spent:
             if price in kept:
@@ -349,15 +351,16 @@ class _Bake:
 
         def lost(price: float) -> float:
             """What is lost, as a share of what may be."""
-            spent = at(price)
-            after = held_out.look("codes", layout.played(spent.arrays), head, self.n_fetches)
-            if left is not None:
-                share = (after.loss.db - refined.loss.db) / left if left > 0 else np.inf
-            else:
-                share = held_out.loss_of_change(refined.shown, after.shown) / allowed
-            if share <= 1 or price < min(kept, default=np.inf):
-                keep(price, spent)
-            return share
+            if price not in losses:
+                spent = at(price)
+                after = held_out.look("codes", layout.played(spent.arrays), head, self.n_fetches)
+                if left is not None:
+                    losses[price] = after.loss.db - refined.loss.db
+                else:
+                    losses[price] = held_out.loss_of_change(refined.shown, after.shown)
+                if losses[price] <= most or price < min(kept, default=np.inf):
+                    keep(price, spent)
+            return losses[price] / most if most > 0 else np.inf
 
         def taken(price: float, max_mb: float) -> float:
             """What the files take, as a share of what they may."""
@@ -369,8 +372,13 @@ class _Bake:
             return share
 
         left = None if config.max_loss_db is None else config.max_loss_db - refined.loss.db
+        most = allowed if left is None else left
         first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
         price = highest_price(lost, first, 0.0 if left is not None and left > 0 else lowest)
+        if left is None and losses[price] > most:
+            # Rounding to whole codes alone loses more. What is allowed is then what a price may add to that.
+            most = losses[price] + allowed
+            price = highest_price(lost, first, lowest)
         if (max_mb := config.max_mb) is not None and (share := taken(price, max_mb)) > 1:
             # Bytes fall about with the square root of the price.
             price = 1 / highest_price(lambda rate: taken(1 / rate, max_mb), (AIM / share) ** 2 / price)

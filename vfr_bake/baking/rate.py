@@ -369,7 +369,10 @@ def highest_price(share: Callable[[float], float], first: float, lowest: float =
         low, high = (max(low, price), high) if found <= 1 else (low, min(high, price))
         if CLOSE <= found <= 1 or high <= max(NEAR * low, lowest):
             break
-        price = max(_next_price(tried, low, high, price), lowest)
+        if lowest and not low and len(tried) > 1:
+            price = lowest  # does any price fit?
+        else:
+            price = max(_next_price(tried, low, high, price), lowest)
     return low or min(tried)
 
 
