@@ -86,7 +86,7 @@ Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
 SPARING = 0.25
 """Factor of what choices may lose where the asset has already lost what its preset aims at."""
-N_PROJECTED = 50_000
+N_PROJECTED = 100_000
 """Rays that decide which directions of the features the colours depend on, and how much of each there is."""
 
 
