@@ -18,7 +18,7 @@ from player.head.dense_tiles import LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, R
 from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
 BLOCK = 4 * ROWS
-"""Pixels at a time: all the numbers of a 64 wide head are then 300 kB."""
+"""Pixels at a time: all the numbers of a 64 wide head are then 150 kB."""
 DENSE, DENSE_BYTES, MULTIPLY, MONOMIALS, QUANTIZE, ROUND = range(6)
 """Kinds of steps."""
 

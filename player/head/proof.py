@@ -32,15 +32,13 @@ def wrong() -> str | None:
     numbers = np.random.default_rng(0)
     x = numbers.uniform(-1, 1, (ROWS, DEPTH)).astype(F32)
     w = numbers.uniform(-1, 1, (DEPTH, WIDTH)).astype(F32)
-    memory = np.zeros(x.size + ROWS * WIDTH, F32)
+    memory = np.zeros(x.size + 2 * ROWS * WIDTH, F32)
     memory[: x.size] = x.reshape(-1)
     weights = np.concatenate([w.reshape(-1), np.zeros(WIDTH, F32), np.full(WIDTH, 0.5, F32)])
+    _floats(memory, weights, DEPTH)
     expected = 0.5 * x.astype(np.float64) @ w
-    for tiles in (_floats, _narrow_floats):
-        memory[x.size :] = 0
-        tiles(memory, weights, DEPTH)
-        if not np.allclose(memory[x.size :].reshape(ROWS, WIDTH), expected, rtol=0, atol=1e-5):
-            return "a layer gives other sums than numpy"
+    if not np.allclose(memory[x.size :].reshape(2, ROWS, WIDTH), expected, rtol=0, atol=1e-5):
+        return "a layer gives other sums than numpy"
     y = np.linspace(-6, 6, 4 * LANES, dtype=F32)
     gelu, sigmoid, codes = y.copy(), y.copy(), np.zeros(y.size, np.uint8)
     _follow(gelu, sigmoid, codes, y, F32(20))
@@ -61,31 +59,23 @@ def _wrong_bytes(numbers: np.random.Generator) -> str | None:
     codes[0], w[:, 0] = 255, 127
     packed = w.reshape(DEPTH // QUAD, QUAD, WIDTH // LANES, LANES).transpose(2, 0, 3, 1).reshape(-1)
     starts = numbers.integers(-1000, 1000, WIDTH).astype(np.int32)
+    memory = np.zeros(2 * ROWS * WIDTH, F32)
+    _bytes(codes.reshape(-1), memory, packed, starts, np.full(WIDTH, 0.5, F32), DEPTH // QUAD)
     expected = (codes[:, :DEPTH].astype(np.int64) @ w + starts) * 0.5
-    for tiles in (_bytes, _narrow_bytes):
-        memory = np.zeros(ROWS * WIDTH, F32)
-        tiles(codes.reshape(-1), memory, packed, starts, np.full(WIDTH, 0.5, F32), DEPTH // QUAD)
-        if (memory.reshape(ROWS, WIDTH) != expected).any():
-            return "products of bytes are others than numpy's"
-    return None
+    right = (memory.reshape(2, ROWS, WIDTH) == expected).all()
+    return None if right else "products of bytes are others than numpy's"
 
 
 @compiled
 def _floats(memory, weights, depth):
-    out, start = len(memory) - ROWS * WIDTH, depth * WIDTH
-    dense_tile(
-        memory, weights, (0, depth), (0, WIDTH), (start, 0, 0), start + WIDTH, (out, WIDTH), depth
-    )  # fmt: skip
-
-
-@compiled
-def _narrow_floats(memory, weights, depth):
-    out, start = len(memory) - ROWS * WIDTH, depth * WIDTH
-    for first in range(0, WIDTH, LANES):
+    """A layer by a wide tile, and behind it once more by narrow ones."""
+    x, scales, wide = (0, depth), (depth + 1) * WIDTH, ROWS * depth
+    narrow = wide + ROWS * WIDTH
+    dense_tile(memory, weights, x, (0, WIDTH), (depth * WIDTH, 0, 0), scales, (wide, WIDTH), depth)
+    for i in range(0, WIDTH, LANES):
         dense_narrow_tile(
-            memory, weights, (0, depth), (first, WIDTH), (start + first, 0, 0), start + WIDTH + first,
-            (out + first, WIDTH), depth,
-        )  # fmt: skip
+            memory, weights, x, (i, WIDTH), (depth * WIDTH + i, 0, 0), scales + i, (narrow + i, WIDTH), depth
+        )
 
 
 @compiled
@@ -98,13 +88,10 @@ def _follow(gelu, sigmoid, codes, x, per_step):
 
 @compiled
 def _bytes(codes, memory, packed, starts, scales, n_quads):
-    dense_bytes_tile(codes, memory, (packed, starts, scales), 0, 0, (0, 0), (0, WIDTH), n_quads)
-
-
-@compiled
-def _narrow_bytes(codes, memory, packed, starts, scales, n_quads):
-    for first in range(0, WIDTH, LANES):
+    """A layer by a wide tile, and behind it once more by narrow ones."""
+    tables, narrow = (packed, starts, scales), ROWS * WIDTH
+    dense_bytes_tile(codes, memory, tables, 0, 0, (0, 0), (0, WIDTH), n_quads)
+    for i in range(0, WIDTH, LANES):
         dense_bytes_narrow_tile(
-            codes, memory, (packed, starts, scales), 0, first * QUAD * n_quads, (first, first),
-            (first, WIDTH), n_quads,
-        )  # fmt: skip
+            codes, memory, tables, 0, i * QUAD * n_quads, (i, i), (narrow + i, WIDTH), n_quads
+        )
