@@ -19,9 +19,13 @@ from vfr_bake.rendering.compositing import RayFeatures, RaySamples
 from vfr_bake.rendering.sampling import LOOKUP_POINTS, march, most_samples
 
 OPACITY_THRESHOLD = 0.03
-"""A cell is empty when a whole march step through it is less opaque than this. With nerfacc's default of 0.01
-the haze around surfaces takes half of a batch's samples: lego after 1,500 steps had 23.4 dB with 0.01, 24.1
-with 0.03 and 24.4 with 0.12, which a thin fog would not survive."""
+"""A cell is empty when a whole step of a training's march through it is less opaque than this. With nerfacc's
+default of 0.01 the haze around surfaces takes half of a batch's samples: lego after 1,500 steps had 23.4 dB
+with 0.01, 24.1 with 0.03 and 24.4 with 0.12, which a thin fog would not survive."""
+TRAINING_STEPS = 2
+"""Steps of a picture's march in one of a training's. Every ray of a training begins its steps at random, so
+that a field learns what long steps show in the mean. Short ones show nearly that, half a decibel better than
+long ones do (docs/notes/2026-11-27-sharper-objects.md)."""
 DECAY = 0.95
 """All cells fade by this factor at an update, so that a cell counts as occupied only if some recent look
 found matter."""
@@ -31,9 +35,18 @@ matter that appears in a cell that counts as empty is found too late (lego after
 with 8, more cells stay occupied, and a batch of so many samples holds fewer rays (0.9 dB less)."""
 
 
+def empty_below(step: float) -> float:
+    """Density, 1/model unit, below which a cell is empty where pictures are marched with `step`.
+
+    >>> round(empty_below(0.01), 3)
+    1.523
+    """
+    return float(-np.log1p(-OPACITY_THRESHOLD)) / (TRAINING_STEPS * step)
+
+
 class OccupancyGrid:
     """The grid on a CPU: `densities` [n, n, n] float32 per model unit, and `distance` [n, n, n] uint8, in
-    cells to the nearest occupied one, for the march.
+    cells to the nearest occupied one, for the march; `step` is the length of a picture's steps, model units.
 
     >>> grid = OccupancyGrid(16, step=0.01, seed=0)
     >>> int(grid.distance.max())
@@ -69,7 +82,7 @@ class OccupancyGrid:
         self.n_updates += 1
         # A fog everywhere must not count as full: the mean bounds the threshold while the field is still
         # thin.
-        threshold = min(-np.log1p(-OPACITY_THRESHOLD) / self.step, float(flat.mean()))
+        threshold = min(empty_below(self.step), float(flat.mean()))
         self.set_occupied(self.densities > threshold)
 
     def observe(self, points: np.ndarray, sigmas: np.ndarray) -> None:
@@ -125,7 +138,8 @@ class OccupancyGrid:
 
 
 class DeviceOccupancyGrid:
-    """The grid on `device`: `densities` [n, n, n] float32 per model unit and `occupied` [n, n, n] bool.
+    """The grid on `device`: `densities` [n, n, n] float32 per model unit and `occupied` [n, n, n] bool;
+    `step` as that of `OccupancyGrid`.
 
     The march on a GPU tests every lattice point and needs no distances.
 
@@ -155,7 +169,7 @@ class DeviceOccupancyGrid:
         self.n_updates += 1
         # A fog everywhere must not count as full: the mean bounds the threshold while the field is still
         # thin.
-        threshold = self.densities.mean().clamp(max=float(-np.log1p(-OPACITY_THRESHOLD)) / self.step)
+        threshold = self.densities.mean().clamp(max=empty_below(self.step))
         occupied = self.densities > threshold
         self.occupied = occupied | ~occupied.any()  # nothing found yet: look everywhere rather than nowhere
 

@@ -43,7 +43,7 @@ class DeviceOccupancyGuide(BoxGuide):
         grid, budget = self._grid, int(self._budget(pilot) * share)
         first = jitter[:, 0].contiguous()
         samples, sigmas = march_on_device(
-            field.lookup, grid.occupied, grid.step, rays_o, rays_d, first, budget
+            field.lookup, grid.occupied, self._step, rays_o, rays_d, first, budget
         )
         grid.observe(samples.points, sigmas)
         return samples

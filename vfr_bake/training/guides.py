@@ -20,7 +20,7 @@ from vfr_bake.config import DeviceSettings, TrainConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.proposals import Round, spacing
 from vfr_bake.rendering.compositing import RaySamples, distortion
-from vfr_bake.rendering.occupancy import DeviceOccupancyGrid, OccupancyGrid
+from vfr_bake.rendering.occupancy import TRAINING_STEPS, DeviceOccupancyGrid, OccupancyGrid
 from vfr_bake.rendering.proposals import FAR, N_FINAL, ProposalSampler
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.rendering.sampling import march
@@ -94,7 +94,8 @@ class BoxGuide(Guide):
 
     def __init__(self, settings: DeviceSettings, grid: OccupancyGrid | DeviceOccupancyGrid) -> None:
         self._settings, self._grid = settings, grid
-        self._samples_per_ray = 2 / grid.step
+        self._step = TRAINING_STEPS * grid.step
+        self._samples_per_ray = 2 / self._step
 
     def n_rays(self, pilot: bool) -> int:
         wanted = 1.1 * self._budget(pilot) / self._samples_per_ray
@@ -148,7 +149,7 @@ class OccupancyGuide(BoxGuide):
         grid, budget = self._grid, int(self._budget(pilot) * share)
         first = jitter[:, 0].contiguous()
         samples, sigmas = march(
-            field, grid.distance, grid.step, rays_o, rays_d, first, budget, self._n_chunks
+            field, grid.distance, self._step, rays_o, rays_d, first, budget, self._n_chunks
         )
         if grid.n_updates > 0:
             grid.observe(samples.points.numpy(), sigmas)

@@ -24,6 +24,7 @@ from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
 from vfr_bake.kernels.head.bfloat16 import fast_products
 from vfr_bake.rendering.compositing import RaySamples, composite, composite_field
+from vfr_bake.rendering.occupancy import TRAINING_STEPS
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
@@ -193,7 +194,8 @@ class Trainer:
         return found if still is None else found.chosen(still.cpu().numpy())
 
     def _step_length(self) -> float:
-        return 2.0 * self.config.step_cells / self._field.config.max_resolution
+        """Length of a picture's march steps, model units."""
+        return 2.0 * self.config.step_cells / TRAINING_STEPS / self._field.config.max_resolution
 
     @property
     def field(self) -> VfrField:
