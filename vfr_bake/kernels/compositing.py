@@ -117,26 +117,37 @@ def silence(gradients, faint):
 
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
-def distortion(weights, mids, widths, starts, counts, losses, grad_weights):
-    """Distortion of each ray (mip-NeRF 360, eq. 15) and its gradient, in one pass forth and one back.
+def distortion(weights, mids, widths, reach, starts, counts, losses, grad_weights):
+    """Distortion of each ray (mip-NeRF 360, eq. 15) and its gradient, where no intervals count as farther
+    apart than `reach`.
 
-    losses[r] = sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 b_i for interval middles m, ascending along a
-    ray, and widths b. On the thread that calls it.
+    losses[r] = sum_ij w_i w_j min(|m_i - m_j|, reach) + 1/3 sum_i w_i^2 b_i for interval middles m, ascending
+    along a ray, and widths b. On the thread that calls it.
     """
     kind = weights.dtype.type
     for ray in range(starts.shape[0]):
         first, last = starts[ray], starts[ray] + counts[ray]
-        before, before_m = kind(0), kind(0)
-        total, total_m = kind(0), kind(0)
+        total = kind(0)
         for i in range(first, last):
             total += weights[i]
-            total_m += weights[i] * mids[i]
+        # The intervals within reach: `low` to i - 1 before an interval, i + 1 to `high` - 1 behind it.
+        low, high = first, first
+        before, before_m, after, after_m = kind(0), kind(0), kind(0), kind(0)
         loss = kind(0)
         for i in range(first, last):
             w, m, b = weights[i], mids[i], widths[i]
-            after, after_m = total - before - w, total_m - before_m - w * m
-            # sum_j w_j |m_i - m_j|, the intervals before i and those behind it
-            distance = m * before - before_m + after_m - m * after
+            while high < last and (high <= i or mids[high] - m < reach):
+                after += weights[high]
+                after_m += weights[high] * mids[high]
+                high += 1
+            while low < i and m - mids[low] >= reach:
+                before -= weights[low]
+                before_m -= weights[low] * mids[low]
+                low += 1
+            after -= w
+            after_m -= w * m
+            # sum_j w_j min(|m_i - m_j|, reach)
+            distance = m * before - before_m + after_m - m * after + reach * (total - before - after - w)
             loss += w * distance + w * w * b / kind(3)
             grad_weights[i] = kind(2) * distance + kind(2) * w * b / kind(3)
             before += w

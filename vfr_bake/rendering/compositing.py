@@ -85,17 +85,20 @@ def composite_field(
     return Composite(*_CompositeField.apply(*samples, faint, density, *density.parameters()))  # type: ignore[misc]
 
 
-def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:
+def distortion(
+    weights: Tensor, mids: Tensor, widths: Tensor, reach: float, starts: Tensor, counts: Tensor
+) -> Tensor:
     """Distortion [n_rays] of the weights over intervals with ascending `mids` and `widths` [n_samples]:
-    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 b_i (mip-NeRF 360, eq. 15).
+    sum_ij w_i w_j min(|m_i - m_j|, reach) + 1/3 sum_i w_i^2 b_i (mip-NeRF 360, eq. 15, which has no `reach`).
 
-    Differentiable with respect to `weights` alone. A single opaque interval of width b gives b / 3.
+    Beyond `reach` nothing draws weights together, so that two surfaces behind each other, as those of glass,
+    stay two. Differentiable with respect to `weights` alone. A single opaque interval of width b gives b / 3.
 
     >>> one = torch.tensor([1.0])
-    >>> round(float(distortion(one, one, one, torch.tensor([0]), torch.tensor([1]))), 4)
+    >>> round(float(distortion(one, one, one, 1.0, torch.tensor([0]), torch.tensor([1]))), 4)
     0.3333
     """
-    return _Distortion.apply(weights, mids, widths, starts, counts)  # type: ignore[return-value]
+    return _Distortion.apply(weights, mids, widths, reach, starts, counts)  # type: ignore[return-value]
 
 
 class _Composite(torch.autograd.Function):
@@ -174,12 +177,12 @@ class _CompositeField(torch.autograd.Function):
 
 class _Distortion(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weights, mids, widths, starts, counts):
+    def forward(ctx, weights, mids, widths, reach, starts, counts):
         losses = torch.empty(len(starts), dtype=weights.dtype)
         grad = torch.zeros_like(weights)
         kernels.distortion(
-            _array(weights), mids.numpy(), widths.numpy(), starts.numpy(), counts.numpy(), losses.numpy(),
-            grad.numpy(),
+            _array(weights), mids.numpy(), widths.numpy(), mids.numpy().dtype.type(reach), starts.numpy(),
+            counts.numpy(), losses.numpy(), grad.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(grad, starts, counts)
         return losses
@@ -189,7 +192,7 @@ class _Distortion(torch.autograd.Function):
         grad, starts, counts = ctx.saved_tensors
         # Packed without gaps, though not in the rays' order.
         order = torch.argsort(starts, stable=True)
-        return grad * grads[0][order].repeat_interleave(counts[order]), None, None, None, None
+        return grad * grads[0][order].repeat_interleave(counts[order]), *[None] * 5
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -76,11 +76,18 @@ def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, 
     return Composite(out, -torch.expm1(-depths.sum(dim=1)), weights)
 
 
-def distortion(weights: Tensor, mids: Tensor, widths: Tensor, starts: Tensor, counts: Tensor) -> Tensor:
-    """Distortion [n_rays] of the weights over intervals with ascending `mids` and `widths` [n_samples] (mip-
-    NeRF 360, eq. 15), as `vfr_bake.rendering.compositing.distortion`."""
+def distortion(
+    weights: Tensor, mids: Tensor, widths: Tensor, reach: float, starts: Tensor, counts: Tensor
+) -> Tensor:
+    """Distortion [n_rays] of the weights over intervals with ascending `mids` and `widths` [n_samples], as
+    `vfr_bake.rendering.compositing.distortion`."""
     padding = Padding(starts, counts, len(weights))
     w, m, b = (padding.rows(values) for values in (weights, mids, widths))
-    # Every pair is met from its later interval: sum_ij w_i w_j |m_i - m_j| is twice that.
-    pairs = 2 * w * (m * sums_before(w) - sums_before(w * m))
+    before, before_m = sums_before(w), sums_before(w * m)
+    # The first interval within reach; what is behind a ray's last one weighs nothing, and must ascend.
+    ascending = m.cummax(dim=1).values if m.numel() else m
+    low = torch.searchsorted(ascending, m - reach, right=True)
+    far, far_m = before.gather(1, low), before_m.gather(1, low)
+    # Every pair is met from its later interval: the sum over all is twice that.
+    pairs = 2 * w * (m * (before - far) - (before_m - far_m) + reach * far)
     return (pairs + w * w * b / 3).sum(dim=1)

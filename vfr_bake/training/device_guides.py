@@ -31,7 +31,7 @@ class DeviceOccupancyGuide(BoxGuide):
         self, config: TrainConfig, settings: DeviceSettings, step_length: float, device: torch.device
     ) -> None:
         grid = DeviceOccupancyGrid(config.occupancy_resolution, step_length, config.seed, device)
-        super().__init__(settings, grid)
+        super().__init__(settings, grid, distortion)
 
     @property
     def sampler(self) -> OccupancyGrid:
@@ -52,10 +52,8 @@ class DeviceOccupancyGuide(BoxGuide):
 class DeviceProposalGuide(SpaceGuide):
     """Trains the two proposal grids of an unbounded scene beside the field on a GPU, by autograd."""
 
-    def __init__(
-        self, config: TrainConfig, settings: DeviceSettings, near: float, device: torch.device
-    ) -> None:
-        super().__init__(config, settings, ProposalSampler(near).to(device), DeviceGridAdam, distortion)
+    def __init__(self, settings: DeviceSettings, near: float, device: torch.device) -> None:
+        super().__init__(settings, ProposalSampler(near).to(device), DeviceGridAdam, distortion)
 
     @property
     def sampler(self) -> ProposalSampler:

@@ -32,6 +32,9 @@ FOG_STEPS = 512
 proposals have all their samples."""
 STEPS_PER_UPDATE = (16, 64)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
+REACH, WHOLE_RAY = 0.01, 1.0
+"""How far apart the distortion loss takes weights to be at most: along an object's ray in sides of the box,
+so that glass and what lies behind it are not drawn together; along a scene's in lengths of the ray."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
 steps and b the slope (mip-NeRF 360, section C)."""
@@ -92,8 +95,13 @@ class Guide(ABC):
 class BoxGuide(Guide):
     """Marches an object's box: what its guides have in common on all devices."""
 
-    def __init__(self, settings: DeviceSettings, grid: OccupancyGrid | DeviceOccupancyGrid) -> None:
-        self._settings, self._grid = settings, grid
+    def __init__(
+        self,
+        settings: DeviceSettings,
+        grid: OccupancyGrid | DeviceOccupancyGrid,
+        distortion: Callable[..., Tensor],
+    ) -> None:
+        self._settings, self._grid, self._distortion = settings, grid, distortion
         self._step = TRAINING_STEPS * grid.step
         self._samples_per_ray = 2 / self._step
 
@@ -113,6 +121,14 @@ class BoxGuide(Guide):
         per_ray = max(n_samples / max(n_rays, 1), 1.0)
         self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
 
+    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
+        if self._settings.distortion == 0:
+            return None
+        # In sides of the box.
+        mids, widths = samples.t_mid / 2, samples.deltas / 2
+        losses = self._distortion(weights, mids, widths, REACH, samples.starts, samples.counts)
+        return self._settings.distortion * losses.sum()
+
     def state(self) -> dict[str, Any]:
         return {"samples_per_ray": self._samples_per_ray, "occupancy": self._grid.state()}
 
@@ -129,7 +145,8 @@ class OccupancyGuide(BoxGuide):
     def __init__(
         self, config: TrainConfig, settings: DeviceSettings, step_length: float, processes: Processes
     ) -> None:
-        super().__init__(settings, OccupancyGrid(config.occupancy_resolution, step_length, config.seed))
+        grid = OccupancyGrid(config.occupancy_resolution, step_length, config.seed)
+        super().__init__(settings, grid, distortion)
         self._processes = processes
         self._n_chunks = get_num_threads()
 
@@ -166,13 +183,12 @@ class SpaceGuide(Guide):
 
     def __init__(
         self,
-        config: TrainConfig,
         settings: DeviceSettings,
         sampler: ProposalSampler,
         adam: Callable[[Tensor], TableAdam],
         distortion: Callable[..., Tensor],
     ) -> None:
-        self._config, self._settings, self._sampler = config, settings, sampler
+        self._settings, self._sampler = settings, sampler
         self._adams = [adam(grid.table) for grid in sampler.grids]  # type: ignore[arg-type]
         self._distortion = distortion
         self._learns = True
@@ -192,15 +208,15 @@ class SpaceGuide(Guide):
         self._n_final = N_FINAL if step < FOG_STEPS else N_FINAL // 2
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        if self._config.distortion == 0:
+        if self._settings.distortion == 0:
             return None
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
         edges = samples.trail["edges"]
         kept = torch.arange(edges.shape[1] - 1, device=weights.device) < samples.counts[:, None]
         low, high = edges[:, :-1][kept], edges[:, 1:][kept]
         mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
-        losses = self._distortion(weights, mids, widths, samples.starts, samples.counts)
-        return self._config.distortion * losses.sum()
+        losses = self._distortion(weights, mids, widths, WHOLE_RAY, samples.starts, samples.counts)
+        return self._settings.distortion * losses.sum()
 
     def tables(self, samples: RaySamples) -> Sequence[TableAdam]:
         return self._adams if samples.trail["learns"] else ()
@@ -217,8 +233,8 @@ class SpaceGuide(Guide):
 class ProposalGuide(SpaceGuide):
     """Trains the two proposal grids of an unbounded scene beside the field, on a CPU."""
 
-    def __init__(self, config: TrainConfig, settings: DeviceSettings, near: float) -> None:
-        super().__init__(config, settings, ProposalSampler(near), GridAdam, distortion)
+    def __init__(self, settings: DeviceSettings, near: float) -> None:
+        super().__init__(settings, ProposalSampler(near), GridAdam, distortion)
 
     @property
     def sampler(self) -> ProposalSampler:

@@ -147,7 +147,7 @@ class Trainer:
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
         if scene.unbounded:
-            self._guide = ProposalGuide(self.config, self.pace, scene.near)
+            self._guide = ProposalGuide(self.pace, scene.near)
         else:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
         self._field.head.products = fast_products()
@@ -158,7 +158,7 @@ class Trainer:
     def _use_torch(self, scene: Scene) -> None:
         self._composite = composite_on_device
         if scene.unbounded:
-            self._guide = DeviceProposalGuide(self.config, self.pace, scene.near, self.device)
+            self._guide = DeviceProposalGuide(self.pace, scene.near, self.device)
         else:
             self._guide = DeviceOccupancyGuide(self.config, self.pace, self._step_length(), self.device)
         self._grid_adam = DeviceGridAdam(self._field.grid.table)

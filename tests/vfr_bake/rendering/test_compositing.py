@@ -88,11 +88,14 @@ def test_gradients_match_autograd_on_hard_inputs(dtype: torch.dtype) -> None:
         torch.testing.assert_close(ours, twin, rtol=1e-4, atol=tolerance)
 
 
-def naive_distortion(weights: np.ndarray, mids: np.ndarray, widths: np.ndarray) -> float:
-    """Mip-NeRF 360, equation 15, pair by pair."""
-    pairs = sum(
-        weights[i] * weights[j] * abs(mids[i] - mids[j]) for i in range(len(mids)) for j in range(len(mids))
-    )
+REACHES = [1e-9, 0.1, 0.3, 1.0]
+"""The intervals are in [0, 1]."""
+
+
+def naive_distortion(weights: np.ndarray, mids: np.ndarray, widths: np.ndarray, reach: float) -> float:
+    """Mip-NeRF 360, equation 15, pair by pair, none of which counts as farther apart than `reach`."""
+    every = range(len(mids))
+    pairs = sum(weights[i] * weights[j] * min(abs(mids[i] - mids[j]), reach) for i in every for j in every)
     return pairs + float((weights**2 * widths).sum()) / 3
 
 
@@ -105,26 +108,41 @@ def intervals(counts: list[int]) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
     return mids, widths, torch.cumsum(lengths, 0) - lengths, lengths
 
 
-def test_distortion_is_the_sum_over_pairs() -> None:
+@pytest.mark.parametrize("reach", REACHES)
+def test_distortion_is_the_sum_over_pairs(reach: float) -> None:
     mids, widths, starts, counts = intervals([5, 0, 1, 12])
     weights = torch.rand(len(mids), dtype=torch.float64)
-    losses = distortion(weights, mids, widths, starts, counts)
+    losses = distortion(weights, mids, widths, reach, starts, counts)
     for ray, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
         rows = slice(start, start + count)
-        expected = naive_distortion(weights[rows].numpy(), mids[rows].numpy(), widths[rows].numpy())
+        values = (values[rows].numpy() for values in (weights, mids, widths))
+        expected = naive_distortion(*values, reach)
         assert losses[ray].item() == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
-def test_distortion_gradient_matches_finite_differences() -> None:
+@pytest.mark.parametrize("reach", REACHES)
+def test_distortion_gradient_matches_finite_differences(reach: float) -> None:
     mids, widths, starts, counts = intervals([4, 0, 5])
     weights = torch.rand(len(mids), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w: distortion(w, mids, widths, starts, counts), (weights,))
+    assert torch.autograd.gradcheck(lambda w: distortion(w, mids, widths, reach, starts, counts), (weights,))
+
+
+def test_two_surfaces_are_drawn_together_within_reach_alone() -> None:
+    """What is farther away than that may be anywhere."""
+    widths, starts, counts = torch.full((2,), 1e-3), torch.tensor([0]), torch.tensor([2])
+    weights = torch.tensor([0.35, 0.65])
+    near, at, behind, far = (
+        distortion(weights, torch.tensor([0.2, mid]), widths, 0.01, starts, counts).item()
+        for mid in (0.205, 0.21, 0.3, 0.9)
+    )
+    assert near < 0.6 * at
+    assert at == pytest.approx(behind, rel=1e-4) == far
 
 
 def test_distortion_gradient_reaches_rays_out_of_order() -> None:
     mids, widths, starts, counts = intervals([3, 2])
     weights = torch.rand(5, dtype=torch.float64, requires_grad=True)
-    backwards = distortion(weights, mids, widths, starts.flip(0), counts.flip(0))
+    backwards = distortion(weights, mids, widths, 1.0, starts.flip(0), counts.flip(0))
     (gradient,) = torch.autograd.grad(backwards[1], weights)
     assert (gradient[:3] != 0).all() and (gradient[3:] == 0).all()
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.reference import composite_ray
-from tests.vfr_bake.rendering.test_compositing import STEP, intervals, packed
+from tests.vfr_bake.rendering.test_compositing import REACHES, STEP, intervals, packed
 from vfr_bake.rendering import compositing as numba_path
 from vfr_bake.torch_kernels.compositing import composite, distortion
 
@@ -65,8 +65,11 @@ def test_rays_may_be_out_of_order_or_absent(device: torch.device) -> None:
     assert empty[0].shape == (2, 5) and not empty[1].any()
 
 
+@pytest.mark.parametrize("reach", REACHES)
 @pytest.mark.parametrize("counts", [[5, 0, 1, 12], [1], [0, 0], []])
-def test_distortion_and_its_gradient_are_the_kernels(counts: list[int], device: torch.device) -> None:
+def test_distortion_and_its_gradient_are_the_kernels(
+    counts: list[int], reach: float, device: torch.device
+) -> None:
     if sum(counts):
         mids, widths, starts, lengths = intervals(counts)
     else:
@@ -75,10 +78,11 @@ def test_distortion_and_its_gradient_are_the_kernels(counts: list[int], device: 
     torch.manual_seed(2)
     weights = torch.rand(len(mids), dtype=torch.float64, requires_grad=True)
     scale = torch.rand(len(counts), dtype=torch.float64)
-    expected = numba_path.distortion(weights, mids, widths, starts, lengths)
+    expected = numba_path.distortion(weights, mids, widths, reach, starts, lengths)
     (gradient,) = torch.autograd.grad((expected * scale).sum(), weights)
     ours = weights.detach().to(device).requires_grad_()
-    losses = distortion(ours, *(a.to(device) for a in (mids, widths, starts, lengths)))
+    mids, widths, starts, lengths = (a.to(device) for a in (mids, widths, starts, lengths))
+    losses = distortion(ours, mids, widths, reach, starts, lengths)
     (losses * scale.to(device)).sum().backward()
     torch.testing.assert_close(losses.detach().cpu(), expected.detach(), rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(ours.grad.cpu(), gradient, rtol=1e-12, atol=1e-14)

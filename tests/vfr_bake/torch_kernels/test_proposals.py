@@ -96,7 +96,7 @@ def guides(device: torch.device) -> tuple[ProposalGuide, DeviceProposalGuide]:
     _, sampler, _, _ = make()
     config = TrainConfig()
     pace = config.for_device("cpu", True)
-    ours, expected = DeviceProposalGuide(config, pace, 0.05, device), ProposalGuide(config, pace, 0.05)
+    ours, expected = DeviceProposalGuide(pace, 0.05, device), ProposalGuide(pace, 0.05)
     for guide in (ours._sampler, expected.sampler):
         guide.load_state_dict(sampler.state_dict())
     return expected, ours
