@@ -32,9 +32,6 @@ FOG_STEPS = 512
 proposals have all their samples."""
 STEPS_PER_UPDATE = (16, 64)
 """Steps between two looks of the occupancy grid at the field: at first, and later."""
-REACH, WHOLE_RAY = 0.01, 1.0
-"""How far apart the distortion loss takes weights to be at most: along an object's ray in sides of the box,
-so that glass and what lies behind it are not drawn together; along a scene's in lengths of the ray."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
 """Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
 steps and b the slope (mip-NeRF 360, section C)."""
@@ -45,6 +42,13 @@ one for so many steps, then in every second for as many, and so on."""
 
 class Guide(ABC):
     """The sampler in training."""
+
+    reach: float
+    """How far apart the distortion loss takes weights to be at most, in the unit of `_intervals`."""
+
+    def __init__(self, settings: DeviceSettings, distortion: Callable[..., Tensor]) -> None:
+        """`distortion`: as `vfr_bake.rendering.compositing.distortion`, for the device."""
+        self._settings, self._distortion = settings, distortion
 
     @property
     @abstractmethod
@@ -72,8 +76,16 @@ class Guide(ABC):
         return None
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        """Sum over the rays of a loss on the weights [n_samples], if there is one."""
-        return None
+        """Sum over the rays of the distortion loss of the weights [n_samples], None if its weight is 0."""
+        if self._settings.distortion == 0:
+            return None
+        mids, widths = self._intervals(samples)
+        losses = self._distortion(weights, mids, widths, self.reach, samples.starts, samples.counts)
+        return self._settings.distortion * losses.sum()
+
+    @abstractmethod
+    def _intervals(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
+        """Middles and widths [n_samples] of the intervals that samples stand for."""
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
         """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
@@ -95,13 +107,17 @@ class Guide(ABC):
 class BoxGuide(Guide):
     """Marches an object's box: what its guides have in common on all devices."""
 
+    reach = 0.01
+    """Sides of the box: what lies behind glass is not drawn to it."""
+
     def __init__(
         self,
         settings: DeviceSettings,
         grid: OccupancyGrid | DeviceOccupancyGrid,
         distortion: Callable[..., Tensor],
     ) -> None:
-        self._settings, self._grid, self._distortion = settings, grid, distortion
+        super().__init__(settings, distortion)
+        self._grid = grid
         self._step = TRAINING_STEPS * grid.step
         self._samples_per_ray = 2 / self._step
 
@@ -121,13 +137,8 @@ class BoxGuide(Guide):
         per_ray = max(n_samples / max(n_rays, 1), 1.0)
         self._samples_per_ray += 0.1 * (per_ray - self._samples_per_ray)
 
-    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        if self._settings.distortion == 0:
-            return None
-        # In sides of the box.
-        mids, widths = samples.t_mid / 2, samples.deltas / 2
-        losses = self._distortion(weights, mids, widths, REACH, samples.starts, samples.counts)
-        return self._settings.distortion * losses.sum()
+    def _intervals(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
+        return samples.t_mid / 2, samples.deltas / 2
 
     def state(self) -> dict[str, Any]:
         return {"samples_per_ray": self._samples_per_ray, "occupancy": self._grid.state()}
@@ -181,6 +192,9 @@ class SpaceGuide(Guide):
     "rounds" that led to them, and whether proposals learn from these ("learns").
     """
 
+    reach = 1.0
+    """The length of the ray, in s."""
+
     def __init__(
         self,
         settings: DeviceSettings,
@@ -188,9 +202,9 @@ class SpaceGuide(Guide):
         adam: Callable[[Tensor], TableAdam],
         distortion: Callable[..., Tensor],
     ) -> None:
-        self._settings, self._sampler = settings, sampler
+        super().__init__(settings, distortion)
+        self._sampler = sampler
         self._adams = [adam(grid.table) for grid in sampler.grids]  # type: ignore[arg-type]
-        self._distortion = distortion
         self._learns = True
         self._n_final = N_FINAL
         self._exponent = 1.0
@@ -207,16 +221,12 @@ class SpaceGuide(Guide):
         # Once there is more than fog, half of the samples teach as much, as they lie where matter is.
         self._n_final = N_FINAL if step < FOG_STEPS else N_FINAL // 2
 
-    def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        if self._settings.distortion == 0:
-            return None
+    def _intervals(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
         # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
         edges = samples.trail["edges"]
-        kept = torch.arange(edges.shape[1] - 1, device=weights.device) < samples.counts[:, None]
+        kept = torch.arange(edges.shape[1] - 1, device=edges.device) < samples.counts[:, None]
         low, high = edges[:, :-1][kept], edges[:, 1:][kept]
-        mids, widths = (low + high) / (2 * self._span), (high - low) / self._span
-        losses = self._distortion(weights, mids, widths, WHOLE_RAY, samples.starts, samples.counts)
-        return self._settings.distortion * losses.sum()
+        return (low + high) / (2 * self._span), (high - low) / self._span
 
     def tables(self, samples: RaySamples) -> Sequence[TableAdam]:
         return self._adams if samples.trail["learns"] else ()

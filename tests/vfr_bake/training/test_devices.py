@@ -15,7 +15,9 @@ from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.field.field import VfrField
+from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
+from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
@@ -156,6 +158,19 @@ def test_several_processes_stay_on_the_cpu() -> None:
         Trainer(small_scene("object"), config(), Processes(0, 2), backend="torch")
 
 
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_pictures_are_marched_with_steps_half_as_long_as_in_training(backend: Backend) -> None:
+    trainer = Trainer(small_scene("object"), config(), backend=backend)
+    training = 2 * trainer.config.step_cells / trainer.field.config.max_resolution
+    _, samples = trainer._sampled(0)
+    assert samples.deltas.numpy() == pytest.approx(training, rel=1e-6)
+    sampler = trainer.sampler
+    assert isinstance(sampler, OccupancyGrid)
+    camera = trainer.cameras[0].resized(8, 8)
+    in_pictures = sampler.sample_all(trainer.field, *camera.rays())
+    assert in_pictures.deltas.numpy() == pytest.approx(training / 2, rel=1e-6)
+
+
 def test_what_is_not_given_follows_from_the_device() -> None:
     cpu, gpu = (TrainConfig().for_device(device, False) for device in ("cpu", "cuda"))
     assert (cpu.steps, cpu.batch_rays, cpu.max_rays, cpu.network_rate) == (1_000_000, 512, 16_384, 4e-3)
@@ -163,6 +178,8 @@ def test_what_is_not_given_follows_from_the_device() -> None:
     assert (gpu.network_rate, gpu.grid_rate) == (0.01, 0.01)
     assert TrainConfig().for_device("cuda", True).steps == 40_000
     assert TrainConfig(batch_rays=64).for_device("cuda", True).batch_rays == 64
+    assert cpu.distortion == gpu.distortion > TrainConfig().for_device("cpu", True).distortion > 0
+    assert TrainConfig(distortion=0.0).for_device("cuda", True).distortion == 0
     on_cpu, on_gpu = (FieldOptions().resolved(False, device) for device in ("cpu", "cuda"))
     assert (on_cpu.log2_table_size, on_cpu.head_width) == (18, 128)
     assert (on_gpu.log2_table_size, on_gpu.head_width) == (19, 256)
