@@ -7,6 +7,7 @@ kernels of them.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
@@ -31,5 +32,7 @@ def can_compile(device: torch.device) -> bool:
 
 @cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    # torch advises 19-bit products, which lose digits that a density, an exponential, shows.
+    warnings.filterwarnings("ignore", "TensorFloat32 tensor cores", UserWarning)
     # The number of samples differs from step to step; without `dynamic` each would be compiled anew.
     return torch.compile(function, dynamic=True)
