@@ -37,9 +37,9 @@ number of levels: 32 double the time of a step on a CPU, most of which is spent 
 
 
 FIELD_BY_DEVICE: dict[str, dict[str, Any]] = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
-"""Settings of the architecture that follow from the device. On a GPU, batches as large as the paper's fill
-tables as large as the paper's. On a CPU, the paper's head takes about half of a step's time, and one of
-half its width leaves room for nearly twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
+"""Settings of the architecture that follow from the device. A GPU has tables as large as the paper's. On a
+CPU, the paper's head takes about half of a step's time, and one of half its width leaves room for nearly
+twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
@@ -60,7 +60,7 @@ class FieldConfig:
     """Cells per axis of the coarsest level, over the unit cube."""
     max_resolution: int = 512
     """Cells per axis of the finest level."""
-    log2_table_size: int = 18
+    log2_table_size: int = 20
     """A level with more vertices than two to this power shares entries by hashing."""
     density_width: int = 64
     """Hidden width of the density network; 0 for a linear map."""
@@ -126,8 +126,8 @@ class FieldOptions:
     max_resolution: int | None = None
     """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
     log2_table_size: int | None = None
-    """A level with more vertices than two to this power shares entries by hashing; CPU 18, GPU 19 as in the
-    paper, whose far larger batches fill it."""
+    """A level with more vertices than two to this power shares entries by hashing; CPU 20, because places
+    that share an entry disturb each other in views that are not learned from; GPU 19, as in the paper."""
     density_width: int | None = None
     """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
     compositing: Compositing = "features"

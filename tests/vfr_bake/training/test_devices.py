@@ -183,7 +183,7 @@ def test_what_is_not_given_follows_from_the_device() -> None:
     assert cpu.distortion == gpu.distortion > TrainConfig().for_device("cpu", True).distortion > 0
     assert TrainConfig(distortion=0.0).for_device("cuda", True).distortion == 0
     on_cpu, on_gpu = (FieldOptions().resolved(False, device) for device in ("cpu", "cuda"))
-    assert (on_cpu.log2_table_size, on_cpu.head_width) == (18, 128)
+    assert (on_cpu.log2_table_size, on_cpu.head_width) == (20, 128)
     assert (on_gpu.log2_table_size, on_gpu.head_width) == (19, 256)
     assert FieldOptions(log2_table_size=15).resolved(False, "cuda").log2_table_size == 15
     assert FieldOptions().resolved(False) == FieldOptions().resolved(False, "cpu")
