@@ -25,6 +25,10 @@ N_CHANNELS = 2
 FLAGS = {"contract", "reassoc", "nsz", "arcp"}
 """Floating-point liberties for speed. NaN and infinity keep their meaning, so that a bad step is seen, not
 hidden."""
+LARGE = 48
+"""Cells per axis of a level that is too large to stay in a core's cache: it has a megabyte."""
+AHEAD = 4
+"""Points by which the rows that a gradient is added to are prefetched ahead."""
 
 
 class Levels(NamedTuple):
@@ -113,17 +117,25 @@ def corners(x, y, z, scale, offset, mask, hashed):
     return corner_rows(ix, iy, iz, last, offset, mask, hashed), weights
 
 
+@njit(inline="always")
+def prefetch_corners(x, y, z, scale, offset, mask, hashed, array):
+    """Prefetch the rows of `array` around a point, unless the level is small: then they are in the cache."""
+    if scale < LARGE:
+        return
+    last = np.int32(scale) - np.int32(1)
+    ix, iy, iz = cell_of(x * scale, last), cell_of(y * scale, last), cell_of(z * scale, last)
+    rows = corner_rows(ix, iy, iz, last, offset, mask, hashed)
+    for corner in range(8):
+        prefetch(array, rows[corner])
+
+
 @njit(fastmath=FLAGS, error_model="numpy")
 def prefetch_point(x, y, z, grid):
-    """Prefetch the rows around a point of all levels that are hashed: the others are in the cache anyway."""
+    """Prefetch the rows around a point of all levels."""
     for level in range(grid.scales.shape[0]):
-        if grid.hashed[level]:
-            scale = grid.scales[level]
-            last = np.int32(scale) - np.int32(1)
-            ix, iy, iz = cell_of(x * scale, last), cell_of(y * scale, last), cell_of(z * scale, last)
-            rows = corner_rows(ix, iy, iz, last, grid.offsets[level], grid.mask, True)
-            for corner in range(8):
-                prefetch(grid.table, rows[corner])
+        prefetch_corners(
+            x, y, z, grid.scales[level], grid.offsets[level], grid.mask, grid.hashed[level], grid.table
+        )  # fmt: skip
 
 
 @njit(fastmath=FLAGS, error_model="numpy")
@@ -163,8 +175,12 @@ def scatter_level(points, grad_features, level, scale, offset, mask, hashed, gra
     The list grows without a branch: what a row held is known only when it has come from memory, and guessing
     it wrong would stop the fetching of those to come.
     """
-    n = np.uint64(0)
-    for i in range(points.shape[0]):
+    n, n_points = np.uint64(0), points.shape[0]
+    for i in range(n_points):
+        ahead = min(i + AHEAD, n_points - 1)
+        prefetch_corners(
+            points[ahead, 0], points[ahead, 1], points[ahead, 2], scale, offset, mask, hashed, grad_table
+        )  # fmt: skip
         g0, g1 = grad_features[i, 2 * level], grad_features[i, 2 * level + 1]
         if g0 == 0 and g1 == 0:
             continue
