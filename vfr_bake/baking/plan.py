@@ -27,6 +27,7 @@ from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import cells_of_page
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
+from vfr_bake.kernels import is_kept
 from vfr_bake.presets import BakeChoice
 from vfr_bake.training.model_file import Model
 
@@ -79,6 +80,9 @@ REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_
 files; and by how much it is longer with the model's own head."""
 CHOSEN_COST = {False: 0.36, True: 0.12}
 """Time of a vertex when it is chosen what is stored of refined values, detail and codes, in the same unit."""
+COMPILE_SECONDS = 28.0
+"""Time in which the first bake after an installation compiles its code: make demo's takes 107 s in a fresh
+checkout, and 78 s in one that has baked before."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +224,12 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         refinement = min(refinement, refinement_seconds(choice, before))
     rest = CHOSEN_COST[unbounded] * n_vertices + REST_COST[unbounded]
     rest += 0 if choice.head_width else OWN_REST_COST[unbounded]
-    return before + refinement + ray_seconds * rest
+    return before + refinement + ray_seconds * rest + (0 if is_compiled() else COMPILE_SECONDS)
+
+
+def is_compiled() -> bool:
+    """Whether an earlier bake has compiled its code and kept it."""
+    return is_kept("descend")
 
 
 def refinement_seconds(choice: BakeChoice, before: float) -> float:

@@ -23,6 +23,7 @@ from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
+    COMPILE_SECONDS,
     FEWEST_RAYS,
     HEAD_COST,
     N_RAYS,
@@ -34,10 +35,12 @@ from vfr_bake.baking.plan import (
     UNBOUNDED_RAYS,
     VERTEX_COST,
     expected_seconds,
+    is_compiled,
     make_plan,
 )
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored
 from vfr_bake.config import BakeConfig
+from vfr_bake.kernels import is_kept
 from vfr_bake.presets import PRESETS, Preset
 from vfr_bake.training.model_file import Model
 
@@ -48,6 +51,12 @@ SMALL: dict[str, Any] = {
     "refine_steps": 0,
     "check_views": 1,
 }
+
+
+@pytest.fixture(autouse=True)
+def _compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is expected does not depend on what ran before the tests."""
+    monkeypatch.setattr("vfr_bake.baking.plan.is_compiled", lambda: True)
 
 
 def quiet(*_: object) -> None:
@@ -235,6 +244,20 @@ def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     # a small head is also trained before refinement
     steps = OWN_HEAD * (step + alone) - (step + (1 + HEAD_SHARE) * alone)
     assert own - small == pytest.approx(OWN_REST_COST[False] + steps, rel=1e-6)
+
+
+def test_the_first_bake_is_expected_to_compile(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vfr_bake.baking.plan.time", SimpleNamespace(perf_counter=lambda: 0.0))
+    config = BakeConfig(**SMALL)
+    plan = make_plan(model, config)
+    assert expected_seconds(model, config, plan) == 0
+    monkeypatch.setattr("vfr_bake.baking.plan.is_compiled", lambda: False)
+    assert expected_seconds(model, config, plan) == COMPILE_SECONDS
+
+
+def test_what_a_bake_compiles_is_kept(model: Model, tmp_path: Path) -> None:
+    bake(model, tmp_path / "asset", BakeConfig(**(SMALL | {"refine_steps": 1})), quiet)
+    assert is_compiled() and not is_kept("no such kernel")
 
 
 def test_more_work_is_expected_to_take_longer(model: Model) -> None:
