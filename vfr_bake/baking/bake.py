@@ -84,8 +84,6 @@ from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
 """Called with (stage, done, of)."""
-SPARING = 0.25
-"""Factor of what choices may lose where the asset has already lost what its preset aims at."""
 N_PROJECTED = 100_000
 """Rays that decide which directions of the features the colours depend on, and how much of each there is."""
 
@@ -158,8 +156,8 @@ class _Bake:
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
-        most_db = self._allowed(self.choice.culled_loss_db, tuning.kept)
         played = runner(stored.head, tuning.ranges)
+        most_db = self.choice.culled_loss_db
         detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
         with self._part("detail"):
             needed = self._needed(detail, layout, stored, teacher)
@@ -289,11 +287,6 @@ class _Bake:
         cameras += views_between(self.model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
         return detail.needed(layout, stored.density, stored.features, cameras, teacher)
 
-    def _allowed(self, most_db: float, now: Stage) -> float:
-        """What a choice may lose by what it takes away, dB: `most_db`, or less where the asset as it is `now`
-        has already lost nearly what the preset aims at."""
-        return float(np.clip(self.choice.target_loss_db - now.loss.db, SPARING * most_db, most_db))
-
     def _projection(self, teacher: TeacherRays) -> Projection:
         """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
@@ -328,7 +321,6 @@ class _Bake:
         grid = layout.grid(stored.density, stored.features)
         matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
         refined = held_out.look("refined", grid, head, self.n_fetches)
-        allowed = self._allowed(self.choice.code_loss_db, refined)
         del grid, stored
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
@@ -371,6 +363,7 @@ class _Bake:
                 keep(price, spent)
             return share
 
+        allowed = self.choice.code_loss_db
         left = None if config.max_loss_db is None else config.max_loss_db - refined.loss.db
         most = allowed if left is None else left
         first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
