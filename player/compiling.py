@@ -11,7 +11,7 @@ try:
 except ImportError:  # an extra: without it the numpy twin of whatever is compiled runs
     numba = None
 else:
-    from player.kept_code import keep, place
+    from player.kept_code import is_kept, keep, place
 
 SOURCES = Path(__file__).parent
 """The sources of all compiled code of the player: whatever lies in this folder and below."""
@@ -24,10 +24,7 @@ def available() -> bool:
 
 def first_use() -> bool:
     """Whether numba is there and has kept no march yet: the first picture waits until it is compiled."""
-    if numba is None:
-        return False
-    folder = place(SOURCES).folder
-    return folder is None or not any(folder.glob("*._march_rays-*.nbi"))
+    return numba is not None and not is_kept("_march_rays", SOURCES)
 
 
 def not_kept() -> str | None:

@@ -69,6 +69,12 @@ def keep(dispatcher: Any, *packages: Path) -> Any:
     return dispatcher
 
 
+def is_kept(name: str, *packages: Path) -> bool:
+    """Whether the function `name` was compiled from the sources in `packages` and kept, by any run."""
+    folder = place(*packages).folder
+    return folder is not None and any(folder.glob(f"*.{name}-*.nbi"))
+
+
 def user_folder() -> Path:
     """The user's folder of what is kept between runs: `$XDG_CACHE_HOME/vfr-bake`, on every system; where that
     is not set, where the system has such folders."""

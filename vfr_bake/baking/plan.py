@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from player.errors import ConfigError
+from player.kept_code import is_kept
 from vfr_bake.baking.cells import (
     BLOCK,
     CELL_SHARE,
@@ -27,7 +28,7 @@ from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import cells_of_page
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
-from vfr_bake.kernels import is_kept
+from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import BakeChoice
 from vfr_bake.training.model_file import Model
 
@@ -229,7 +230,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
 
 def is_compiled() -> bool:
     """Whether an earlier bake has compiled its code and kept it."""
-    return is_kept("descend")
+    return is_kept("descend", *SOURCES)
 
 
 def refinement_seconds(choice: BakeChoice, before: float) -> float:

@@ -14,7 +14,7 @@ import numba
 from numba import config
 
 import player
-from player.kept_code import keep, place
+from player.kept_code import keep
 
 # OpenMP is on every Linux with torch, workqueue everywhere; TBB only where somebody installed it, often too
 # old.
@@ -33,9 +33,3 @@ def njit(cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], 
         return keep(dispatcher, *SOURCES) if cache else dispatcher
 
     return compiled
-
-
-def is_kept(name: str) -> bool:
-    """Whether an earlier run has compiled the kernel of that name and kept it."""
-    folder = place(*SOURCES).folder
-    return folder is not None and any(folder.glob(f"*.{name}-*.nbi"))

@@ -14,6 +14,7 @@ import pytest
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.errors import ConfigError, TrainingError
+from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import _Bake, bake
@@ -40,7 +41,7 @@ from vfr_bake.baking.plan import (
 )
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored
 from vfr_bake.config import BakeConfig
-from vfr_bake.kernels import is_kept
+from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import PRESETS, Preset
 from vfr_bake.training.model_file import Model
 
@@ -257,7 +258,7 @@ def test_the_first_bake_is_expected_to_compile(model: Model, monkeypatch: pytest
 
 def test_what_a_bake_compiles_is_kept(model: Model, tmp_path: Path) -> None:
     bake(model, tmp_path / "asset", BakeConfig(**(SMALL | {"refine_steps": 1})), quiet)
-    assert is_compiled() and not is_kept("no such kernel")
+    assert is_compiled() and not is_kept("no such kernel", *SOURCES)
 
 
 def test_more_work_is_expected_to_take_longer(model: Model) -> None:
