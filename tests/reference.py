@@ -39,21 +39,29 @@ def gelu(x: np.ndarray) -> np.ndarray:
     return x * special.ndtr(x)
 
 
+def hard_swish(x: np.ndarray) -> np.ndarray:
+    return x * np.clip(x / 6 + 0.5, 0.0, 1.0)
+
+
+ACTIVATIONS = {"gelu": gelu, "hard_swish": hard_swish}
+
+
 def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
     """rgb [n, 3] of a head (`exporters.head.onnx_head.HeadWeights`) at `features` [n, n_channels], `dirs` [n,
     3].
     """
+    activation = ACTIVATIONS[weights.activation]
     h = np.asarray(features, np.float64)
     for weight, bias in weights.spatial:
-        h = gelu(h @ weight.astype(np.float64) + bias)
+        h = activation(h @ weight.astype(np.float64) + bias)
     weight, bias = weights.to_sh
     f = (h @ weight.astype(np.float64) + bias).reshape(len(h), weights.sh_degree**2, weights.n_sh_features)
     y = spherical_harmonics(np.asarray(dirs, np.float64), weights.sh_degree)
     e = (f * y[:, :, None]).reshape(len(h), f.shape[1] * f.shape[2])
     d_bottleneck, d_sh, bias = weights.directional_first
-    z = gelu(h @ d_bottleneck.astype(np.float64) + e @ d_sh.astype(np.float64) + bias)
+    z = activation(h @ d_bottleneck.astype(np.float64) + e @ d_sh.astype(np.float64) + bias)
     for weight, bias in weights.directional:
-        z = gelu(z @ weight.astype(np.float64) + bias)
+        z = activation(z @ weight.astype(np.float64) + bias)
     weight, bias = weights.output
     return special.expit(z @ weight.astype(np.float64) + bias)
 

@@ -20,6 +20,7 @@ from player.head.graph import (
     IR_VERSION,
     OPSET,
     PAIR_LIMIT,
+    Activation,
     HeadForm,
     head_nodes,
     head_ports,
@@ -40,13 +41,14 @@ class HeadWeights:
     """The head's arrays, any float type; layers as (W [n_in, n_out], b [n_out]).
 
     Args:
-        spatial: hidden layers on the composited features, each followed by GELU; at least one.
+        spatial: hidden layers on the composited features, at least one.
         to_sh: h -> the spherical-harmonics features, [n_hidden, n_bases * n_sh_features], basis-major.
         directional_first: (D_bottleneck [n_hidden, n_out], D_sh [n_bases * n_sh_features, n_out], b [n_out]).
-        directional: more hidden layers, each followed by GELU; may be empty.
+        directional: more hidden layers; may be empty.
         output: the last layer, [n_in, 3], followed by a sigmoid.
         sh_degree: number of bands, 1 to 8; n_bases = sh_degree^2.
         n_sh_features: features a basis.
+        activation: what follows each hidden layer.
 
     Raises:
         ShapeError: two layers do not fit.
@@ -60,6 +62,7 @@ class HeadWeights:
     output: Layer
     sh_degree: int
     n_sh_features: int
+    activation: Activation = "gelu"
 
     def __post_init__(self) -> None:
         if not self.spatial:
@@ -117,7 +120,13 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
         from onnx import helper, numpy_helper
     if ranges is not None and len(ranges) != 1 + len(weights.directional):
         raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
-    form = HeadForm(len(weights.spatial), len(weights.directional), weights.sh_degree, ranges is not None)
+    form = HeadForm(
+        len(weights.spatial),
+        len(weights.directional),
+        weights.sh_degree,
+        ranges is not None,
+        weights.activation,
+    )
     nodes = [
         helper.make_node(node.operator, node.inputs, [node.output], node.output, **node.attributes)
         for node in head_nodes(form)

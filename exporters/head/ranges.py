@@ -1,7 +1,7 @@
 """Ranges of the head's hidden activations, for multiplying in 8 bits.
 
 Letters as in `player.head.graph`: h is what the spatial MLP emits, z_i what directional layer i emits.
-Both come out of a GELU, so they are never below -0.17.
+Both come out of an activation: GELU is never below -0.17, hard swish never below -0.375.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ def activation_ranges(weights: HeadWeights, features: np.ndarray, dirs: np.ndarr
         features: [n, n_channels] composited features like those that will be played, n at least 1.
         dirs: [n, 3] their unit view directions.
     """
+    activated = _gelu if weights.activation == "gelu" else _hard_swish
     h = features.astype(np.float64)
     for weight, bias in weights.spatial:
-        h = _gelu(h @ weight + bias)
+        h = activated(h @ weight + bias)
     encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * _basis(weights, dirs)
     d_bottleneck, d_sh, bias = weights.directional_first
-    z = _gelu(h @ d_bottleneck + encoded @ d_sh + bias)
+    z = activated(h @ d_bottleneck + encoded @ d_sh + bias)
     ranges = [_range(h)]
     for weight, bias in weights.directional:
         ranges.append(_range(z))
-        z = _gelu(z @ weight + bias)
+        z = activated(z @ weight + bias)
     return tuple(ranges)
 
 
@@ -51,3 +52,7 @@ def _range(values: np.ndarray) -> Range:
 def _gelu(x: np.ndarray) -> np.ndarray:
     """The tanh form, within 5e-4 of the exact one: near enough for a range, and numpy alone can do it."""
     return 0.5 * x * (1 + np.tanh(0.7978845608 * (x + 0.044715 * x**3)))
+
+
+def _hard_swish(x: np.ndarray) -> np.ndarray:
+    return x * np.clip(x / 6 + 0.5, 0.0, 1.0)

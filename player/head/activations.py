@@ -5,6 +5,7 @@ They are a pass of their own over numbers that are still in cache. Each takes do
 on one another, which the processor does for many vectors at once if these follow one another in a short loop.
 
     gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
+    hard_swish(x) = x min(max(x / 6 + 1/2, 0), 1)
     sigmoid(x) = 1 / (1 + exp(-x))
 """
 
@@ -19,7 +20,7 @@ from numba.extending import intrinsic
 
 from player.compiled.lanes import BYTE, FLOAT, INT, Lanes, address, choose, load, splat, store, vector
 
-LINEAR, GELU = range(2)
+LINEAR, GELU, HARD_SWISH = range(3)
 
 # erf(z) = z P(z^2) / Q(z^2) for |z| <= 4, highest power first; Q > 0
 _ERF_P = (
@@ -38,6 +39,10 @@ def _gelu(x: Lanes) -> Lanes:
     erf = z * _polynomial(_ERF_P, square) * _inverse(_polynomial(_ERF_Q, square))
     half = x * 0.5
     return half.call("fma", erf, half)
+
+
+def _hard_swish(x: Lanes) -> Lanes:
+    return x * x.call("fma", 1 / 6, 0.5).most(0).least(1)
 
 
 def _within(x: Lanes, most: float) -> Lanes:
@@ -87,6 +92,8 @@ def _in_place(function: Callable[[Lanes], Lanes]) -> Any:
 
 gelu_lanes: Any = _in_place(_gelu)
 """gelu_lanes(memory, at): LANES numbers of `memory` [n] float32, from index `at` on, become their GELU."""
+hard_swish_lanes: Any = _in_place(_hard_swish)
+"""hard_swish_lanes(memory, at): LANES numbers of `memory`, from index `at` on, become their hard swish."""
 sigmoid_lanes: Any = _in_place(_sigmoid)
 """sigmoid_lanes(memory, at): LANES numbers of `memory`, from index `at` on, become their sigmoid."""
 

@@ -1,9 +1,9 @@
 """A head in 8 bits, compiled by numba: the same graph that onnxruntime runs, in blocks whose numbers stay in
 cache.
 
-A head as `exporters.head.onnx_head` writes it is a dozen small matrix products with a GELU behind each.
-onnxruntime makes a pass over memory of every operation. Here all operations are done on a block of pixels
-(`player.head.dense_tiles`, `player.head.activations`), which takes four fifths of the time.
+A head as `exporters.head.onnx_head` writes it is a dozen small matrix products with an activation behind
+each. onnxruntime makes a pass over memory of every operation. Here all operations are done on a block of
+pixels (`player.head.dense_tiles`, `player.head.activations`), which takes four fifths of the time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import numpy as np
 from player.compiling import compiled
 from player.head.activations import (
     GELU,
+    HARD_SWISH,
     gelu_lanes,
+    hard_swish_lanes,
     quantize_lanes,
     round_lanes,
     sigmoid_lanes,
@@ -142,6 +144,9 @@ def _activate(memory, at, n, kind):
     if kind == GELU:
         for i in range(at, at + n, LANES):
             gelu_lanes(memory, i)
+    elif kind == HARD_SWISH:
+        for i in range(at, at + n, LANES):
+            hard_swish_lanes(memory, i)
 
 
 @compiled

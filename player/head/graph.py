@@ -2,13 +2,15 @@
 whole.
 
 With F the composited `features` of a pixel and d its unit direction (row vectors, y = x @ W + b):
-    h   = gelu(... gelu(F S0 + s0) ...)                      spatial layers
+    h   = a(... a(F S0 + s0) ...)                            spatial layers
     e   = (h Wf + bf) * (m(d) C + c)                         spherical-harmonics encoding
-    z   = gelu(h D_bottleneck + e D_sh + d0)                 first directional layer
-    rgb = sigmoid(gelu(... gelu(z D1 + d1) ...) W + b)       more directional layers, output
-gelu(x) = x (1 + erf(x / sqrt 2)) / 2, the exact form. m(d) are the monomials of x, y and z up to the order
-sh_degree - 1, without the constant, each a product of one of the order below and x, y or z; C and c are the
-coefficients of the spherical harmonics, each column as often as a basis has features.
+    z   = a(h D_bottleneck + e D_sh + d0)                    first directional layer
+    rgb = sigmoid(a(... a(z D1 + d1) ...) W + b)             more directional layers, output
+The activation a is gelu(x) = x (1 + erf(x / sqrt 2)) / 2, in its exact form, or hard_swish(x) = x min(max(x /
+6 + 1/2, 0), 1), which takes a seventh of the operations; it is the same in all layers of a head. m(d) are the
+monomials of x, y and z up to the order sh_degree - 1, without the constant, each a product of one of the
+order below and x, y or z; C and c are the coefficients of the spherical harmonics, each column as often as a
+basis has features.
 
 In 8 bits, h and every z but the last are rounded to 256 levels, and the layers that take them multiply codes:
 with q the codes of x, q = clip(rint(x / x_scale) + zero, 0, 255), and Q those of W,
@@ -23,7 +25,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -42,6 +44,8 @@ PAIR_LIMIT = 128
 """Largest sum of the magnitudes of two neighbouring codes of weights, 2i and 2i + 1, of an output. Where a
 processor adds up two products at a time in 16 bits, 255 times as much still fits."""
 
+Activation = Literal["gelu", "hard_swish"]
+
 
 @dataclass(frozen=True)
 class HeadForm:
@@ -53,6 +57,7 @@ class HeadForm:
     sh_degree: int
     """Bands of spherical harmonics."""
     in_8_bits: bool
+    activation: Activation
 
 
 class Layer(NamedTuple):
@@ -159,7 +164,12 @@ def head_nodes(form: HeadForm) -> list[Node]:
                 codes = [f"{name}_{part}_{kind}" for kind in ("codes", "scale", "zero")]
                 add("DequantizeLinear", codes, f"{name}_{part}", axis=axis)
         linear = add("Gemm", [x, f"{name}_weight", f"{name}_bias"], f"{name}_linear")
-        return add("Gelu", [linear], name, approximate="none") if activated else linear
+        return activation(linear, name) if activated else linear
+
+    def activation(x: str, name: str) -> str:
+        if form.activation == "hard_swish":
+            return add("HardSwish", [x], name)
+        return add("Gelu", [x], name, approximate="none")
 
     def in_codes(x: str) -> str:
         if not form.in_8_bits:
@@ -194,7 +204,7 @@ def head_nodes(form: HeadForm) -> list[Node]:
     e = add("Mul", [f, harmonics()], "sh_encoded")
     z = dense("directional_0_bottleneck", h)
     z = add("Gemm", [e, "directional_0_sh_weight", z], "directional_0_linear")
-    z = add("Gelu", [z], "directional_0", approximate="none")
+    z = activation(z, "directional_0")
     for index in range(1, form.n_directional + 1):
         z = dense(f"directional_{index}", in_codes(z), activated=True)
     add("Sigmoid", [dense("output", z)], "rgb")
@@ -279,7 +289,9 @@ class _Reader:
         n_directional = count("directional_{}_bias" + "_codes" * in_8_bits, 1, MAX_LAYERS)
         n_orders = count("sh_{}_axis_pick", 2, MAX_DEGREE)
         sh_degree = n_orders + 2 if "sh_weight" in names else 1
-        form = HeadForm(n_spatial, n_directional, sh_degree, in_8_bits)
+        is_hard = any(node.operator == "HardSwish" for node in graph.nodes)
+        activation: Activation = "hard_swish" if is_hard else "gelu"
+        form = HeadForm(n_spatial, n_directional, sh_degree, in_8_bits, activation)
         known = 1 <= n_spatial <= MAX_LAYERS and n_directional <= MAX_LAYERS and sh_degree <= MAX_DEGREE
         if not known or graph.nodes != head_nodes(form):
             raise self._wrong("nodes", "the graph of a head", "another one")

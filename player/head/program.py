@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from player.head.activations import GELU, LINEAR
+from player.head.activations import GELU, HARD_SWISH, LINEAR
 from player.head.dense_tiles import LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED
 from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
@@ -99,6 +99,7 @@ class _Compiler:
     def __init__(self, head: HeadArrays, in_bytes: bool) -> None:
         self._head = head
         self._in_bytes = in_bytes
+        self._activation = {"gelu": GELU, "hard_swish": HARD_SWISH}[head.form.activation]
         self._weights = _Constants(np.float32)
         self._packed = _Constants(np.int8)
         self._starts = _Constants(np.int32)
@@ -110,7 +111,7 @@ class _Compiler:
         features, dirs = self._floats(head.n_channels), self._floats(3)
         h = features
         for layer in head.spatial:
-            h = self._dense(h, layer, GELU)
+            h = self._dense(h, layer, self._activation)
         rounding, *roundings = head.roundings
         h = self._rounded(h, rounding)
         order, harmonics = _ordered(head.harmonics)
@@ -123,9 +124,9 @@ class _Compiler:
             Step(MULTIPLY, x=sh.place, x_pitch=sh.pitch, out=encoded.place, pitch=encoded.pitch)
         )
         z = self._dense_rounded(h, head.bottleneck, rounding)
-        z = self._dense(encoded, Layer(head.from_sh[order], np.zeros(0)), GELU, start=z)
+        z = self._dense(encoded, Layer(head.from_sh[order], np.zeros(0)), self._activation, start=z)
         for layer, rounding in zip(head.directional, roundings, strict=True):
-            z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, GELU)
+            z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, self._activation)
         rgb = self._dense(z, head.output)
         pairs = [pair for order in range(1, head.form.sh_degree) for pair in _pairs(order)]
         return Program(

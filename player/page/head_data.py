@@ -53,6 +53,7 @@ def head_data(head: HeadArrays) -> HeadData:
     description = {
         "sh_degree": head.form.sh_degree,
         "in_8_bits": head.form.in_8_bits,
+        "activation": head.form.activation,
         "n_channels": head.n_channels,
         "spatial": [numbers.layer(layer) for layer in head.spatial],
         "to_sh": numbers.layer(head.to_sh),

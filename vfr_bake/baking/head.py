@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import gelu
+from torch.nn.functional import gelu, hardswish
 
 from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
@@ -79,6 +79,7 @@ def small_head(
         output=layer(width, 3, 1.0),
         sh_degree=n_bands,
         n_sh_features=like.n_sh_features,
+        activation="hard_swish",
     )
 
 
@@ -101,6 +102,7 @@ class FoldedHead(nn.Module):
     ) -> None:
         super().__init__()
         self._like, self._ranges = weights, ranges
+        self._activation = gelu if weights.activation == "gelu" else hardswish
         self._units = np.ones(weights.n_channels) if units is None else units.astype(np.float64)
         self.harmonics = SphericalHarmonics(weights.sh_degree)
         layers = [*weights.spatial, weights.to_sh, *weights.directional, weights.output]
@@ -116,14 +118,14 @@ class FoldedHead(nn.Module):
         n_spatial = len(self._like.spatial)
         h = codes * self._per_unit
         for weight, b in layers[:n_spatial]:
-            h = gelu(torch.addmm(b, h, weight))
+            h = self._activation(torch.addmm(b, h, weight))
         h = self._rounded(h, 0)
         weight, b = layers[n_spatial]
         basis = self.harmonics(dirs).repeat_interleave(self._like.n_sh_features, dim=-1)
         encoded = torch.addmm(b, h, self._rounded_weight(weight)) * basis
-        h = gelu(torch.addmm(bias, h, self._rounded_weight(d_bottleneck)) + encoded @ d_sh)
+        h = self._activation(torch.addmm(bias, h, self._rounded_weight(d_bottleneck)) + encoded @ d_sh)
         for index, (weight, b) in enumerate(layers[n_spatial + 1 : -1], start=1):
-            h = gelu(torch.addmm(b, self._rounded(h, index), self._rounded_weight(weight)))
+            h = self._activation(torch.addmm(b, self._rounded(h, index), self._rounded_weight(weight)))
         weight, b = layers[-1]
         return torch.sigmoid(torch.addmm(b, h, weight))
 
@@ -165,6 +167,7 @@ class FoldedHead(nn.Module):
             output=arrays[-1],
             sh_degree=self._like.sh_degree,
             n_sh_features=self._like.n_sh_features,
+            activation=self._like.activation,
         )
 
 

@@ -11,7 +11,7 @@ layout(location = 0) out uvec4 colours;
 // becomes of its outputs, 1 / scale and zero where they are rounded; whether they are added to what is there.
 uniform vec4 uLayers[3 * N_LAYERS];
 
-const float GELU = 1.0, ROUNDED = 2.0;
+const float ACTIVATED = 1.0, ROUNDED = 2.0;
 
 mat4 memory[MEMORY]; // a column for each pixel
 
@@ -30,14 +30,18 @@ vec4 gelu(vec4 x) {
   return max(x, 0.0) - 0.5 * y / q;
 }
 
+vec4 hard_swish(vec4 x) {
+  return x * clamp(x * (1.0 / 6.0) + 0.5, 0.0, 1.0);
+}
+
 vec4 rounded(vec4 x, float perStep, float zero) {
   return clamp(roundEven(x * perStep) + zero, 0.0, 255.0) - zero;
 }
 
 mat4 activated(mat4 x, vec4 scale, vec4 after) {
   x = mat4(x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale);
-  if (after.y < GELU) return x;
-  x = mat4(gelu(x[0]), gelu(x[1]), gelu(x[2]), gelu(x[3]));
+  if (after.y < ACTIVATED) return x;
+  x = mat4(ACTIVATION(x[0]), ACTIVATION(x[1]), ACTIVATION(x[2]), ACTIVATION(x[3]));
   if (after.y < ROUNDED) return x;
   return mat4(rounded(x[0], after.z, after.w), rounded(x[1], after.z, after.w), rounded(x[2], after.z, after.w), rounded(x[3], after.z, after.w));
 }

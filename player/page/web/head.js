@@ -3,7 +3,7 @@
 // of player/head/graph.py, which has the equations; the rounding to 8 bits is that of player/head/activations.py.
 
 const AT_ONCE = 2; // texels of a layer's outputs that head.glsl finds at a time, so that each input is read for all of them
-const AS_IT_IS = 0, GELU = 1, ROUNDED = 2; // what becomes of outputs: see head.glsl
+const AS_IT_IS = 0, ACTIVATED = 1, ROUNDED = 2; // what becomes of outputs: see head.glsl
 const XYZW = "xyzw";
 const fours = (n) => Math.ceil(n / 4);
 const outputTexels = (n) => AT_ONCE * Math.ceil(fours(n) / AT_ONCE);
@@ -64,7 +64,7 @@ export function headCode(head) {
   const layers = new Layers(), roundings = [...head.roundings], { columns, which } = distinctColumns(head.harmonics);
   // What is done to the outputs of a layer; those of the last layer before a rounded one are rounded.
   const activated = () => {
-    if (!head.in_8_bits || !roundings.length) return [GELU, 0, 0];
+    if (!head.in_8_bits || !roundings.length) return [ACTIVATED, 0, 0];
     const { scale, zero } = roundings.shift();
     return [ROUNDED, 1 / scale, zero];
   };
@@ -74,7 +74,7 @@ export function headCode(head) {
   places.HARMONICS_AT = layers.place(columns.length);
   const swap = () => ([here, there] = [there, here]);
   head.spatial.forEach((layer, i) => {
-    layers.dense(there, here, layer, { after: i + 1 < head.spatial.length ? [GELU, 0, 0] : activated() });
+    layers.dense(there, here, layer, { after: i + 1 < head.spatial.length ? [ACTIVATED, 0, 0] : activated() });
     swap();
   });
   layers.dense(places.ENCODED_AT, here, head.to_sh);
@@ -88,7 +88,7 @@ export function headCode(head) {
   }
   layers.dense(there, here, head.output);
   const texts = {
-    ...places, COLOURS_AT: there, MEMORY: layers.size, N_LAYERS: layers.table.length / 12, HARMONICS_LAYER: head.spatial.length + 1,
+    ...places, ACTIVATION: head.activation, COLOURS_AT: there, MEMORY: layers.size, N_LAYERS: layers.table.length / 12, HARMONICS_LAYER: head.spatial.length + 1,
     WRITE_MONOMIALS: monomialsCode(head.monomials), MULTIPLY_BY_HARMONICS: multiplyCode(which),
   };
   return { texts, weights: new Float32Array(layers.weights), table: layers.table };

@@ -11,6 +11,7 @@ import pytest
 
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from player.errors import FormatError, ShapeError
+from player.head.graph import Activation
 from tests.reference import evaluate_head
 
 
@@ -21,6 +22,7 @@ def random_head(
     n_sh_features: int = 4,
     n_spatial: int = 1,
     n_more: int = 2,
+    activation: Activation = "gelu",
 ) -> HeadWeights:
     random = np.random.default_rng(5)
 
@@ -35,7 +37,7 @@ def random_head(
     first = (layer(width, width)[0], layer(n_encoded, width)[0], layer(1, width)[1])
     more = tuple(layer(width, width) for _ in range(n_more))
     return HeadWeights(
-        spatial, layer(width, n_encoded), first, more, layer(width, 3), sh_degree, n_sh_features
+        spatial, layer(width, n_encoded), first, more, layer(width, 3), sh_degree, n_sh_features, activation
     )
 
 
@@ -52,9 +54,10 @@ def inputs(n: int, n_channels: int = 8) -> tuple[np.ndarray, np.ndarray]:
     return random.normal(size=(n, n_channels)).astype(np.float32), dirs.astype(np.float32)
 
 
+@pytest.mark.parametrize("activation", ["gelu", "hard_swish"])
 @pytest.mark.parametrize("n", [0, 1, 500])
-def test_any_number_of_pixels(n: int) -> None:
-    weights, (features, dirs) = random_head(), inputs(n)
+def test_any_number_of_pixels(n: int, activation: Activation) -> None:
+    weights, (features, dirs) = random_head(activation=activation), inputs(n)
     rgb = run(weights, features, dirs)
     assert rgb.shape == (n, 3) and rgb.dtype == np.float32
     np.testing.assert_allclose(rgb, evaluate_head(weights, features, dirs), rtol=0, atol=1e-5)

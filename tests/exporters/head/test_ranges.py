@@ -15,7 +15,7 @@ from player.errors import ShapeError
 from player.head.graph import read_head
 from tests.numerics.bounds import Row
 from tests.player.head.heads import play_in_integers
-from tests.reference import gelu, spherical_harmonics
+from tests.reference import ACTIVATIONS, spherical_harmonics
 
 N_CHANNELS, WIDTH, N_SH = 12, 64, 4
 EXTREME = Row(
@@ -33,8 +33,8 @@ def layer(random: np.random.Generator, n_in: int, n_out: int) -> tuple[np.ndarra
     return random.normal(size=(n_in, n_out)) * (2 / n_in) ** 0.5, random.normal(size=n_out) * 0.1
 
 
-@pytest.fixture(scope="module")
-def weights() -> HeadWeights:
+@pytest.fixture(scope="module", params=["gelu", "hard_swish"])
+def weights(request: pytest.FixtureRequest) -> HeadWeights:
     random = np.random.default_rng(0)
     first = layer(random, WIDTH, WIDTH)
     return HeadWeights(
@@ -45,6 +45,7 @@ def weights() -> HeadWeights:
         output=layer(random, WIDTH, 3),
         sh_degree=4,
         n_sh_features=N_SH,
+        activation=request.param,
     )
 
 
@@ -85,16 +86,17 @@ Squeeze = Callable[[int, np.ndarray], np.ndarray]
 
 def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) -> np.ndarray:
     """The head in float64, without rounding, with `squeeze` on what its 8-bit layers take in."""
+    activation = ACTIVATIONS[weights.activation]
     h = seen["features"].astype(np.float64)
     for weight, bias in weights.spatial:
-        h = gelu(h @ weight + bias)
+        h = activation(h @ weight + bias)
     h = squeeze(0, h)
     basis = spherical_harmonics(seen["dirs"].astype(np.float64), weights.sh_degree)
     encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * np.repeat(basis, weights.n_sh_features, axis=1)
     d_bottleneck, d_sh, bias = weights.directional_first
-    z = gelu(h @ d_bottleneck + encoded @ d_sh + bias)
+    z = activation(h @ d_bottleneck + encoded @ d_sh + bias)
     for number, (weight, bias) in enumerate(weights.directional, start=1):
-        z = gelu(squeeze(number, z) @ weight + bias)
+        z = activation(squeeze(number, z) @ weight + bias)
     return 1 / (1 + np.exp(-(z @ weights.output[0] + weights.output[1])))
 
 

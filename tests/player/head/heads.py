@@ -10,7 +10,7 @@ from scipy.special import expit
 from exporters.head import onnx_head
 from exporters.head.onnx_head import HeadWeights, Range, head_onnx
 from player.head.graph import HeadArrays, Layer, Rounding
-from tests.reference import gelu
+from tests.reference import ACTIVATIONS
 
 
 def head_onnx_of_before(weights: HeadWeights, ranges: list[Range]) -> bytes:
@@ -32,18 +32,18 @@ def play_in_integers(
     saturating: products of the inputs 2i and 2i + 1 are added up in 16 bits, from -32768 to 32767, as
     onnxruntime does on processors with AVX2 that have no VNNI.
     """
-    roundings = iter(head.roundings)
+    activation, roundings = ACTIVATIONS[head.form.activation], iter(head.roundings)
     h = features.astype(np.float64)
     for layer in head.spatial:
-        h = gelu(_plain(h, layer))
+        h = activation(_plain(h, layer))
     codes, zero = _codes(h, next(roundings))
     exponents = np.array(_exponents(head.form.sh_degree)).reshape(-1, 3)
     terms = np.prod(dirs[:, None].astype(np.float64) ** exponents, axis=-1)
     encoded = _in_codes(codes, zero, head.to_sh, saturating) * _plain(terms, head.harmonics)
-    z = gelu(_in_codes(codes, zero, head.bottleneck, saturating) + encoded @ head.from_sh)
+    z = activation(_in_codes(codes, zero, head.bottleneck, saturating) + encoded @ head.from_sh)
     for layer in head.directional:
         codes, zero = _codes(z, next(roundings))
-        z = gelu(_in_codes(codes, zero, layer, saturating))
+        z = activation(_in_codes(codes, zero, layer, saturating))
     return expit(_plain(z, head.output))
 
 

@@ -72,8 +72,10 @@ def test_a_head_in_float32_is_onnxruntimes(tmp_path: Path) -> None:
         random_head(n_channels=10, width=64, n_spatial=2, n_more=3),
         random_head(n_channels=3, width=17, sh_degree=2, n_sh_features=2, n_more=0),
         random_head(n_channels=33, width=40, sh_degree=3, n_sh_features=5),
+        random_head(n_channels=16, width=64, n_more=3, activation="hard_swish"),
+        random_head(n_channels=7, width=18, n_spatial=2, activation="hard_swish"),
     ],
-    ids=["32", "64", "17", "40"],
+    ids=["32", "64", "17", "40", "64 hard swish", "18 hard swish"],
 )
 def test_compiled_head_is_the_formula_in_any_number_of_pixels(weights: HeadWeights, tmp_path: Path) -> None:
     data = in_8_bits(weights, weights.n_channels)

@@ -15,6 +15,7 @@ from player.asset.manifest import Manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 from player.asset.single_level import VertexBricks, from_vertices
 from player.cameras.camera import Camera
+from player.head.graph import Activation
 from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.player.conftest import cameras_bytes, head_bytes, look_at, write_shells
 from tests.player.march.pyramid_scene import filled, random_scene, sparse_scene
@@ -22,9 +23,9 @@ from tests.player.march.pyramid_scene import filled, random_scene, sparse_scene
 WIDTH, HEIGHT = 60, 44
 
 
-def head_of(n_channels: int, in_8_bits: bool) -> bytes:
+def head_of(n_channels: int, in_8_bits: bool, activation: Activation = "gelu") -> bytes:
     """A head of random weights whose widths are no multiples of four."""
-    weights = random_head(n_channels, 18, n_sh_features=3)
+    weights = random_head(n_channels, 18, n_sh_features=3, activation=activation)
     (first, bias), *more = weights.spatial
     weights = replace(weights, spatial=((first / np.float32(40), bias), *more))  # of codes up to 127
     features, dirs = inputs(500, n_channels)
@@ -50,7 +51,8 @@ def shells(folder: Path) -> Asset:
 def pyramid_asset(
     folder: Path, level_steps: tuple[int, ...], contracted: bool, n_channels: int, sparse: bool = False
 ) -> Asset:
-    """Random pyramids of as many levels as `level_steps` has, with a head of random weights in 8 bits."""
+    """Random pyramids of as many levels as `level_steps` has, with a head of random weights in 8 bits, whose
+    activation is the hard swish where they are `sparse`."""
     if sparse:
         scene = sparse_scene(level_steps, 3, contracted)
     else:
@@ -65,7 +67,8 @@ def pyramid_asset(
         near=0.05 if contracted else 0.0, view_size=(48, 40), n_fetches=4, background=(0.2, 0.5, 0.9),
     )  # fmt: skip
     features = scene.features if n_channels == 3 else wider(scene.features, n_channels)
-    return write(folder, manifest, GridArrays(scene.densities, features), head_of(n_channels, True))
+    head = head_of(n_channels, True, "hard_swish" if sparse else "gelu")
+    return write(folder, manifest, GridArrays(scene.densities, features), head)
 
 
 def dense(resolution: int, n_channels: int, top: int, kind: type[np.generic], seed: int) -> PyramidValues:
@@ -76,7 +79,7 @@ def dense(resolution: int, n_channels: int, top: int, kind: type[np.generic], se
     return from_vertices(VertexBricks(coords, masks, values if kind == np.int8 else values[:, 0]), resolution)
 
 
-def fog(folder: Path, thickness: float = 2.0) -> Asset:
+def fog(folder: Path, thickness: float = 2.0, activation: Activation = "gelu") -> Asset:
     """A box that is full: hundreds of thin samples on a ray, or a few where it is flat."""
     box = ((-1.0, -1.0, -thickness / 2), (1.0, 1.0, thickness / 2))
     low = -3.0 - 2 * np.log(thickness / 2)
@@ -86,7 +89,7 @@ def fog(folder: Path, thickness: float = 2.0) -> Asset:
     )  # fmt: skip
     features = dense(15, 8, 120, np.int8, 1)
     arrays = GridArrays(dense(24, 1, 255, np.uint8, 0), features)
-    return write(folder, manifest, arrays, head_of(8, False))
+    return write(folder, manifest, arrays, head_of(8, False, activation))
 
 
 def empty(folder: Path, n_channels: int = 4) -> Asset:

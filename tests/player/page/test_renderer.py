@@ -48,7 +48,7 @@ GLSL = Row(PAGE, "shaders", ALL_ASSETS, unit="accepted by the reference compiler
 ASSETS: dict[str, Callable[[Path], Asset]] = {
     "one level, 4 channels": lambda folder: scenes.shells(folder),
     "fog, 8 channels": lambda folder: scenes.fog(folder),
-    "flat fog, 8 channels": lambda folder: scenes.fog(folder, 0.01),
+    "flat fog, 8 channels": lambda folder: scenes.fog(folder, 0.01, "hard_swish"),
     "4 levels, 9 channels": lambda folder: scenes.pyramid_asset(folder, (1, 1, 2, 4), False, 9),
     "sparse, 3 levels, 3 channels": lambda folder: scenes.pyramid_asset(
         folder, (1, 2, 2), False, 3, sparse=True

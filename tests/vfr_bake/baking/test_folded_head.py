@@ -11,6 +11,7 @@ import torch
 
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
+from player.head.graph import Activation
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.refinement import HEAD_RATE, Steps, Stored, train_head
 from vfr_bake.config import FieldConfig
@@ -32,9 +33,10 @@ def inputs(n: int) -> tuple[np.ndarray, np.ndarray]:
     return random.uniform(-127, 127, (n, 12)).astype(np.float32), dirs.astype(np.float32)
 
 
+@pytest.mark.parametrize("activation", ["gelu", "hard_swish"])
 @pytest.mark.parametrize("eight", [False, True], ids=["float32", "8 bits"])
-def test_the_trainable_head_is_the_exported_one(eight: bool) -> None:
-    weights = folded()
+def test_the_trainable_head_is_the_exported_one(eight: bool, activation: Activation) -> None:
+    weights = replace(folded(), activation=activation)
     codes, dirs = inputs(500)
     ranges = activation_ranges(weights, codes, dirs) if eight else None
     data = head_onnx(weights, ranges)

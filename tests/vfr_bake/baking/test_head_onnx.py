@@ -15,7 +15,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from torch.nn.functional import gelu
+from torch.nn.functional import gelu, hardswish
 
 from exporters.head.asset_head import comparisons, head_bytes
 from exporters.head.onnx_head import HeadWeights, Range, head_onnx, weight_scales
@@ -152,12 +152,13 @@ def quantised(
         w = torch.fake_quantize_per_channel_affine(w, scales, zeros, 1, -127, 127)
         return x @ w + tensor(bias)
 
+    activation = gelu if weights.activation == "gelu" else hardswish
     ((weight, bias),) = weights.spatial
-    h = rounded(gelu(features @ tensor(weight) + tensor(bias)), ranges[0])
+    h = rounded(activation(features @ tensor(weight) + tensor(bias)), ranges[0])
     basis = SphericalHarmonics(weights.sh_degree)(dirs).repeat_interleave(weights.n_sh_features, dim=-1)
     d_bottleneck, d_sh, bias = weights.directional_first
-    z = gelu(layer(h, d_bottleneck, bias) + (layer(h, *weights.to_sh) * basis) @ tensor(d_sh))
+    z = activation(layer(h, d_bottleneck, bias) + (layer(h, *weights.to_sh) * basis) @ tensor(d_sh))
     for limits, (weight, bias) in zip(ranges[1:], weights.directional, strict=True):
-        z = gelu(layer(rounded(z, limits), weight, bias))
+        z = activation(layer(rounded(z, limits), weight, bias))
     weight, bias = weights.output
     return torch.sigmoid(z @ tensor(weight) + tensor(bias))
