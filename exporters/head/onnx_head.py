@@ -105,27 +105,28 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
 
     Args:
         weights: the head.
-        ranges: None for float32 throughout; else one range for each hidden activation, as
+        ranges: None for float32 throughout; else the ranges of h, of e and of each z but the last, as
             `exporters.head.ranges.activation_ranges` finds them. The wide layers then multiply in 8 bits, in
             the standard QuantizeLinear/DequantizeLinear form. Ranges are constants of the graph, so a
             pixel's colour does not depend on which pixels it is evaluated with.
 
     Raises:
-        ShapeError: not one range for each activation.
+        ShapeError: another number of ranges.
         FormatError: a head that no player would take, such as one of too many layers.
         MissingExtraError: the package `onnx` is not installed.
     """
     with needs("the ONNX head", "the package onnx"):
         import onnx
         from onnx import helper, numpy_helper
-    if ranges is not None and len(ranges) != 1 + len(weights.directional):
-        raise ShapeError(f"head: ranges: expected {1 + len(weights.directional)}, got {len(ranges)}")
+    if ranges is not None and len(ranges) != 2 + len(weights.directional):
+        raise ShapeError(f"head: ranges: expected {2 + len(weights.directional)}, got {len(ranges)}")
     form = HeadForm(
         len(weights.spatial),
         len(weights.directional),
         weights.sh_degree,
         ranges is not None,
         weights.activation,
+        ranges is not None,
     )
     nodes = [
         helper.make_node(node.operator, node.inputs, [node.output], node.output, **node.attributes)
@@ -177,13 +178,16 @@ def _constants(weights: HeadWeights, ranges: Sequence[Range] | None) -> dict[str
     """The graph's constants by name."""
     constants: dict[str, np.ndarray] = {}
 
-    def dense(name: str, layer: Layer, x: str = "") -> None:
-        """A layer, in 8 bits if what it takes in, `x`, is."""
+    def dense(name: str, layer: Layer, x: str = "", parts: Sequence[str] = ("weight", "bias")) -> None:
+        """The parts of a layer, in 8 bits if what it takes in, `x`, is."""
         x_scale = constants.get(f"{x}_scale")
         if x_scale is None:
-            constants[f"{name}_weight"], constants[f"{name}_bias"] = (a.astype(np.float32) for a in layer)
+            for part, array in zip(parts, layer, strict=False):
+                constants[f"{name}_{part}"] = array.astype(np.float32)
             return
-        for part, (codes, scale) in _in_8_bits(layer, x_scale[0]).items():
+        in_8_bits = _in_8_bits(layer, x_scale[0])
+        for part in parts:
+            codes, scale = in_8_bits[part]
             constants[f"{name}_{part}_codes"], constants[f"{name}_{part}_scale"] = codes, scale
             constants[f"{name}_{part}_zero"] = np.zeros(len(scale), codes.dtype)
 
@@ -201,9 +205,10 @@ def _constants(weights: HeadWeights, ranges: Sequence[Range] | None) -> dict[str
     constants.update(_harmonics(weights))
     d_bottleneck, d_sh, bias = weights.directional_first
     dense("directional_0_bottleneck", (d_bottleneck, bias), h)
-    constants["directional_0_sh_weight"] = d_sh.astype(np.float32)
+    in_codes("sh_encoded", 1)
+    dense("directional_0_sh", (d_sh, np.zeros_like(bias)), "sh_encoded", ["weight"])
     for index, layer in enumerate(weights.directional, start=1):
-        in_codes(f"directional_{index - 1}", index)
+        in_codes(f"directional_{index - 1}", index + 1)
         dense(f"directional_{index}", layer, f"directional_{index - 1}")
     dense("output", weights.output)
     return constants

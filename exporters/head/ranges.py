@@ -1,7 +1,8 @@
 """Ranges of the head's hidden activations, for multiplying in 8 bits.
 
-Letters as in `player.head.graph`: h is what the spatial MLP emits, z_i what directional layer i emits.
-Both come out of an activation: GELU is never below -0.17, hard swish never below -0.375.
+Letters as in `player.head.graph`: h is what the spatial MLP emits, e the encoded features, z_i what
+directional layer i emits. h and z_i come out of an activation: GELU is never below -0.17, hard swish never
+below -0.375.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ finer step."""
 
 
 def activation_ranges(weights: HeadWeights, features: np.ndarray, dirs: np.ndarray) -> tuple[Range, ...]:
-    """The range of h, and of each z_i that another directional layer takes in.
+    """The ranges of h, of e, and of each z_i that another directional layer takes in.
 
     Args:
         weights: the head.
@@ -31,7 +32,7 @@ def activation_ranges(weights: HeadWeights, features: np.ndarray, dirs: np.ndarr
     encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * _basis(weights, dirs)
     d_bottleneck, d_sh, bias = weights.directional_first
     z = activated(h @ d_bottleneck + encoded @ d_sh + bias)
-    ranges = [_range(h)]
+    ranges = [_range(h), _range(encoded)]
     for weight, bias in weights.directional:
         ranges.append(_range(z))
         z = activated(z @ weight + bias)

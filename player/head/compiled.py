@@ -25,19 +25,23 @@ from player.head.dense_tiles import (
     MOST_BYTES,
     ROWS,
     WIDTH,
+    add_lanes,
     dense_bytes_narrow_tile,
     dense_bytes_tile,
     dense_narrow_tile,
     dense_tile,
     multiply_lanes,
+    repeat_lanes,
 )
 from player.head.program import (
+    ADD,
     BLOCK,
     DENSE,
     DENSE_BYTES,
     MULTIPLY,
     QUAD,
     QUANTIZE,
+    REPEAT,
     ROUND,
     Program,
 )
@@ -80,6 +84,10 @@ def _run(steps, weights, integers, pairs, memory, codes, features, dirs, rgb, pl
                 _dense_bytes(codes, memory, integers[0], integers[1], weights, step, n)
             elif step.kind == MULTIPLY:
                 _multiply(memory, step, n)
+            elif step.kind == ADD:
+                _add(memory, step, n)
+            elif step.kind == REPEAT:
+                _repeat(memory, step, n)
             elif step.kind == QUANTIZE:
                 _quantize(codes, memory, weights, step, n)
             elif step.kind == ROUND:
@@ -158,6 +166,24 @@ def _multiply(memory, step, n):
             multiply_lanes(memory, out + i, out + i, x + k)
             k = k + LANES if k + LANES < x_pitch else 0
         x, out = x + x_pitch, out + pitch
+
+
+@compiled
+def _repeat(memory, step, n):
+    """Each number several times. A whole vector of it is written, whose end the next one overwrites."""
+    x, out = step.x, step.out
+    for _ in range(n):
+        for i in range(step.depth):
+            for k in range(0, step.copies, LANES):
+                repeat_lanes(memory, out + i * step.copies + k, x + i)
+        x, out = x + step.x_pitch, out + step.pitch
+
+
+@compiled
+def _add(memory, step, n):
+    for i in range(0, n * step.pitch, LANES):
+        add_lanes(memory, step.out + i, step.out + i, step.x + i)
+    _activate(memory, step.out, n * step.pitch, step.activation)
 
 
 @compiled

@@ -7,6 +7,7 @@ alone imports this.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -162,22 +163,42 @@ dense_bytes_narrow_tile: Any = _dense_bytes(1)
 """The same for ROWS by LANES outputs."""
 
 
-def _multiply(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
+def _combined(combine: Callable[[Lanes, Lanes], Lanes]) -> Any:
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = address(context, builder, signature.args[0], arguments[0])
-        one, other = (load(builder, array, at) for at in arguments[2:])
-        store(array, arguments[1], one * other)
-        return context.get_dummy_value()
+    def typed(_: Any, memory: Any, out: Any, a: Any, b: Any) -> Any:
 
-    return types.void(memory, types.int64, types.int64, types.int64), generate
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array = address(context, builder, signature.args[0], arguments[0])
+            one, other = (load(builder, array, at) for at in arguments[2:])
+            store(array, arguments[1], combine(one, other))
+            return context.get_dummy_value()
+
+        return types.void(memory, types.int64, types.int64, types.int64), generate
+
+    return intrinsic(typed)
 
 
-multiply_lanes: Any = intrinsic(_multiply)
+multiply_lanes: Any = _combined(lambda a, b: a * b)
 """multiply_lanes(memory, out, a, b): LANES numbers at `out` become the products of those at `a` and `b`.
 
 The compiler does not do so by itself: it cannot know that the three do not overlap.
 """
+add_lanes: Any = _combined(lambda a, b: a + b)
+"""The same with sums."""
+
+
+def _repeat(_: Any, memory: Any, out: Any, x: Any) -> Any:
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = address(context, builder, signature.args[0], arguments[0])
+        store(array, arguments[1], splat(builder, builder.load(builder.gep(array, [arguments[2]]))))
+        return context.get_dummy_value()
+
+    return types.void(memory, types.int64, types.int64), generate
+
+
+repeat_lanes: Any = intrinsic(_repeat)
+"""repeat_lanes(memory, out, x): LANES numbers at `out` become the one at `x`."""
 
 
 class _Sums:

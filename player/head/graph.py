@@ -12,8 +12,9 @@ monomials of x, y and z up to the order sh_degree - 1, without the constant, eac
 order below and x, y or z; C and c are the coefficients of the spherical harmonics, each column as often as a
 basis has features.
 
-In 8 bits, h and every z but the last are rounded to 256 levels, and the layers that take them multiply codes:
-with q the codes of x, q = clip(rint(x / x_scale) + zero, 0, 255), and Q those of W,
+In 8 bits, h, e and every z but the last are rounded to 256 levels, and the layers that take them multiply
+codes; in older heads e is not rounded. With q the codes of x, q = clip(rint(x / x_scale) + zero, 0, 255), and
+Q those of W,
     y = ((q - zero) Q + codes of b) * scale
 in integers. The `scale` [n_out] of an output is x_scale times that of its weights.
 
@@ -58,6 +59,8 @@ class HeadForm:
     """Bands of spherical harmonics."""
     in_8_bits: bool
     activation: Activation
+    rounds_encoded: bool
+    """Whether e is rounded to 8 bits, too."""
 
 
 class Layer(NamedTuple):
@@ -88,13 +91,15 @@ class HeadArrays:
     spatial: list[Layer]
     roundings: list[Rounding]
     """Roundings of h, and of each z that another directional layer takes; none in float32."""
+    of_encoded: Rounding | None
+    """Rounding of e, if it is rounded."""
     to_sh: Layer
     harmonics: Layer
     """C [n_monomials, n_encoded] and c, the monomials in the order of `monomials`."""
     bottleneck: Layer
     """D_bottleneck and d0."""
-    from_sh: np.ndarray
-    """D_sh [n_encoded, n_out]."""
+    from_sh: Layer
+    """D_sh, without a bias."""
     directional: list[Layer]
     output: Layer
     n_parameters: int
@@ -109,7 +114,7 @@ class HeadArrays:
     def may_saturate(self) -> bool:
         """Whether sums of two products of codes may exceed 16 bits, which assets have that were written
         before `PAIR_LIMIT` was kept."""
-        layers = [self.to_sh, self.bottleneck, *self.directional]
+        layers = [self.to_sh, self.bottleneck, self.from_sh, *self.directional]
         return any(pair_sums(a.weight).max(initial=0) > PAIR_LIMIT for a in layers if a.scale is not None)
 
 
@@ -171,8 +176,8 @@ def head_nodes(form: HeadForm) -> list[Node]:
             return add("HardSwish", [x], name)
         return add("Gelu", [x], name, approximate="none")
 
-    def in_codes(x: str) -> str:
-        if not form.in_8_bits:
+    def in_codes(x: str, wanted: bool = form.in_8_bits) -> str:
+        if not wanted:
             return x
         steps = [f"{x}_scale", f"{x}_zero"]
         add("QuantizeLinear", [x, *steps], f"{x}_codes")
@@ -203,7 +208,13 @@ def head_nodes(form: HeadForm) -> list[Node]:
     f = dense("to_sh", h)
     e = add("Mul", [f, harmonics()], "sh_encoded")
     z = dense("directional_0_bottleneck", h)
-    z = add("Gemm", [e, "directional_0_sh_weight", z], "directional_0_linear")
+    e = in_codes(e, form.rounds_encoded)
+    if e in rounded:  # runtimes multiply codes where no sum in float32 is added
+        codes = [f"directional_0_sh_weight_{kind}" for kind in ("codes", "scale", "zero")]
+        weight = add("DequantizeLinear", codes, "directional_0_sh_weight", axis=1)
+        z = add("Add", [z, add("Gemm", [e, weight], "directional_0_sh")], "directional_0_linear")
+    else:
+        z = add("Gemm", [e, "directional_0_sh_weight", z], "directional_0_linear")
     z = activation(z, "directional_0")
     for index in range(1, form.n_directional + 1):
         z = dense(f"directional_{index}", in_codes(z), activated=True)
@@ -264,7 +275,8 @@ class _Reader:
         harmonics = self._harmonics(form.sh_degree, n_encoded)
         bottleneck = self._layer("directional_0_bottleneck", width, rounding=of_h)
         width = bottleneck.weight.shape[1]
-        from_sh = self._floats("directional_0_sh_weight", n_encoded, width)
+        of_encoded = self._rounding("sh_encoded") if form.rounds_encoded else None
+        from_sh = self._without_bias("directional_0_sh", n_encoded, width, of_encoded)
         directional = []
         for index in range(1, form.n_directional + 1):
             of_z = rounding(f"directional_{index - 1}")
@@ -274,8 +286,9 @@ class _Reader:
         if self._left:
             raise self._wrong("constants", "those of a head", f"{min(self._left)[:80]!a} as well")
         return HeadArrays(
-            form, spatial, roundings, to_sh, harmonics, bottleneck, from_sh, directional, output, n_parameters
-        )
+            form, spatial, roundings, of_encoded, to_sh, harmonics, bottleneck, from_sh, directional, output,
+            n_parameters,
+        )  # fmt: skip
 
     def _form(self) -> HeadForm:
         """The form that the names of the constants tell, if the nodes are that form's."""
@@ -291,7 +304,8 @@ class _Reader:
         sh_degree = n_orders + 2 if "sh_weight" in names else 1
         is_hard = any(node.operator == "HardSwish" for node in graph.nodes)
         activation: Activation = "hard_swish" if is_hard else "gelu"
-        form = HeadForm(n_spatial, n_directional, sh_degree, in_8_bits, activation)
+        rounds_encoded = "sh_encoded_scale" in names
+        form = HeadForm(n_spatial, n_directional, sh_degree, in_8_bits, activation, rounds_encoded)
         known = 1 <= n_spatial <= MAX_LAYERS and n_directional <= MAX_LAYERS and sh_degree <= MAX_DEGREE
         if not known or graph.nodes != head_nodes(form):
             raise self._wrong("nodes", "the graph of a head", "another one")
@@ -327,21 +341,43 @@ class _Reader:
         if rounding is None:
             weight = self._floats(f"{name}_weight", n_in, n_out)
             return Layer(weight, self._floats(f"{name}_bias", weight.shape[1]))
-        weight = self._take(f"{name}_weight_codes", np.int8, n_in, n_out)
+        weight, product = self._codes(name, n_in, n_out, rounding)
         width = weight.shape[1]
         bias = self._take(f"{name}_bias_codes", np.int32, width)
-        scales = self._scales(f"{name}_weight_scale", width), self._scales(f"{name}_bias_scale", width)
-        for part, kind in (("weight", np.int8), ("bias", np.int32)):
-            if self._take(f"{name}_{part}_zero", kind, width).any():
-                raise self._wrong(f"{name}_{part}_zero", "zeros", "others")
-        with np.errstate(over="ignore"):
-            product = scales[0] * rounding.scale
-        if not np.array_equal(product, scales[1]):
+        scale = self._scales(f"{name}_bias_scale", width)
+        self._zeros(f"{name}_bias_zero", np.int32, width)
+        if not np.array_equal(product, scale):
             raise self._wrong(f"{name}_bias_scale", "the scale of the products", "another one")
-        codes = np.abs(weight.astype(np.int64)).sum(axis=0)
-        if (np.abs(bias.astype(np.int64)) + 255 * codes > LARGEST_SUM).any():
+        return self._fitting(name, Layer(weight, bias, scale))
+
+    def _without_bias(self, name: str, n_in: int, n_out: int, rounding: Rounding | None) -> Layer:
+        if rounding is None:
+            return Layer(self._floats(f"{name}_weight", n_in, n_out), np.zeros(n_out, np.float32))
+        weight, scale = self._codes(name, n_in, n_out, rounding)
+        if not np.isfinite(scale).all():
+            raise self._wrong(f"{name}_weight_scale", "products with a finite scale", "others")
+        return self._fitting(name, Layer(weight, np.zeros(n_out, np.int32), scale))
+
+    def _codes(
+        self, name: str, n_in: int, n_out: int | None, rounding: Rounding
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A layer's codes of weights, and the scale of their products."""
+        weight = self._take(f"{name}_weight_codes", np.int8, n_in, n_out)
+        scale = self._scales(f"{name}_weight_scale", weight.shape[1])
+        self._zeros(f"{name}_weight_zero", np.int8, weight.shape[1])
+        with np.errstate(over="ignore"):
+            return weight, scale * rounding.scale
+
+    def _zeros(self, name: str, kind: type, width: int) -> None:
+        if self._take(name, kind, width).any():
+            raise self._wrong(name, "zeros", "others")
+
+    def _fitting(self, name: str, layer: Layer) -> Layer:
+        """The layer, if its sums of products fit into 32 bits."""
+        codes = np.abs(layer.weight.astype(np.int64)).sum(axis=0)
+        if (np.abs(layer.bias.astype(np.int64)) + 255 * codes > LARGEST_SUM).any():
             raise self._wrong(name, "sums of products that fit into 32 bits", "larger ones")
-        return Layer(weight, bias, scales[1])
+        return layer
 
     def _scales(self, name: str, *shape: int) -> np.ndarray:
         array = self._floats(name, *shape)

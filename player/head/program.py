@@ -19,7 +19,7 @@ from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
 BLOCK = 4 * ROWS
 """Pixels at a time: all the numbers of a 64 wide head are then 150 kB."""
-DENSE, DENSE_BYTES, MULTIPLY, MONOMIALS, QUANTIZE, ROUND = range(6)
+DENSE, DENSE_BYTES, MULTIPLY, ADD, REPEAT, MONOMIALS, QUANTIZE, ROUND = range(8)
 """Kinds of steps."""
 
 
@@ -43,9 +43,11 @@ class Step(NamedTuple):
     x: int = 0
     x_pitch: int = 0
     depth: int = 0
-    """DENSE: inputs of the layer. DENSE_BYTES: QUADs of inputs."""
+    """DENSE: inputs of the layer. DENSE_BYTES: QUADs of inputs. REPEAT: numbers of a pixel."""
     w: int = 0
     """Place of the layer's weights."""
+    copies: int = 1
+    """REPEAT: how often each number is written."""
     start: int = 0
     """Place of what the layer's sums begin with."""
     start_pitch: int = 0
@@ -57,7 +59,8 @@ class Step(NamedTuple):
     zero: int = 0
     """QUANTIZE, ROUND: the code of 0."""
     out: int = 0
-    """MULTIPLY: place of the table that is multiplied by `x`, whose rows may be shorter and begin again."""
+    """MULTIPLY, ADD: place of the table that `x` is multiplied with or added to. MULTIPLY: rows of `x` may be
+    shorter, and begin again."""
     pitch: int = 0
     activation: int = LINEAR
 
@@ -114,17 +117,17 @@ class _Compiler:
             h = self._dense(h, layer, self._activation)
         rounding, *roundings = head.roundings
         h = self._rounded(h, rounding)
-        order, harmonics = _ordered(head.harmonics)
+        order, harmonics, copies = _ordered(head.harmonics)
         weight, bias, scale = head.to_sh
         assert scale is not None
         to_sh = Layer(weight[:, order], bias[order], scale[order])
         encoded = self._dense_rounded(h, to_sh, rounding)
-        sh = self._harmonics(dirs, harmonics)
+        sh = self._harmonics(dirs, harmonics, copies)
         self._steps.append(
             Step(MULTIPLY, x=sh.place, x_pitch=sh.pitch, out=encoded.place, pitch=encoded.pitch)
         )
         z = self._dense_rounded(h, head.bottleneck, rounding)
-        z = self._dense(encoded, Layer(head.from_sh[order], np.zeros(0)), self._activation, start=z)
+        z = self._add_encoded(z, encoded, order)
         for layer, rounding in zip(head.directional, roundings, strict=True):
             z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, self._activation)
         rgb = self._dense(z, head.output)
@@ -177,13 +180,35 @@ class _Compiler:
         ))  # fmt: skip
         return out
 
-    def _harmonics(self, dirs: Value, layer: Layer) -> Value:
-        """The spherical harmonics of directions."""
+    def _add_encoded(self, z: Value, encoded: Value, order: np.ndarray) -> Value:
+        """The first directional layer: the activation of z and what comes of the encoded features, which lie
+        in an `order`."""
+        head, layer = self._head, self._head.from_sh
+        layer = layer._replace(weight=layer.weight[order])
+        if head.of_encoded is None:
+            return self._dense(encoded, layer, self._activation, start=z)
+        added = self._dense_rounded(self._rounded(encoded, head.of_encoded), layer, head.of_encoded)
+        self._steps.append(Step(
+            ADD, x=added.place, x_pitch=added.pitch, out=z.place, pitch=z.pitch, activation=self._activation
+        ))  # fmt: skip
+        return z
+
+    def _harmonics(self, dirs: Value, layer: Layer, copies: int) -> Value:
+        """The spherical harmonics of directions, each so often."""
         terms = self._floats(len(layer.weight))
         self._steps.append(
             Step(MONOMIALS, x=dirs.place, x_pitch=dirs.pitch, out=terms.place, pitch=terms.pitch)
         )
-        return self._dense(terms, layer)
+        sh = self._dense(terms, layer)
+        if copies == 1:
+            return sh
+        out = self._floats(copies * sh.width)
+        self._n_floats += _padded(copies)  # whole vectors are written, beyond the last number too
+        self._steps.append(Step(
+            REPEAT, x=sh.place, x_pitch=sh.pitch, depth=sh.width, copies=copies, out=out.place,
+            pitch=out.pitch,
+        ))  # fmt: skip
+        return out
 
     def _rounded(self, x: Value, rounding: Rounding) -> Value:
         """`x` as codes: in bytes, or in floats from which the code of 0 is taken off."""
@@ -200,18 +225,24 @@ class _Compiler:
         return out
 
 
-def _ordered(harmonics: Layer) -> tuple[np.ndarray, Layer]:
-    """An order of the encoded features in which the harmonics that they are multiplied by begin again and
-    again, and these harmonics, each once: so they are found once for several features. If they fill no whole
-    vectors, the features' own order and all of their harmonics."""
+def _ordered(harmonics: Layer) -> tuple[np.ndarray, Layer, int]:
+    """An order of the encoded features, the harmonics that they are multiplied by, each of which is found
+    once, and how often each is to be repeated for that.
+
+    Where harmonics fill whole vectors, those of the features are all of them again and again. Elsewhere the
+    features of a harmonic are beside one another, if all have as many; if not, each feature has its own.
+    """
     columns = np.vstack([harmonics.bias, harmonics.weight])
     distinct, which = np.unique(columns, axis=1, return_inverse=True)
     n, n_all = distinct.shape[1], columns.shape[1]
     by_harmonic = np.argsort(which.reshape(-1), kind="stable")
-    if n % LANES or (np.bincount(which.reshape(-1)) != n_all // n).any():
-        return np.arange(n_all), harmonics
-    order = by_harmonic.reshape(n, -1).T.reshape(-1)
-    return order, Layer(harmonics.weight[:, order[:n]], harmonics.bias[order[:n]])
+    if (np.bincount(which.reshape(-1)) != n_all // n).any():
+        return np.arange(n_all), harmonics, 1
+    first = by_harmonic.reshape(n, -1)[:, 0]
+    once = Layer(harmonics.weight[:, first], harmonics.bias[first])
+    if n % LANES:
+        return by_harmonic, once, n_all // n
+    return by_harmonic.reshape(n, -1).T.reshape(-1), once, 1
 
 
 def _pairs(order: int) -> list[tuple[int, int]]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from player.head.graph import HeadArrays, Layer, monomials
+from player.head.graph import HeadArrays, Layer, Rounding, monomials
 
 _TYPES = {"float32": "<f4", "int8": "<i1", "int32": "<i4"}
 
@@ -48,8 +48,6 @@ class _Numbers:
 def head_data(head: HeadArrays) -> HeadData:
     """The files of a head."""
     numbers = _Numbers()
-    n_in, n_out = head.from_sh.shape
-    from_sh = {"n_in": n_in, "n_out": n_out, "weight": numbers.add(head.from_sh), "bias": None, "scale": None}
     description = {
         "sh_degree": head.form.sh_degree,
         "in_8_bits": head.form.in_8_bits,
@@ -59,13 +57,18 @@ def head_data(head: HeadArrays) -> HeadData:
         "to_sh": numbers.layer(head.to_sh),
         "harmonics": numbers.layer(head.harmonics),
         "bottleneck": numbers.layer(head.bottleneck),
-        "from_sh": from_sh,
+        "from_sh": numbers.layer(head.from_sh),
         "directional": [numbers.layer(layer) for layer in head.directional],
         "output": numbers.layer(head.output),
-        "roundings": [{"scale": float(r.scale), "zero": int(r.zero)} for r in head.roundings],
+        "roundings": [_rounding(each) for each in head.roundings],
+        "of_encoded": None if head.of_encoded is None else _rounding(head.of_encoded),
         "monomials": monomial_products(head.form.sh_degree),
     }
     return HeadData(json.dumps(description, separators=(",", ":")).encode(), numbers.data)
+
+
+def _rounding(rounding: Rounding) -> dict[str, float | int]:
+    return {"scale": float(rounding.scale), "zero": int(rounding.zero)}
 
 
 def monomial_products(sh_degree: int) -> list[tuple[int, int]]:

@@ -90,8 +90,8 @@ class FoldedHead(nn.Module):
         weights: the weights before training.
         units: [n_channels] units that composites are counted in, so that channels of small codes are trained
             as fast as those of large ones.
-        ranges: ranges of the hidden activations, as `exporters.head.ranges` finds them, where the wide layers
-            are to be multiplied in 8 bits.
+        ranges: those that `exporters.head.ranges` finds, where the wide layers are to be multiplied in 8
+            bits.
     """
 
     def __init__(
@@ -122,9 +122,10 @@ class FoldedHead(nn.Module):
         h = self._rounded(h, 0)
         weight, b = layers[n_spatial]
         basis = self.harmonics(dirs).repeat_interleave(self._like.n_sh_features, dim=-1)
-        encoded = torch.addmm(b, h, self._rounded_weight(weight)) * basis
-        h = self._activation(torch.addmm(bias, h, self._rounded_weight(d_bottleneck)) + encoded @ d_sh)
-        for index, (weight, b) in enumerate(layers[n_spatial + 1 : -1], start=1):
+        encoded = self._rounded(torch.addmm(b, h, self._rounded_weight(weight)) * basis, 1)
+        first = torch.addmm(bias, h, self._rounded_weight(d_bottleneck))
+        h = self._activation(first + encoded @ self._rounded_weight(d_sh))
+        for index, (weight, b) in enumerate(layers[n_spatial + 1 : -1], start=2):
             h = self._activation(torch.addmm(b, self._rounded(h, index), self._rounded_weight(weight)))
         weight, b = layers[-1]
         return torch.sigmoid(torch.addmm(b, h, weight))

@@ -38,12 +38,15 @@ vec4 rounded(vec4 x, float perStep, float zero) {
   return clamp(roundEven(x * perStep) + zero, 0.0, 255.0) - zero;
 }
 
+mat4 allRounded(mat4 x, float perStep, float zero) {
+  return mat4(rounded(x[0], perStep, zero), rounded(x[1], perStep, zero), rounded(x[2], perStep, zero), rounded(x[3], perStep, zero));
+}
+
 mat4 activated(mat4 x, vec4 scale, vec4 after) {
   x = mat4(x[0] * scale, x[1] * scale, x[2] * scale, x[3] * scale);
   if (after.y < ACTIVATED) return x;
   x = mat4(ACTIVATION(x[0]), ACTIVATION(x[1]), ACTIVATION(x[2]), ACTIVATION(x[3]));
-  if (after.y < ROUNDED) return x;
-  return mat4(rounded(x[0], after.z, after.w), rounded(x[1], after.z, after.w), rounded(x[2], after.z, after.w), rounded(x[3], after.z, after.w));
+  return after.y < ROUNDED ? x : allRounded(x, after.z, after.w);
 }
 
 mat4 weights(int k) {

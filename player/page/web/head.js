@@ -50,7 +50,7 @@ class Layers {
     this.table.push(fours(nIn), outputTexels(nOut), x, y, this.weights.length / 4, ...after, Number(add), 0, 0, 0);
     for (let first = 0; first < outputTexels(nOut); first += AT_ONCE) {
       const some = Array.from({ length: AT_ONCE }, (_, i) => first + i);
-      for (const o of some) texel(o, (c) => bias?.[c] ?? 0);
+      for (const o of some) texel(o, (c) => bias[c]);
       for (const o of some) texel(o, (c) => scale?.[c] ?? 1);
       for (let i = 0; i < 4 * fours(nIn); i += 4) {
         for (const o of some) for (let row = i; row < i + 4; row++) texel(o, (c) => (row < nIn ? weight[row * nOut + c] : 0));
@@ -80,7 +80,7 @@ export function headCode(head) {
   layers.dense(places.ENCODED_AT, here, head.to_sh);
   layers.dense(places.HARMONICS_AT, places.MONOMIALS_AT, columnsLayer(head.harmonics.n_in, columns));
   layers.dense(there, here, head.bottleneck);
-  layers.dense(there, places.ENCODED_AT, head.from_sh, { add: true, after: activated() });
+  layers.dense(there, places.ENCODED_AT, scaled(head.from_sh), { add: true, after: activated() });
   swap();
   for (const layer of head.directional) {
     layers.dense(there, here, layer, { after: activated() });
@@ -89,7 +89,7 @@ export function headCode(head) {
   layers.dense(there, here, head.output);
   const texts = {
     ...places, ACTIVATION: head.activation, COLOURS_AT: there, MEMORY: layers.size, N_LAYERS: layers.table.length / 12, HARMONICS_LAYER: head.spatial.length + 1,
-    WRITE_MONOMIALS: monomialsCode(head.monomials), MULTIPLY_BY_HARMONICS: multiplyCode(which),
+    WRITE_MONOMIALS: monomialsCode(head.monomials), MULTIPLY_BY_HARMONICS: multiplyCode(which, head.of_encoded),
   };
   return { texts, weights: new Float32Array(layers.weights), table: layers.table };
 }
@@ -111,9 +111,19 @@ function monomialsCode(monomials) {
   return [...found, ...texels].join("");
 }
 
-// Each encoded feature times its harmonic, for all four pixels at once: a column each.
-function multiplyCode(which) {
+// A layer whose sums need not be multiplied by its scale, because its weights have been.
+function scaled(layer) {
+  if (!layer.scale) return layer;
+  const weight = Float32Array.from(layer.weight, (w, i) => w * layer.scale[i % layer.n_out]);
+  return { ...layer, weight, scale: null };
+}
+
+// Each encoded feature times its harmonic, rounded if `rounding` says how, for all four pixels at once: a column each.
+function multiplyCode(which, rounding) {
   const columns = [0, 1, 2, 3].map((p) => texelsOf(which.map((i) => `memory[HARMONICS_AT + ${i >> 2}][${p}].${XYZW[i & 3]}`)));
-  const multiply = (_, o) => `memory[ENCODED_AT + ${o}] = matrixCompMult(memory[ENCODED_AT + ${o}], mat4(${columns.map((texels) => texels[o]).join(", ")}));\n`;
+  const product = (o) => `matrixCompMult(memory[ENCODED_AT + ${o}], mat4(${columns.map((texels) => texels[o]).join(", ")}))`;
+  const { scale, zero } = rounding ?? {};
+  const found = rounding ? (o) => `allRounded(${product(o)}, ${(1 / scale).toExponential()}, ${zero}.0)` : product;
+  const multiply = (_, o) => `memory[ENCODED_AT + ${o}] = ${found(o)};\n`;
   return columns[0].map(multiply).join("");
 }

@@ -8,11 +8,11 @@
 //
 // - manifest: the asset's manifest (docs/format.md), without its provenance;
 // - cameras: [{ name, width, height, fx, fy, cx, cy, c2w: [16], row-major, OpenGL axes, world frame }, ...];
-// - head: { sh_degree, in_8_bits, activation, n_channels, spatial: [layer, ...], to_sh: layer, harmonics: layer, bottleneck: layer,
-//   from_sh: layer, directional: [layer, ...], output: layer, roundings: [{ scale, zero }, ...],
-//   monomials: [[parent, axis], ...] }, as player/head/graph.py names them. A layer is { n_in, n_out, weight, bias, scale }:
-//   weight [n_in * n_out] row-major, bias [n_out] (null for from_sh), scale [n_out] or null: Float32Array, or in 8 bits
-//   weight an Int8Array and bias an Int32Array. A monomial is the product of an earlier one (its place in the list, -1
+// - head: { sh_degree, in_8_bits, activation, n_channels, spatial: [layer, ...], to_sh: layer, harmonics: layer,
+//   bottleneck: layer, from_sh: layer, directional: [layer, ...], output: layer, roundings: [{ scale, zero }, ...],
+//   of_encoded: one of these or null, monomials: [[parent, axis], ...] }, as player/head/graph.py names them. A layer is
+//   { n_in, n_out, weight, bias, scale }: weight [n_in * n_out] row-major, bias [n_out], scale [n_out] or null: Float32Array,
+//   or in 8 bits weight an Int8Array and bias an Int32Array. A monomial is the product of an earlier one (its place in the list, -1
 //   for 1) and the axis 0 to 2 of the direction;
 // - grid: the arrays of grid.js;
 // - n_parts: how many parts are read; problem: a sentence about a part that could not be, or null.

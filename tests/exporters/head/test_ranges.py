@@ -81,7 +81,7 @@ def test_a_pixel_does_not_depend_on_its_neighbours(weights: HeadWeights) -> None
 
 
 Squeeze = Callable[[int, np.ndarray], np.ndarray]
-"""What becomes of the activation of a number, which a layer in 8 bits takes in."""
+"""What becomes of h (0), e (1) and each z (2, 3), which layers in 8 bits take in."""
 
 
 def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) -> np.ndarray:
@@ -93,9 +93,10 @@ def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) 
     h = squeeze(0, h)
     basis = spherical_harmonics(seen["dirs"].astype(np.float64), weights.sh_degree)
     encoded = (h @ weights.to_sh[0] + weights.to_sh[1]) * np.repeat(basis, weights.n_sh_features, axis=1)
+    encoded = squeeze(1, encoded)
     d_bottleneck, d_sh, bias = weights.directional_first
     z = activation(h @ d_bottleneck + encoded @ d_sh + bias)
-    for number, (weight, bias) in enumerate(weights.directional, start=1):
+    for number, (weight, bias) in enumerate(weights.directional, start=2):
         z = activation(squeeze(number, z) @ weight + bias)
     return 1 / (1 + np.exp(-(z @ weights.output[0] + weights.output[1])))
 
@@ -131,7 +132,7 @@ def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None
     """Activations of inputs that the ranges were not made from lie within them, but for two in ten
     thousand."""
     ranges = activation_ranges(weights, **inputs(4000))
-    assert len(ranges) == 3
+    assert len(ranges) == 4
     found: dict[int, np.ndarray] = {}
 
     def kept(number: int, x: np.ndarray) -> np.ndarray:
@@ -150,7 +151,7 @@ def test_weights_are_within_half_a_step_of_their_codes(weights: HeadWeights) -> 
     """A step of an output is 1/127 of the largest sum of two neighbouring weights' magnitudes."""
     model = onnx.load_from_string(head_onnx(weights, activation_ranges(weights, **inputs(4000))))
     constants = {entry.name: onnx.numpy_helper.to_array(entry) for entry in model.graph.initializer}
-    wide = [weights.to_sh[0], weights.directional_first[0], *(weight for weight, _ in weights.directional)]
+    wide = [weights.to_sh[0], *weights.directional_first[:2], *(weight for weight, _ in weights.directional)]
     met = set()
     for node in model.graph.node:
         codes = constants.get(node.input[0]) if node.op_type == "DequantizeLinear" else None
@@ -167,5 +168,5 @@ def test_weights_are_within_half_a_step_of_their_codes(weights: HeadWeights) -> 
 
 
 def test_one_range_for_each_activation(weights: HeadWeights) -> None:
-    with pytest.raises(ShapeError, match="ranges: expected 3, got 1"):
+    with pytest.raises(ShapeError, match="ranges: expected 4, got 1"):
         head_onnx(weights, [(0.0, 1.0)])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
+import onnx
 from scipy.special import expit
 
 from exporters.head import onnx_head
 from exporters.head.onnx_head import HeadWeights, Range, head_onnx
-from player.head.graph import HeadArrays, Layer, Rounding
+from player.head.graph import HeadArrays, Layer, Rounding, head_nodes, read_head
 from tests.reference import ACTIVATIONS
 
 
@@ -21,7 +24,25 @@ def head_onnx_of_before(weights: HeadWeights, ranges: list[Range]) -> bytes:
         return (np.maximum(np.abs(weight).max(axis=0), 1e-12) / 127).astype(np.float32)
 
     with mock.patch.object(onnx_head, "weight_scales", scales):
-        return head_onnx(weights, ranges)
+        return head_onnx_with_floats(weights, ranges)
+
+
+def head_onnx_with_floats(weights: HeadWeights, ranges: Sequence[Range]) -> bytes:
+    """A head in 8 bits as it was written when e was not rounded."""
+    data = head_onnx(weights, ranges)
+    model, form = onnx.load_from_string(data), replace(read_head(data, "head").form, rounds_encoded=False)
+    constants, gone = model.graph.initializer, ("sh_encoded_", "directional_0_sh_weight_")
+    kept = [constant for constant in constants if not constant.name.startswith(gone)]
+    from_sh = weights.directional_first[1].astype(np.float32)
+    kept.append(onnx.numpy_helper.from_array(from_sh, "directional_0_sh_weight"))
+    del model.graph.node[:], constants[:]
+    constants.extend(kept)
+    for node in head_nodes(form):
+        made = onnx.helper.make_node(
+            node.operator, node.inputs, [node.output], node.output, **node.attributes
+        )
+        model.graph.node.append(made)
+    return model.SerializeToString(deterministic=True)
 
 
 def play_in_integers(
@@ -40,7 +61,12 @@ def play_in_integers(
     exponents = np.array(_exponents(head.form.sh_degree)).reshape(-1, 3)
     terms = np.prod(dirs[:, None].astype(np.float64) ** exponents, axis=-1)
     encoded = _in_codes(codes, zero, head.to_sh, saturating) * _plain(terms, head.harmonics)
-    z = activation(_in_codes(codes, zero, head.bottleneck, saturating) + encoded @ head.from_sh)
+    z = _in_codes(codes, zero, head.bottleneck, saturating)
+    if head.of_encoded is None:
+        z += _plain(encoded, head.from_sh)
+    else:
+        z += _in_codes(*_codes(encoded, head.of_encoded), head.from_sh, saturating)
+    z = activation(z)
     for layer in head.directional:
         codes, zero = _codes(z, next(roundings))
         z = activation(_in_codes(codes, zero, layer, saturating))

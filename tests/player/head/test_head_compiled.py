@@ -19,7 +19,7 @@ from player.head.program import BLOCK, DENSE_BYTES, QUANTIZE, ROUND, program_of
 from player.scratch import CANARIES
 from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.numerics.bounds import Row
-from tests.player.head.heads import head_onnx_of_before, play_in_integers
+from tests.player.head.heads import head_onnx_of_before, head_onnx_with_floats, play_in_integers
 
 SUMS = Row(
     "The exported head", "sums of products of codes, in bytes and in float32", "below 2^24 in float32",
@@ -85,6 +85,15 @@ def test_compiled_head_is_the_formula_in_any_number_of_pixels(weights: HeadWeigh
         check(head(features, dirs), play_in_integers(arrays, features, dirs))
 
 
+def test_heads_whose_encoded_features_are_not_rounded(tmp_path: Path) -> None:
+    """As they were written at first."""
+    weights, (features, dirs) = random_head(), inputs(2000)
+    data = head_onnx_with_floats(weights, activation_ranges(weights, features, dirs))
+    expected = play_in_integers(read_head(data, "head"), features, dirs)
+    check(open_head(tmp_path, data)(features, dirs), expected)
+    check(Head(tmp_path / "head.onnx", 8)(features, dirs), expected)
+
+
 def test_a_pixel_does_not_depend_on_the_others(tmp_path: Path) -> None:
     head = open_head(tmp_path, in_8_bits(random_head()))
     features, dirs = inputs(200)
@@ -114,9 +123,9 @@ def test_compiled_head_beyond_the_range_of_exp(tmp_path: Path) -> None:
 def test_what_is_no_number_is_told(tmp_path: Path) -> None:
     """A rounding makes a level of it; behind the last one it stays, where float32 does not hold a sum."""
     weights = random_head(n_more=0)
-    bottleneck, from_sh, bias = weights.directional_first
-    weights = replace(weights, directional_first=(bottleneck, np.full_like(from_sh, 3e38), bias))
-    head = open_head(tmp_path, head_onnx(weights, [(-1.0, 3.0)]))
+    bottleneck, *others = weights.directional_first
+    weights = replace(weights, directional_first=(np.full_like(bottleneck, 3e38), *others))
+    head = open_head(tmp_path, head_onnx(weights, [(-1.0, 3.0)] * 2))
     with pytest.raises(FormatError, match="expected 100 finite colours, got NaN"):
         head(*inputs(100))
 
@@ -155,7 +164,7 @@ def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
     large = tuple((np.full_like(w, 0.5) * np.sign(w), b) for w, b in weights.directional)
     weights = replace(weights, directional=large)
     features, dirs = inputs(300)
-    ranges = [(0.0, 1e-3)] * 2  # every activation is clipped at code 255, or is 0
+    ranges = [(0.0, 1e-3)] * 3  # every activation is clipped at code 255, or is 0
     data = head_onnx_of_before(weights, ranges)
     assert read_head(data, "head").may_saturate
     rgb = open_head(tmp_path, data, 8)(features * 50, dirs)

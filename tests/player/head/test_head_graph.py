@@ -283,7 +283,7 @@ def test_every_pair_of_codes_is_bounded_and_one_reaches_the_bound() -> None:
         bottleneck = np.resize(weight, weights.directional_first[0].shape)
         _, from_sh, bias = weights.directional_first
         weights = replace(weights, directional_first=(bottleneck, from_sh, bias * 0))
-        codes = read_head(head_onnx(weights, [(-0.2, 1.0)]), "head").bottleneck.weight
+        codes = read_head(head_onnx(weights, [(-0.2, 1.0)] * 2), "head").bottleneck.weight
         sums = pair_sums(codes).max(axis=0)
         assert (sums <= PAIR_LIMIT).all() and (sums >= PAIR_LIMIT - 2).all()
 

@@ -18,18 +18,23 @@ from player.cameras.camera import Camera
 from player.head.graph import Activation
 from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.player.conftest import cameras_bytes, head_bytes, look_at, write_shells
+from tests.player.head.heads import head_onnx_with_floats
 from tests.player.march.pyramid_scene import filled, random_scene, sparse_scene
 
 WIDTH, HEIGHT = 60, 44
 
 
 def head_of(n_channels: int, in_8_bits: bool, activation: Activation = "gelu") -> bytes:
-    """A head of random weights whose widths are no multiples of four."""
+    """A head of random weights whose widths are no multiples of four; in 8 bits and with GELU as it was when
+    encoded features were not rounded."""
     weights = random_head(n_channels, 18, n_sh_features=3, activation=activation)
     (first, bias), *more = weights.spatial
     weights = replace(weights, spatial=((first / np.float32(40), bias), *more))  # of codes up to 127
     features, dirs = inputs(500, n_channels)
-    return head_onnx(weights, activation_ranges(weights, features * 40, dirs) if in_8_bits else None)
+    ranges = activation_ranges(weights, features * 40, dirs) if in_8_bits else None
+    if ranges and activation == "gelu":
+        return head_onnx_with_floats(weights, ranges)
+    return head_onnx(weights, ranges)
 
 
 def wider(values: PyramidValues, n_channels: int) -> PyramidValues:

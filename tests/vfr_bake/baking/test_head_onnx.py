@@ -157,8 +157,9 @@ def quantised(
     h = rounded(activation(features @ tensor(weight) + tensor(bias)), ranges[0])
     basis = SphericalHarmonics(weights.sh_degree)(dirs).repeat_interleave(weights.n_sh_features, dim=-1)
     d_bottleneck, d_sh, bias = weights.directional_first
-    z = activation(layer(h, d_bottleneck, bias) + (layer(h, *weights.to_sh) * basis) @ tensor(d_sh))
-    for limits, (weight, bias) in zip(ranges[1:], weights.directional, strict=True):
+    encoded = rounded(layer(h, *weights.to_sh) * basis, ranges[1])
+    z = activation(layer(h, d_bottleneck, bias) + layer(encoded, d_sh, np.zeros_like(bias)))
+    for limits, (weight, bias) in zip(ranges[2:], weights.directional, strict=True):
         z = activation(layer(rounded(z, limits), weight, bias))
     weight, bias = weights.output
     return torch.sigmoid(z @ tensor(weight) + tensor(bias))
