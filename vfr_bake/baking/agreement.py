@@ -37,6 +37,9 @@ SHARES = tuple(0.85**n for n in range(16))
 """Shares of the usual levels that are tried; behind the last, every pixel is marched."""
 MOST_PIXELS = 1_500_000
 """Pixels of all pictures that are compared, at most, but for the first picture."""
+MOST_MARCHED = 0.9
+"""Share of the pixels that show anything which may be left to march: marched in stages, more of them would
+take longer than all do at once, and lose something for it."""
 LONGEST_SIDE = 640
 """Pixels along a side of pictures between views, at most: larger ones are smoother, and lose less."""
 
@@ -96,16 +99,29 @@ class _Played:
         self._errors = self._off(self._exact)
 
     def levels(self, quality: Quality, usual: float) -> float:
-        """The most levels with which pictures of the quality lose what is allowed; the fewer, the less."""
+        """The most levels with which pictures of the quality lose what is allowed, the fewer, the less; 0
+        where nearly all pixels would be marched all the same."""
         tried = [round(usual * share, 1) for share in SHARES]
-        return [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels))]
+        found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels))]
+        marched = self._n_marched(quality, found) / max(self._n_marched("exact", found), 1)
+        return found if marched <= MOST_MARCHED else 0.0
 
-    def _fits(self, quality: Quality, levels: float) -> bool:
-        """Whether pictures of a quality lose at most what is allowed, with so many levels."""
+    def _n_marched(self, quality: Quality, levels: float) -> int:
+        """How many pixels of the views are marched, and meet something."""
+        self._agree_within(levels)
+        frames = (self._renderer.render(view.camera, quality=quality) for view in self._views)
+        return sum(int((frame.n_density_samples > 0).sum()) for frame in frames)
+
+    def _agree_within(self, levels: float) -> None:
+        """Have pixels become the mean of others that differ by so many levels."""
         manifest = replace(self._asset.manifest, agreement=(levels, levels))
         changed = replace(self._asset, manifest=manifest)
         vars(changed)["grid"] = self._asset.grid  # it need not be built again
         self._renderer.show(changed)
+
+    def _fits(self, quality: Quality, levels: float) -> bool:
+        """Whether pictures of a quality lose at most what is allowed, with so many levels."""
+        self._agree_within(levels)
         errors = self._off([self._picture(view, quality) for view in self._views])
         lost, allowed = 10 * np.log10(errors / self._errors), ALLOWED_DB[quality]
         most = OF_ONE * lost[0]

@@ -12,6 +12,7 @@ from player.asset.manifest import AGREEMENT
 from player.cameras.camera import Camera, orbit
 from player.march.interpolation import Quality
 from player.render import Renderer
+from vfr_bake.baking import agreement
 from vfr_bake.baking.agreement import ALLOWED_DB, SHARES, WORST, View, compared_views, fitting_agreement
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig
@@ -26,6 +27,12 @@ def asset(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Asset:
     )
     bake(model, folder, config, lambda stage, done, of: None)
     return Asset.open(folder)
+
+
+@pytest.fixture
+def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures so small are mostly edges: nearly all pixels may be marched here."""
+    monkeypatch.setattr(agreement, "MOST_MARCHED", 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +68,7 @@ def lost(asset: Asset, views: list[View], quality: Quality) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.usefixtures("any_share")
 @pytest.mark.parametrize("noise", [0.003, 0.01, 0.03])
 def test_pictures_with_the_levels_that_are_found_lose_what_is_allowed(
     asset: Asset, cameras: list[Camera], noise: float
@@ -73,16 +81,16 @@ def test_pictures_with_the_levels_that_are_found_lose_what_is_allowed(
         loss = lost(agreed, views, quality)
         assert loss.mean() <= allowed and loss.max() <= WORST * allowed
     usual = AGREEMENT[False]
-    next_wider = [(n or SHARES[-1] * most * 0.85) / 0.85 for n, most in zip(found, usual, strict=True)]
-    wider = replace(asset.manifest, agreement=tuple(next_wider))
+    wider = replace(asset.manifest, agreement=tuple(levels / SHARES[1] for levels in found))
     object.__setattr__(agreed, "manifest", wider)
     for (quality, allowed), levels, most in zip(ALLOWED_DB.items(), found, usual, strict=True):
-        if levels < most:
+        if 0 < levels < most:
             loss = lost(agreed, views, quality)
             bound = loss.mean() + 2 * loss.std(ddof=1) / np.sqrt(len(loss))
             assert bound > allowed or loss.max() > WORST * allowed, "more levels would have been allowed"
 
 
+@pytest.mark.usefixtures("any_share")
 def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras: list[Camera]) -> None:
     views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
     found = [fitting_agreement(asset, views, error) for error in (1.0, 1e-3, 3e-4, 1e-9)]
@@ -91,6 +99,17 @@ def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras:
     assert all(high <= fast for high, fast in found)
 
 
+@pytest.mark.usefixtures("any_share")
+def test_nothing_is_interpolated_where_nearly_all_would_be_marched(
+    asset: Asset, cameras: list[Camera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
+    assert min(fitting_agreement(asset, views, 1.0)) > 0
+    monkeypatch.setattr(agreement, "MOST_MARCHED", 0.0)
+    assert fitting_agreement(asset, views, 1.0) == (0.0, 0.0)
+
+
+@pytest.mark.usefixtures("any_share")
 def test_one_view_is_trusted_less(asset: Asset, cameras: list[Camera]) -> None:
     view = View(cameras[0], np.arange(96 * 80), None)
     alone, twice = (fitting_agreement(asset, [view] * n, 1e-3) for n in (1, 2))
