@@ -73,14 +73,14 @@ PRESETS: dict[Preset, BakeChoice] = {
     "balanced": BakeChoice(
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
-        code_loss_db=0.04, density_step=4, code_levels=50, head_width=64, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        code_loss_db=0.03, density_step=4, code_levels=50, head_width=64, head_layers=3,
+        head_bands=4, head_bits=8, refine_steps=2000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
-        code_loss_db=0.1, density_step=6, code_levels=50, head_width=32, head_layers=1,
+        code_loss_db=0.15, density_step=6, code_levels=50, head_width=48, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
         page_mb=512,
     ),
