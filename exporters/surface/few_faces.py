@@ -92,7 +92,7 @@ def _within(mesh: TriangleMesh, n_faces: int, max_bytes: int | None) -> Triangle
     while True:
         mesh = simplify_mesh(mesh, n_faces)
         if len(mesh.faces) > n_faces:
-            cube = max(1.5 * cube, mean_edge(mesh.vertices, mesh.faces))
+            cube = max(1.2 * cube, mean_edge(mesh.vertices, mesh.faces))
             vertices, faces = clustered(mesh.vertices, mesh.faces, cube)
             if not len(faces):
                 raise DataError(f"surface: expected one that fits into {n_faces} faces, got specks alone")

@@ -403,7 +403,7 @@ class _Bake:
         def head(width: int) -> bytes:
             shape = width, self.choice.head_layers, min(self.choice.head_bands, stored.head.sh_degree)
             weights = small_head(stored.head, *shape, scale) if width else stored.head
-            any_ranges = [(0.0, 1.0)] * (1 + len(weights.directional)) if self.choice.head_bits == 8 else None
+            any_ranges = [(0.0, 1.0)] * (2 + len(weights.directional)) if self.choice.head_bits == 8 else None
             return head_onnx(weights, any_ranges)
 
         manifest = self._manifest(layout, arrays, {}, (1,))
