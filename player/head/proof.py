@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from player.compiling import compiled
-from player.head.activations import gelu_lanes, quantize_lanes, sigmoid_lanes
+from player.head.activations import gelu_lanes, hard_swish_lanes, quantize_lanes, sigmoid_lanes
 from player.head.dense_tiles import (
     LANES,
     MOST_BYTES,
@@ -40,11 +40,13 @@ def wrong() -> str | None:
     if not np.allclose(memory[x.size :].reshape(2, ROWS, WIDTH), expected, rtol=0, atol=1e-5):
         return "a layer gives other sums than numpy"
     y = np.linspace(-6, 6, 4 * LANES, dtype=F32)
-    gelu, sigmoid, codes = y.copy(), y.copy(), np.zeros(y.size, np.uint8)
-    _follow(gelu, sigmoid, codes, y, F32(20))
+    gelu, swish, sigmoid, codes = y.copy(), y.copy(), y.copy(), np.zeros(y.size, np.uint8)
+    _follow(gelu, swish, sigmoid, codes, y, F32(20))
     expected = y * np.array([0.5 * math.erfc(-value / math.sqrt(2)) for value in y])
     if not np.allclose(gelu, expected, rtol=0, atol=1e-5):
         return "gelu is another than numpy's"
+    if not np.allclose(swish, y * np.clip(y / 6 + 0.5, 0, 1), rtol=0, atol=1e-5):
+        return "the hard swish is another than numpy's"
     if not np.allclose(sigmoid, 1 / (1 + np.exp(-y.astype(np.float64))), rtol=0, atol=1e-5):
         return "the sigmoid is another than numpy's"
     if (codes != np.clip(np.rint(y * F32(20)) + 100, 0, 255)).any():
@@ -79,9 +81,10 @@ def _floats(memory, weights, depth):
 
 
 @compiled
-def _follow(gelu, sigmoid, codes, x, per_step):
+def _follow(gelu, swish, sigmoid, codes, x, per_step):
     for i in range(0, len(x), LANES):
         gelu_lanes(gelu, i)
+        hard_swish_lanes(swish, i)
         sigmoid_lanes(sigmoid, i)
         quantize_lanes(codes, x, i, i, 100, per_step)
 

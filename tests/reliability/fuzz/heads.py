@@ -4,6 +4,7 @@ that no package writes."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,23 @@ from tests.reliability.fuzz.targets import Target, check_colours
 
 N_CHANNELS = 4
 OPERATORS = (
-    *("Add", "Sub", "Mul", "Div", "MatMul", "Gemm", "Gelu", "Sigmoid", "Relu", "Concat", "Slice", "Split"),
+    *(
+        "Add",
+        "Sub",
+        "Mul",
+        "Div",
+        "MatMul",
+        "Gemm",
+        "Gelu",
+        "HardSwish",
+        "Sigmoid",
+        "Concat",
+        "Slice",
+        "Split",
+    ),
     *("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Gather", "Expand", "Tile", "Shape", "Cast", "Pow"),
     *("QuantizeLinear", "DequantizeLinear", "ConstantOfShape", "Constant", "Loop", "If", "Scan", "Pad"),
+    *("HardSwish", "HardSigmoid"),
     *("RandomNormal", "Einsum", "LSTM", "Optional", "SequenceEmpty", "NonZero", "Resize", "TfIdfVectorizer"),
 )
 DIMENSIONS = (-(2**63), -1, 0, 1, 2, 3, 4, 7, 8, 9, 16, 255, 2**31, 2**32, 2**40, 2**62, 2**63 - 1)
@@ -316,7 +331,7 @@ def head_targets(work: Path, small: bytes) -> list[Target]:
     wholes = {
         "small head": small,
         "head": head_onnx(weights),
-        "head in 8 bits": head_onnx(weights, [(-0.2, 1.0)] * 2),
+        "head in 8 bits": head_onnx(replace(weights, activation="hard_swish"), [(-0.2, 1.0)] * 3),
     }
 
     def read(compiled: bool) -> None:
