@@ -95,7 +95,7 @@ class _Played:
 
     def __init__(self, renderer: Renderer, views: Sequence[View], error: float) -> None:
         self._renderer, self._asset, self._views, self._error = renderer, renderer.asset, views, error
-        self._exact = [self._picture(view, "exact") for view in views]
+        self._exact, self._n_exact = self._pictures("exact")
         self._errors = self._off(self._exact)
 
     def levels(self, quality: Quality, usual: float) -> float:
@@ -103,14 +103,9 @@ class _Played:
         where nearly all pixels would be marched all the same."""
         tried = [round(usual * share, 1) for share in SHARES]
         found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels))]
-        marched = self._n_marched(quality, found) / max(self._n_marched("exact", found), 1)
-        return found if marched <= MOST_MARCHED else 0.0
-
-    def _n_marched(self, quality: Quality, levels: float) -> int:
-        """How many pixels of the views are marched, and meet something."""
-        self._agree_within(levels)
-        frames = (self._renderer.render(view.camera, quality=quality) for view in self._views)
-        return sum(int((frame.n_density_samples > 0).sum()) for frame in frames)
+        self._agree_within(found)
+        _, n_marched = self._pictures(quality)
+        return found if n_marched <= MOST_MARCHED * self._n_exact else 0.0
 
     def _agree_within(self, levels: float) -> None:
         """Have pixels become the mean of others that differ by so many levels."""
@@ -122,17 +117,22 @@ class _Played:
     def _fits(self, quality: Quality, levels: float) -> bool:
         """Whether pictures of a quality lose at most what is allowed, with so many levels."""
         self._agree_within(levels)
-        errors = self._off([self._picture(view, quality) for view in self._views])
+        errors = self._off(self._pictures(quality)[0])
         lost, allowed = 10 * np.log10(errors / self._errors), ALLOWED_DB[quality]
         most = OF_ONE * lost[0]
         if len(lost) > 1:
             most = lost.mean() + SPREADS * lost.std(ddof=1) / np.sqrt(len(lost))
         return bool(most <= allowed and lost.max() <= WORST * allowed)
 
-    def _picture(self, view: View, quality: Quality) -> np.ndarray:
-        """[n, 3] the colours of the view's pixels, rounded to 8 bits."""
-        frame = self._renderer.render(view.camera, quality=quality)
-        return frame.to_uint8().reshape(-1, 3)[view.pixels] / 255
+    def _pictures(self, quality: Quality) -> tuple[list[np.ndarray], int]:
+        """[n, 3] the colours of each view's pixels, rounded to 8 bits; and how many pixels of all views were
+        marched, and met something."""
+        colours, n_marched = [], 0
+        for view in self._views:
+            frame = self._renderer.render(view.camera, quality=quality)
+            colours.append(frame.to_uint8().reshape(-1, 3)[view.pixels] / 255)
+            n_marched += int((frame.n_density_samples > 0).sum())
+        return colours, n_marched
 
     def _off(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """[n_views] the mean square errors of pictures to photographs."""
