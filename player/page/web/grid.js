@@ -1,8 +1,9 @@
 // Arranges a scene for the march on a GPU: flat arrays that become textures. The twin of player/asset/grid.py.
 //
 // - table [nb^3 * 4] Uint8: for a place in a brick of the finest level, at (bx * nb + by) * nb + bz: where the densities of
-//   the finest brick there are, (x, y, z) in bricks, and MANY + its level; or 0, 0, 0 and the distance in bricks to the
-//   nearest place that has one with a live cell there;
+//   the finest brick there are, (x, y, z) in bricks, and MANY + its level; or the level of a coarser brick whose cells there
+//   are all dead, if its samples stand for several steps, else 0, then 0, 0 and the distance in bricks to the nearest place
+//   that has a brick, for coarser ones one with a live cell there;
 // - density [Uint8]: a block of bricks (`blockOf`) of 8 x 8 x 10 texels of four bytes. The texel (x, y, z) of a brick, z = 0..8,
 //   has the codes of the vertices (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1), so that a cell is read with two fetches;
 //   that of z = 9 has in its first byte which cells of the column are live, a bit for each;
@@ -100,7 +101,7 @@ function eachPlace(n, level, [x, y, z], paint) {
   }
 }
 
-// A place in a coarse brick none of whose cells there is live is as empty as one without a brick, unless a sample that
+// A place in a coarse brick none of whose cells there is live is as empty as one without a brick, but that a sample that
 // begins there may stand for several steps.
 function tableOf({ levels, count }, n, levelSteps) {
   const block = blockOf(count, DENSITY_BRICK);
@@ -109,9 +110,9 @@ function tableOf({ levels, count }, n, levelSteps) {
     numbers.forEach((number, i) => {
       const [x, y, z] = placeOf(first + i, block), entry = x | (y << 8) | (z << 16) | ((MANY + level) << 24);
       const own = bricks.masks.subarray(16 * number, 16 * number + 16);
-      const whole = level === 0 || levelSteps[level] > 1;
+      const dead = levelSteps[level] > 1 ? level : 0;
       eachPlace(n, level, coordOf(bricks.keys[number]), (place, i, j, k) => {
-        table[place] = whole || someLive(own, level, i, j, k) ? entry : 0;
+        table[place] = level === 0 || someLive(own, level, i, j, k) ? entry : dead;
       });
     });
   }
@@ -135,11 +136,12 @@ function someLive(cells, level, i, j, k) {
 // Distances in the largest coordinate, in two sweeps over a padded grid, from the neighbours before and behind: four lines of
 // these beside a line of places, and the place before each.
 function addDistances(table, n) {
+  const isBrick = (entry) => entry >= 2 ** 24;
   const m = n + 2, distances = new Uint8Array(m ** 3).fill(MOST_DISTANCE), least = new Uint8Array(m);
   const padded = (x, y) => ((x + 1) * m + y + 1) * m + 1; // where the line of z = 0... begins
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let to = padded(x, y), end = to + n; to < end; at++, to++) if (table[at] !== 0) distances[to] = 0;
+      for (let to = padded(x, y), end = to + n; to < end; at++, to++) if (isBrick(table[at])) distances[to] = 0;
     }
   }
   // `sign`: 1 where the lines before are looked at, -1 for those behind; the z before a place then is z - sign.
@@ -156,7 +158,7 @@ function addDistances(table, n) {
   for (let x = n - 1; x >= 0; x--) for (let y = n - 1; y >= 0; y--) sweepLine(padded(x, y), -1);
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
-      for (let from = padded(x, y), end = from + n; from < end; at++, from++) if (table[at] === 0) table[at] = distances[from] << 24;
+      for (let from = padded(x, y), end = from + n; from < end; at++, from++) if (!isBrick(table[at])) table[at] |= distances[from] << 24;
     }
   }
 }

@@ -2,7 +2,7 @@
 
 uniform float uMostTau;
 uniform vec2 uDensityCode; // log sigma at code 0, and its slope
-uniform int uLevelSteps[8];
+uniform int uLevelSteps[8], uLongestStep; // base steps that a sample of each level stands for, and the most of all
 
 struct March {
   int n; // the base step to go on with
@@ -11,7 +11,7 @@ struct March {
   ivec3 first; // where its densities begin,
   int reach; // how far around it all is empty, in bricks; -1 where it is not
   float scale; // cells of its level a cell of the finest
-  int size; // base steps that a sample in it stands for
+  int size; // base steps that a sample in it stands for, were it live
 };
 
 March begun() {
@@ -26,7 +26,10 @@ void lookAt(inout March march, vec3 cell) {
   march.brick = brick;
   ivec4 entry = tableAt(ivec3(brick));
   march.reach = entry.w < MANY ? entry.w - 1 : -1;
-  if (entry.w < MANY) return;
+  if (entry.w < MANY) {
+    march.size = entry.x > 0 ? uLevelSteps[entry.x] : 1;
+    return;
+  }
   march.first = entry.xyz * ivec3(8, 8, 10);
   march.scale = 1.0 / float(1 << (entry.w - MANY));
   march.size = uLevelSteps[entry.w - MANY];
@@ -66,12 +69,15 @@ bool stepOn(inout March march, out float s, out float weight) {
   if (!(sampleS < rayLength) || march.tau > uMostTau) return false;
   vec3 cell = cellOf(g);
   lookAt(march, cell);
-  if (march.reach >= 0) {
-    march.n = jumpFrom(march.n, g, march.brick, float(march.reach));
-    return true;
-  }
   int size = march.size;
   if (march.n != 0) size = min(size, march.n & -march.n);
+  if (march.reach >= 0) {
+    int there = jumpFrom(march.n, g, march.brick, float(march.reach)), after = march.n + size;
+    if (after <= there) { // else its middle may be in a live cell
+      march.n = max(there & -uLongestStep, after); // a step that the march comes by
+      return true;
+    }
+  }
   if (size > 1) {
     g = placeOf(march.n, size);
     cell = cellOf(g);

@@ -180,7 +180,8 @@ export class Renderer {
     const fetches = { exact: k, high: Math.ceil((7 * k) / 8), fast: Math.ceil(k / 2) }[view.quality ?? "high"];
     const cells = Math.max(...this.constant.uCellsPerUnit) * manifest.step;
     const coarser = view.quality === "fast" && cells <= 1 ? 2 : 1;
-    return { uFetches: view.n_fetches ?? fetches, uLevelSteps: Array.from({ length: 8 }, (_, level) => (steps[level] ?? 1) * coarser) };
+    const uLevelSteps = Array.from({ length: 8 }, (_, level) => (steps[level] ?? 1) * coarser);
+    return { uFetches: view.n_fetches ?? fetches, uLevelSteps, uLongestStep: Math.max(...uLevelSteps) };
   }
 
   // Draws a view into a framebuffer, null for the canvas; `upwards` if its first row is the picture's last. Only what is
