@@ -2,8 +2,8 @@
 NUMBA_CPU_FEATURES name.
 
 LLVM knows which name has which instructions, and does not say so. It is asked by what it makes of a few lines
-that every processor can run: a sum of sixteen numbers tells how wide its registers are, a sum of products of
-bytes whether it multiplies those. Compiled code alone imports this.
+that every processor can run: sums of many numbers tell how wide its registers are, a sum of products of bytes
+whether it adds up four of them at once. Compiled code alone imports this.
 """
 
 from __future__ import annotations
@@ -21,6 +21,12 @@ define <16 x float> @sum(<16 x float> %a, <16 x float> %b) {
   ret <16 x float> %c
 }
 """
+_SHORT_SUM = """
+define <N x i16> @sum(<N x i16> %a, <N x i16> %b) {
+  %c = add <N x i16> %a, %b
+  ret <N x i16> %c
+}
+"""
 _DOT = """
 declare i32 @llvm.vector.reduce.add.vNi32(<N x i32>)
 define i32 @dot(<N x i8> %a, <N x i8> %b) {
@@ -31,6 +37,8 @@ define i32 @dot(<N x i8> %a, <N x i8> %b) {
   ret i32 %s
 }
 """
+_REGISTERS = {32: "ymm", 64: "zmm"}
+"""Names of registers by the bytes that they hold."""
 
 
 @lru_cache(maxsize=1)
@@ -50,8 +58,15 @@ def has_wide_registers(of: tuple[str, str, str] | None = None) -> bool:
 def multiplies_bytes(n: int, of: tuple[str, str, str] | None = None) -> bool:
     """Whether one instruction (VNNI) multiplies `n` bytes, 32 or 64, by as many and adds up fours of the
     products."""
-    register = {32: "ymm", 64: "zmm"}[n]
-    return bool(re.search(rf"vpdpbusd\s.*{register}", _assembly(_DOT.replace("N", str(n)), of or target())))
+    module = _DOT.replace("N", str(n))
+    return bool(re.search(rf"vpdpbusd\s.*{_REGISTERS[n]}", _assembly(module, of or target())))
+
+
+def multiplies_shorts(n: int, of: tuple[str, str, str] | None = None) -> bool:
+    """Whether registers hold `n` bytes, 32 or 64, of integers of 8 and 16 bits (AVX2 and AVX-512BW): then two
+    instructions multiply as many bytes and add up fours of the products, if twos of them fit into 16 bits."""
+    module = _SHORT_SUM.replace("N", str(n // 2))
+    return bool(re.search(rf"vpaddw\s.*{_REGISTERS[n]}", _assembly(module, of or target())))
 
 
 def _assembly(module: str, of: tuple[str, str, str]) -> str:

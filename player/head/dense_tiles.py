@@ -1,8 +1,8 @@
 """Tiles of dense layers in registers, which `player.head.compiled` puts together.
 
 A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold, or by one
-where a layer ends with one; in float32, and in 8 bits where the processor multiplies bytes. Compiled code
-alone imports this.
+where a layer ends with one; in float32, and in 8 bits where the processor multiplies bytes, which are four
+times as many a register. Compiled code alone imports this.
 """
 
 from __future__ import annotations
@@ -15,8 +15,21 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from player.compiled.lanes import FLOAT, INT, LANES, LONG, Lanes, address, load, splat, store, vector
-from player.compiled.processor import multiplies_bytes
+from player.compiled.lanes import (
+    BYTE,
+    FLOAT,
+    INT,
+    LANES,
+    LONG,
+    SHORT,
+    Lanes,
+    address,
+    load,
+    splat,
+    store,
+    vector,
+)
+from player.compiled.processor import multiplies_bytes, multiplies_shorts
 
 ROWS = 12 if LANES == 16 else 6
 """Pixels of a tile. A processor has 32 registers of 16 numbers, or 16 of 8: two vectors of sums for each
@@ -31,11 +44,20 @@ MOST_BYTES = 256
 and needs no register for each row."""
 UNSCALED = -(1 << 40)
 """A place of scales that says there are none, in every tile of a layer."""
-MULTIPLIES_BYTES = multiplies_bytes(QUAD * LANES)
-"""Whether the processor adds up products of bytes: Intel's do since 2019, AMD's since 2022 (VNNI)."""
+ADDS_QUADS = multiplies_bytes(QUAD * LANES)
+"""Whether the processor adds up QUAD products of bytes: Intel's do since 2019, AMD's since 2022 (VNNI)."""
+ADDS_PAIRS = not ADDS_QUADS and multiplies_shorts(QUAD * LANES)
+"""Whether it adds up two at a time, in 16 bits, as all with AVX2 do: exact where the magnitudes of two
+neighbouring weights add up to `player.head.graph.PAIR_LIMIT` at most."""
+MULTIPLIES_BYTES = ADDS_QUADS or ADDS_PAIRS
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
-"""The instruction by LLVM's name. Its operands are words of QUAD bytes, as LLVM had them up to version 21;
-later versions turn them into theirs."""
+"""The instruction that adds up QUADs by LLVM's name. Its operands are words of QUAD bytes, as LLVM had them
+up to version 21; later versions turn them into theirs."""
+_PAIRS, _QUADS = {
+    8: ("llvm.x86.avx2.pmadd.ub.sw", "llvm.x86.avx2.pmadd.wd"),
+    16: ("llvm.x86.avx512.pmaddubs.w.512", "llvm.x86.avx512.pmaddw.d.512"),
+}[LANES]
+"""The instructions that multiply bytes and add up twos of them, and the same of 16 bits."""
 
 
 def _dense(n_vectors: int) -> Any:
@@ -100,6 +122,19 @@ def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, A
                 sums.set(row, number, value.call("fma", column, sums.get(row, number)))
 
 
+def _plus_products(total: Lanes, codes: Lanes, weights: Lanes) -> Lanes:
+    """LANES sums and what QUAD codes of bytes, unsigned, by as many weights, signed, add to each."""
+    b, lanes = total.b, vector(INT)
+    if ADDS_QUADS:
+        dot = cgutils.get_or_insert_function(b.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
+        return Lanes(b, b.call(dot, [total.value, codes.value, weights.value]))
+    in_bytes, shorts = ir.VectorType(BYTE, QUAD * LANES), ir.VectorType(SHORT, 2 * LANES)
+    pairs = cgutils.get_or_insert_function(b.module, ir.FunctionType(shorts, [in_bytes] * 2), _PAIRS)
+    quads = cgutils.get_or_insert_function(b.module, ir.FunctionType(lanes, [shorts] * 2), _QUADS)
+    twos = b.call(pairs, [b.bitcast(codes.value, in_bytes), b.bitcast(weights.value, in_bytes)])
+    return total + Lanes(b, b.call(quads, [twos, ir.Constant(shorts, [1] * (2 * LANES))]))
+
+
 def _dense_bytes(n_vectors: int) -> Any:
 
     def typed(
@@ -108,7 +143,7 @@ def _dense_bytes(n_vectors: int) -> Any:
         packed, starts, scales = weights
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            if not MULTIPLIES_BYTES:  # no program has such a step, and the compiler knows no such instruction
+            if not MULTIPLIES_BYTES:  # no program has such a step; the compiler may know no such instruction
                 return context.get_dummy_value()
             bytes_here, here = (address(context, builder, signature.args[n], arguments[n]) for n in (0, 1))
             parts = [builder.extract_value(arguments[2], index) for index in range(3)]
@@ -127,8 +162,6 @@ def _dense_bytes(n_vectors: int) -> Any:
             x_rows = _rows(builder, bytes_here, arguments[3], LONG(MOST_BYTES))
             x_rows = [builder.bitcast(row, quads) for row in x_rows]
             words = builder.bitcast(builder.gep(packed_there, [arguments[4]]), quads)
-            lanes = vector(INT)
-            dot = cgutils.get_or_insert_function(builder.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
             with cgutils.for_range(builder, depth) as loop:
                 columns = []
                 for number in range(n_vectors):
@@ -137,8 +170,7 @@ def _dense_bytes(n_vectors: int) -> Any:
                 for row in range(ROWS):
                     quad = splat(builder, builder.load(builder.gep(x_rows[row], [loop.index]), align=1))
                     for number, column in enumerate(columns):
-                        total = builder.call(dot, [sums.get(row, number).value, quad.value, column.value])
-                        sums.set(row, number, Lanes(builder, total))
+                        sums.set(row, number, _plus_products(sums.get(row, number), quad, column))
             sums.write(here, out, _scales(builder, scales_there, scale_at, n_vectors))
             return context.get_dummy_value()
 

@@ -3,19 +3,21 @@
 Every value of the head is a table in memory of BLOCK pixels by its width, padded to whole vectors. All places
 and sizes follow from the widths that `player.head.graph` has checked. What is rounded to 8 bits is kept in
 bytes where the processor multiplies those (`player.head.dense_tiles`). Elsewhere codes are kept as floats:
-sums of their products are the same integers, added up more slowly.
+sums of their products are the same integers, added up more slowly. So are those of a head whose weights are
+so large that two products do not fit into 16 bits, where the processor adds them up so.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from player.head.activations import GELU, HARD_SWISH, LINEAR
-from player.head.dense_tiles import LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED
-from player.head.graph import HeadArrays, Layer, Rounding, monomials
+from player.head.dense_tiles import ADDS_PAIRS, LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED
+from player.head.graph import PAIR_LIMIT, HeadArrays, Layer, Rounding, monomials, pair_sums
 
 BLOCK = 4 * ROWS
 """Pixels at a time: all the numbers of a 64 wide head are then 150 kB."""
@@ -95,7 +97,7 @@ class Program:
 
 def program_of(head: HeadArrays, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
     """The program of a head in 8 bits. `in_bytes`: whether the processor multiplies bytes."""
-    return _Compiler(head, in_bytes).program()
+    return _Compiler(head, in_bytes and not (ADDS_PAIRS and head.may_saturate)).program()
 
 
 class _Compiler:
@@ -117,7 +119,7 @@ class _Compiler:
             h = self._dense(h, layer, self._activation)
         rounding, *roundings = head.roundings
         h = self._rounded(h, rounding)
-        order, harmonics, copies = _ordered(head.harmonics)
+        order, harmonics, copies = next(found for found in _orders(head.harmonics) if self._fits(found[0]))
         weight, bias, scale = head.to_sh
         assert scale is not None
         to_sh = Layer(weight[:, order], bias[order], scale[order])
@@ -193,6 +195,12 @@ class _Compiler:
         ))  # fmt: skip
         return z
 
+    def _fits(self, order: np.ndarray) -> bool:
+        """Whether the encoded features may be multiplied in an `order`, which makes others neighbours."""
+        layer = self._head.from_sh
+        pairs_count = self._in_bytes and ADDS_PAIRS and layer.scale is not None
+        return not pairs_count or pair_sums(layer.weight[order]).max(initial=0) <= PAIR_LIMIT
+
     def _harmonics(self, dirs: Value, layer: Layer, copies: int) -> Value:
         """The spherical harmonics of directions, each so often."""
         terms = self._floats(len(layer.weight))
@@ -225,24 +233,25 @@ class _Compiler:
         return out
 
 
-def _ordered(harmonics: Layer) -> tuple[np.ndarray, Layer, int]:
-    """An order of the encoded features, the harmonics that they are multiplied by, each of which is found
-    once, and how often each is to be repeated for that.
+def _orders(harmonics: Layer) -> Iterator[tuple[np.ndarray, Layer, int]]:
+    """Orders of the encoded features, the fastest first, each with the harmonics that they are multiplied by
+    and how often each of these is to be repeated for that.
 
-    Where harmonics fill whole vectors, those of the features are all of them again and again. Elsewhere the
-    features of a harmonic are beside one another, if all have as many; if not, each feature has its own.
+    Each harmonic is found once if all have as many features. Where they fill whole vectors, those of the
+    features can be all of them again and again. Else the features of a harmonic are beside one another. Last,
+    each feature has its own, in the order of the file.
     """
     columns = np.vstack([harmonics.bias, harmonics.weight])
     distinct, which = np.unique(columns, axis=1, return_inverse=True)
     n, n_all = distinct.shape[1], columns.shape[1]
-    by_harmonic = np.argsort(which.reshape(-1), kind="stable")
-    if (np.bincount(which.reshape(-1)) != n_all // n).any():
-        return np.arange(n_all), harmonics, 1
-    first = by_harmonic.reshape(n, -1)[:, 0]
-    once = Layer(harmonics.weight[:, first], harmonics.bias[first])
-    if n % LANES:
-        return by_harmonic, once, n_all // n
-    return by_harmonic.reshape(n, -1).T.reshape(-1), once, 1
+    if (np.bincount(which.reshape(-1)) == n_all // n).all():
+        by_harmonic = np.argsort(which.reshape(-1), kind="stable")
+        first = by_harmonic.reshape(n, -1)[:, 0]
+        once = Layer(harmonics.weight[:, first], harmonics.bias[first])
+        if n % LANES == 0:
+            yield by_harmonic.reshape(n, -1).T.reshape(-1), once, 1
+        yield by_harmonic, once, n_all // n
+    yield np.arange(n_all), harmonics, 1
 
 
 def _pairs(order: int) -> list[tuple[int, int]]:

@@ -10,6 +10,7 @@ import numpy as np
 from player.compiling import compiled
 from player.head.activations import gelu_lanes, hard_swish_lanes, quantize_lanes, sigmoid_lanes
 from player.head.dense_tiles import (
+    ADDS_QUADS,
     LANES,
     MOST_BYTES,
     MULTIPLIES_BYTES,
@@ -21,6 +22,7 @@ from player.head.dense_tiles import (
     dense_narrow_tile,
     dense_tile,
 )
+from player.head.graph import PAIR_LIMIT
 
 F32 = np.float32
 DEPTH = 24
@@ -57,8 +59,9 @@ def wrong() -> str | None:
 def _wrong_bytes(numbers: np.random.Generator) -> str | None:
     codes = np.zeros((ROWS, MOST_BYTES), np.uint8)
     codes[:, :DEPTH] = numbers.integers(0, 256, (ROWS, DEPTH))
-    w = numbers.integers(-127, 128, (DEPTH, WIDTH)).astype(np.int8)
-    codes[0], w[:, 0] = 255, 127
+    most = 127 if ADDS_QUADS else PAIR_LIMIT // 2
+    w = numbers.integers(-most, most + 1, (DEPTH, WIDTH)).astype(np.int8)
+    codes[0], w[:, 0] = 255, most
     packed = w.reshape(DEPTH // QUAD, QUAD, WIDTH // LANES, LANES).transpose(2, 0, 3, 1).reshape(-1)
     starts = numbers.integers(-1000, 1000, WIDTH).astype(np.int32)
     memory = np.zeros(2 * ROWS * WIDTH, F32)

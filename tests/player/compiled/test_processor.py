@@ -12,7 +12,7 @@ import pytest
 from llvmlite import binding
 
 from player.compiled.lanes import LANES
-from player.compiled.processor import has_wide_registers, multiplies_bytes, target
+from player.compiled.processor import has_wide_registers, multiplies_bytes, multiplies_shorts, target
 from player.head.dense_tiles import MULTIPLIES_BYTES
 from tests.reliability.processors import REPOSITORY, SHORT, processors, run
 
@@ -26,34 +26,44 @@ def every_target() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "features", "lanes", "in_bytes"),
+    ("name", "features", "lanes", "in_quads", "in_pairs"),
     [
-        ("generic", "", 8, False),
-        ("x86-64-v2", "", 8, False),
-        ("x86-64-v3", "", 8, False),
-        ("haswell", "", 8, False),
-        ("x86-64-v4", "", 16, False),
-        ("skylake-avx512", "", 16, False),
-        ("cascadelake", "", 16, True),
-        ("icelake-server", "", 16, True),
-        ("sapphirerapids", "", 16, True),  # nothing later: LLVM 15, numba 0.61's, ends the process over it
-        ("alderlake", "", 8, True),
-        ("haswell", "+avx512f", 16, False),
-        ("haswell", "+avxvnni", 8, True),
-        ("icelake-server", "-avx512f", 8, False),
-        ("icelake-server", "-avx512vnni", 16, False),
+        ("generic", "", 8, False, False),
+        ("x86-64-v2", "", 8, False, False),
+        ("x86-64-v3", "", 8, False, True),
+        ("haswell", "", 8, False, True),
+        ("x86-64-v4", "", 16, False, True),
+        ("skylake-avx512", "", 16, False, True),
+        ("cascadelake", "", 16, True, True),
+        ("icelake-server", "", 16, True, True),
+        (
+            "sapphirerapids",
+            "",
+            16,
+            True,
+            True,
+        ),  # nothing later: LLVM 15, numba 0.61's, ends the process over it
+        ("alderlake", "", 8, True, True),
+        ("haswell", "+avx512f", 16, False, False),
+        ("haswell", "+avxvnni", 8, True, True),
+        ("icelake-server", "-avx512f", 8, False, True),
+        ("icelake-server", "-avx512vnni", 16, False, True),
     ],
 )
-def test_what_a_processor_has(name: str, features: str, lanes: int, in_bytes: bool) -> None:
+def test_what_a_processor_has(name: str, features: str, lanes: int, in_quads: bool, in_pairs: bool) -> None:
     of = "x86_64-unknown-linux-gnu", name, features
     assert (16 if has_wide_registers(of) else 8) == lanes
-    assert multiplies_bytes(4 * lanes, of) == in_bytes
+    assert multiplies_bytes(4 * lanes, of) == in_quads
+    assert multiplies_shorts(4 * lanes, of) == in_pairs
 
 
 @pytest.mark.parametrize("name", ["generic", "apple-m1", "neoverse-n1", "neoverse-v2"])
 def test_what_arm_has(name: str) -> None:
     of = ARM, name, "+neon"
-    assert not has_wide_registers(of) and not multiplies_bytes(32, of) and not multiplies_bytes(64, of)
+    assert not has_wide_registers(of)
+    assert not any(
+        multiplies(n, of) for multiplies in (multiplies_bytes, multiplies_shorts) for n in (32, 64)
+    )
 
 
 def asked(**settings: str) -> str:
@@ -79,8 +89,9 @@ def test_numba_s_own_settings_are_obeyed() -> None:
         assert asked() == here
         assert target()[1] == binding.get_host_cpu_name()
     assert asked(NUMBA_CPU_NAME="generic") == "8 False"
-    assert asked(NUMBA_CPU_NAME="x86-64-v3", NUMBA_CPU_FEATURES="") == "8 False"
-    assert asked(NUMBA_CPU_FEATURES="+avx2,-avx512f", NUMBA_CPU_NAME="x86-64-v2") == "8 False"
+    assert asked(NUMBA_CPU_NAME="x86-64-v2", NUMBA_CPU_FEATURES="") == "8 False"
+    assert asked(NUMBA_CPU_NAME="x86-64-v3", NUMBA_CPU_FEATURES="") == "8 True"
+    assert asked(NUMBA_CPU_FEATURES="+avx2,-avx512f", NUMBA_CPU_NAME="x86-64-v2") == "8 True"
     assert asked(NUMBA_CPU_NAME="cascadelake", NUMBA_CPU_FEATURES="") == "16 True"
 
 

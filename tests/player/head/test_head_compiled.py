@@ -12,10 +12,10 @@ from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
 from player.errors import FormatError
 from player.head.compiled import CompiledHead
-from player.head.dense_tiles import MULTIPLIES_BYTES
-from player.head.graph import read_head
+from player.head.dense_tiles import ADDS_PAIRS, MULTIPLIES_BYTES
+from player.head.graph import PAIR_LIMIT, pair_sums, read_head
 from player.head.head import CHUNK, Head
-from player.head.program import BLOCK, DENSE_BYTES, QUANTIZE, ROUND, program_of
+from player.head.program import BLOCK, DENSE_BYTES, QUANTIZE, ROUND, _orders, program_of
 from player.scratch import CANARIES
 from tests.exporters.head.test_onnx_head import inputs, random_head
 from tests.numerics.bounds import Row
@@ -170,6 +170,23 @@ def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
     rgb = open_head(tmp_path, data, 8)(features * 50, dirs)
     expected = play_in_integers(read_head(data, "head"), features * 50, dirs)
     CLIPPED_SUMS.check(rgb, expected)
+
+
+def test_encoded_features_keep_neighbours_whose_products_fit_into_16_bits() -> None:
+    """Put in another order, they have others, and weights of up to 127 each."""
+    weights = random_head(n_channels=8, width=64, n_more=1, sh_degree=4)
+    arrays = read_head(head_onnx(weights, activation_ranges(weights, *inputs(300))), "head")
+    codes = np.zeros_like(arrays.from_sh.weight)
+    codes[::2] = 127
+    apart = replace(arrays, from_sh=arrays.from_sh._replace(weight=codes))
+    assert not apart.may_saturate
+    most = [pair_sums(codes[order]).max() for order, *_ in _orders(apart.harmonics)]
+    assert min(most) <= PAIR_LIMIT < max(most)
+    pictures = [CompiledHead(program_of(apart, some))(*inputs(300)) for some in {False, MULTIPLIES_BYTES}]
+    SUMS.holds([picture.tobytes() == pictures[0].tobytes() for picture in pictures])
+    both = replace(arrays, from_sh=arrays.from_sh._replace(weight=np.full_like(codes, 127)))
+    assert both.may_saturate
+    assert (DENSE_BYTES in {int(step[0]) for step in program_of(both, True).steps}) == (not ADDS_PAIRS)
 
 
 @pytest.mark.parametrize("sh_degree", [1, 2, 5, 8])
