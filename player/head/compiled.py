@@ -188,13 +188,15 @@ def _add(memory, step, n):
 
 @compiled
 def _monomials(memory, pairs, step, n):
-    dirs, dirs_pitch, out, pitch = step.x, step.x_pitch, step.out, step.pitch
-    for _ in range(n):
-        for i in range(len(pairs)):
-            parent, axis = pairs[i, 0], pairs[i, 1]
-            value = memory[dirs + axis]
-            memory[out + i] = value if parent < 0 else memory[out + parent] * value
-        dirs, out = dirs + dirs_pitch, out + pitch
+    """One monomial of all pixels after the other: what a pixel multiplies was written a while ago."""
+    dirs_pitch, pitch = step.x_pitch, step.pitch
+    for i in range(len(pairs)):
+        parent, axis, out = step.out + pairs[i, 0], step.x + pairs[i, 1], step.out + i
+        for row in range(n):
+            value = memory[axis + row * dirs_pitch]
+            if parent >= step.out:
+                value *= memory[parent + row * pitch]
+            memory[out + row * pitch] = value
 
 
 @compiled
