@@ -42,21 +42,6 @@ def test_documents_and_plots_are_what_the_results_give() -> None:
     assert plots <= {path.name for path in files}
 
 
-def test_a_part_that_one_file_lacks_is_told_from_the_other() -> None:
-    scored = {"psnr": 36.0, "psnr_uncertainty": 0.1, "psnr_worst": 34.0, "ssim": 0.98, "n_views": 16}
-    trained = {"steps": 9000, "training_seconds": 300.0, "seconds": 310.0, "peak_mb": 900.0}
-    second = {
-        "train_demo": result(trained, "vfr-train demo model.pt", date="2026-11-25"),
-        "eval_demo": result(scored),
-    }
-    first = {name: {**part, "machine": MACHINE | {"processor": "other"}} for name, part in second.items()}
-    first["train_demo"] = first["train_demo"] | {"figures": trained | {"steps": 40_000}}
-    block = "<!-- benchmarks: training -->\n<!-- /benchmarks -->"
-    assert "9,000" in rendered(block, {}, second)
-    both = rendered(block, first, second)
-    assert "40,000" in both and "9,000" not in both
-
-
 def test_every_block_is_shown_once_and_known() -> None:
     shown = [
         found[2]

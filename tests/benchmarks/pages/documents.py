@@ -3,8 +3,6 @@
 <!-- benchmarks: NAME -->
 what `BLOCKS[NAME]` makes of the results, or `BESIDE[NAME]` of those of two processors
 <!-- /benchmarks -->
-
-A part that was not measured on a processor with AVX-512 is told from one without: its row names the machine.
 """
 
 from __future__ import annotations
@@ -31,19 +29,12 @@ def rendered(text: str, results: Results, second: Results) -> str:
     `results`: of a processor with AVX-512; `second`: of one without.
     """
 
-    every = _every_part(results, second)
-
     def block(found: re.Match[str]) -> str:
         name = found[2]
-        lines = BESIDE[name](results, second) if name in BESIDE else BLOCKS[name](every)
+        lines = BESIDE[name](results, second) if name in BESIDE else BLOCKS[name](results)
         return "\n".join([found[1], *lines, "", found[3]])
 
     return BLOCK.sub(block, text)
-
-
-def _every_part(results: Results, second: Results) -> Results:
-    """The parts of both, those of `results` where both have one."""
-    return results | {name: part for name, part in second.items() if name not in results}
 
 
 def prose(text: str) -> str:
@@ -57,7 +48,7 @@ def rendered_files(results: Results, second: Results) -> dict[Path, bytes]:
     for name in DOCUMENTS:
         path = REPOSITORY / name
         files[path] = rendered(path.read_text(encoding="utf-8"), results, second).encode()
-    for name, picture in plots(_every_part(results, second)).items():
+    for name, picture in plots(results).items():
         files[REPOSITORY / "docs" / name] = picture.encode()
     return files
 
