@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
+from scipy import ndimage
 
 from player.asset.asset import Asset
-from player.asset.grid import DISTANCE_BITS
+from player.asset.grid import DISTANCE_BITS, MAX_DISTANCE, SparseGrid
 from player.cameras.camera import Camera
 from player.page.gpu_memory import gpu_bytes
 from player.render import Renderer
@@ -134,7 +135,7 @@ def test_the_arrays_are_the_players(scene: Scene) -> None:
     """Distances and slots, the bricks that hold features, and the memory that is foretold."""
     found, grid = scene.page.page.evaluate("() => arrays()"), scene.asset.grid
     table = scene.page.array(found["table"], np.uint8).reshape(-1, 4)
-    assert (entries_of(table, found["nSlots"]) == grid.table).all()
+    check_table(entries_of(table, found["nSlots"]), grid)
     texels = unblocked(scene.page.array(found["density"], np.uint8), found["nSlots"], (8, 8, 10))
     codes = grid.codes.reshape(-1, 9, 9, 9)
     assert (texels[:, :, :, :9] == corners(codes)).all()
@@ -193,6 +194,22 @@ def entries_of(table: np.ndarray, count: int) -> np.ndarray:
     place, kind = table[:, :3].astype(np.int64), table[:, 3].astype(np.int64)
     nowhere = -(kind | place[:, 0] << DISTANCE_BITS)
     return np.where(kind < 32, nowhere, number_of(place, count) << 3 | (kind - 32))
+
+
+def check_table(found: np.ndarray, grid: SparseGrid) -> None:
+    """Entries are those of the player's table: a place has a brick if a cell there is live. Any other tells
+    how far the nearest one is."""
+    assert (found == grid.table).all()
+    n = grid.n_per_axis
+    middles = np.stack(np.meshgrid(*[np.arange(8 * n)] * 3, indexing="ij")).reshape(3, -1) + np.float32(0.5)
+    live = grid.find(middles.astype(np.float32)).live & (middles < grid.resolution).all(axis=0)
+    occupied: np.ndarray = np.any(live.reshape(n, 8, n, 8, n, 8), axis=(1, 3, 5)).reshape(-1)
+    assert ((found >= 0) == occupied).all()
+    away: Any = ndimage.distance_transform_cdt(found.reshape(n, n, n) < 0, "chessboard")
+    if occupied.any():
+        assert (np.minimum(away, MAX_DISTANCE).reshape(-1) == -found & MAX_DISTANCE)[~occupied].all()
+    else:
+        assert (found == -MAX_DISTANCE).all()
 
 
 def test_shaders_are_valid_glsl(scene: Scene, tmp_path: Path) -> None:
