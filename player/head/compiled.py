@@ -188,7 +188,8 @@ def _add(memory, step, n):
 
 @compiled
 def _monomials(memory, pairs, step, n):
-    """One monomial of all pixels after the other: what a pixel multiplies was written a while ago."""
+    """The first monomial of all pixels, then the second, and so on: none is read just after it is written,
+    which would make each product wait for the one before."""
     dirs_pitch, pitch = step.x_pitch, step.pitch
     for i in range(len(pairs)):
         parent, axis, out = step.out + pairs[i, 0], step.x + pairs[i, 1], step.out + i
