@@ -117,6 +117,18 @@ CONDITIONS = {"n_views": 8, "threads": 2, "frames_a_setting_and_size": 12}
 TRADE = result({"settings": ROWS, "conditions": CONDITIONS, "size": "800x800"})
 
 
+def test_a_loss_on_test_views_is_that_of_the_same_asset() -> None:
+    """A bake that was measured again since the trade was is another asset."""
+    found = {
+        "resolution": 594, "feature_resolution": 460, "n_channels": 16, "n_fetches": 5, "n_vertices": 6e6,
+        "n_bytes": 5e6, "seconds": 200.0, "peak_mb": 900.0, "samples_median": 7, "samples_p95": 25,
+        "loss_db": 0.3, "loss_db_spread": 0.1,
+    }  # fmt: skip
+    for commit, shown in ((TRADE["commit"], True), ("9f8e7d6c5b", False)):
+        results = {"bake_lego_balanced": result(found, commit=commit), "trade_lego": TRADE}
+        assert ("| 0.08 |" in BLOCKS["baking"](results)[2]) == shown
+
+
 def test_what_is_chosen_keeps_to_what_was_wanted() -> None:
     rows = [line.split(" | ") for line in BLOCKS["choose"]({"trade_lego": TRADE}) if "| lego" in line]
     assert [row[1:3] + row[4:5] for row in rows] == [

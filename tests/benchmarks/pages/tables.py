@@ -156,6 +156,9 @@ def baking(results: Results) -> list[str]:
     rows = []
     for name in there:
         found, played = results[name]["figures"], own_setting(results, name)
+        trade = results.get(f"trade_{name.split('_')[1]}")
+        if trade is not None and trade["commit"] != results[name]["commit"]:
+            played = None  # of another asset
         row = [
             asset_name(name),
             where(results, name),
