@@ -6,17 +6,49 @@ import hashlib
 import io
 import json
 import shutil
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from player.asset.asset import Asset
 from player.asset.manifest import FileEntry, Manifest, manifest_bytes
-from player.asset.single_level import VertexBricks, to_vertices
-from player.asset.version_3.packing import pack_codes, pack_masks
+from player.asset.pyramid import PyramidValues
+from player.asset.single_level import VertexBricks
 from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
 
 KEYS_OF_4 = ("level_steps", "density_steps", "feature_steps", "parts")
+STRATEGIES = (zlib.Z_HUFFMAN_ONLY, zlib.Z_DEFAULT_STRATEGY)
+"""The smaller is kept: differences of codes are noise, in which the repetitions that zlib finds cost more
+than they save (lego: 11 % less without them), but for codes that hardly change."""
+
+
+def pack_codes(codes: np.ndarray) -> bytes:
+    """Codes [n] or [n, n_channels], int8 or uint8, as bytes that `unpack_codes` reads."""
+    planes = np.ascontiguousarray((codes if codes.ndim == 2 else codes[:, None]).T).view(np.uint8)
+    steps = planes.copy()
+    steps[:, 1:] -= planes[:, :-1]
+    return min((_compressed(steps.tobytes(), strategy) for strategy in STRATEGIES), key=len)
+
+
+def _compressed(data: bytes, strategy: int) -> bytes:
+    stream = zlib.compressobj(strategy=strategy, memLevel=9)
+    return stream.compress(data) + stream.flush()
+
+
+def pack_masks(masks: np.ndarray) -> bytes:
+    """Masks of bricks [n_bricks, 8] uint64 as bytes that `unpack_masks` reads."""
+    return zlib.compress(np.ascontiguousarray(masks, "<u8").tobytes())
+
+
+def to_vertices(grid: PyramidValues) -> VertexBricks:
+    """Undo `from_vertices`, for a grid of one level; values are [n_vertices, n_channels].
+
+    Every cell with eight corners stored is live in what `from_vertices` makes: a pyramid with a cell that is
+    not live among eight vertices of others is another one when it is read again.
+    """
+    (vertices,), (values,) = grid.pyramid.vertices, grid.values
+    return VertexBricks(vertices.bricks.coords, vertices.bricks.masks, values)
 
 
 def write_version_3(

@@ -52,13 +52,3 @@ def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
     if not np.array_equal(kept, masks):
         values = values[stored_bits(kept)[stored_bits(masks)]]
     return PyramidValues(pyramid, (values,))
-
-
-def to_vertices(grid: PyramidValues) -> VertexBricks:
-    """Undo `from_vertices`, for a grid of one level; values are [n_vertices, n_channels].
-
-    Every cell with eight corners stored is live in what `from_vertices` makes: a pyramid with a cell that is
-    not live among eight vertices of others is another one when it is read again.
-    """
-    (vertices,), (values,) = grid.pyramid.vertices, grid.values
-    return VertexBricks(vertices.bricks.coords, vertices.bricks.masks, values)

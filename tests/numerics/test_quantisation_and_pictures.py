@@ -15,7 +15,7 @@ from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
 from player.asset.density import decode_density, encode_density
 from player.asset.grid import SparseGrid
-from player.asset.version_3.packing import pack_codes, unpack_codes
+from player.asset.version_3.packing import unpack_codes
 from player.cameras.transforms import read_cameras
 from player.compiled import march as march_compiled
 from player.march import march
@@ -23,6 +23,7 @@ from player.render import Frame, Renderer, render
 from tests.numerics.bounds import Row
 from tests.numerics.fog import fog
 from tests.player.conftest import RESOLUTION, STEP, shells
+from tests.version_3 import pack_codes
 from tests.vertex_grids import grid_of
 from vfr_bake.baking.grids import code_step, latent, whole_codes
 

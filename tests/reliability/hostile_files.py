@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from player.asset.version_3.packing import pack_codes, pack_masks
-from tests.version_3 import as_version_3
+from tests.version_3 import as_version_3, pack_codes, pack_masks
 
 BUDGET = 0.3
 """Gigabytes that the commands may take for the asset."""

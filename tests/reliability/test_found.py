@@ -20,14 +20,13 @@ import torch
 from exporters.shapes.crop import parse_crop
 from player.asset.asset import Asset
 from player.asset.manifest import NAME, parse_manifest
-from player.asset.version_3.packing import pack_codes, pack_masks
 from player.asset.version_3.unpacking import read_arrays, read_coords
 from player.cameras.transforms import parse_transforms, transforms_cameras
 from player.errors import ConfigError, DataError, FormatError
 from player.files.images import png_bytes, read_key
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.reliability.hostile_files import vouch
-from tests.version_3 import as_version_3
+from tests.version_3 import as_version_3, pack_codes, pack_masks
 from vfr_bake.config import FieldConfig, field_config_from
 from vfr_bake.data.files.pictures import read_picture
 from vfr_bake.field.field import VfrField

@@ -15,12 +15,13 @@ import pytest
 from player.asset.asset import Asset, checksums
 from player.asset.bricks import stored_bits
 from player.asset.manifest import FILES_OF_3
-from player.asset.version_3.packing import pack_codes, pack_masks, unpack_codes
+from player.asset.version_3.packing import unpack_codes
 from player.asset.version_3.unpacking import read_arrays
 from player.cameras.views import asset_cameras
 from player.errors import FormatError, IntegrityError
 from player.render import Renderer
 from tests.player.asset.test_asset import edit, replace_file
+from tests.version_3 import pack_codes, pack_masks
 
 KEPT = Path(__file__).parent / "version_3_1"
 

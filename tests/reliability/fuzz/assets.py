@@ -26,14 +26,13 @@ from player.asset.asset import Asset, read_manifest
 from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
 from player.asset.single_level import VertexBricks
-from player.asset.version_3.packing import pack_codes, pack_masks
 from player.asset.version_3.unpacking import PLACES, read_arrays
 from player.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
 from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_value
 from tests.reliability.fuzz.targets import Target, small_view
-from tests.version_3 import write_version_3
+from tests.version_3 import pack_codes, pack_masks, write_version_3
 
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19
