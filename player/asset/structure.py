@@ -9,7 +9,7 @@ Above the coarsest level there are further ones, each with half as many cells al
 until there is one cell, which is live. All their octants with live cells are refined, and nothing is said
 about them.
 
-Both are sections of `player.asset.coder`. Octants, in the order of (x, y, z), are rows of one channel and one
+Both are blocks of `player.asset.coder`. Octants, in the order of (x, y, z), are rows of one channel and one
 class. Parents, in the order of octants and then of 16 x + 4 y + z within them, are rows of eight channels.
 The class of a child is `live * 7 + dead`, which count, among its six neighbours through a face at the finer
 level, those that are known to be so: those of channels before, those whose parent is not live, and those
@@ -135,7 +135,7 @@ def _parts(data: bytes, n_parts: int, where: str) -> list[bytes]:
     parts, at = [], 0
     for _ in range(n_parts):
         if len(data) < at + _LENGTH.size:
-            raise FormatError(f"{where}: expected {n_parts} sections, got {len(parts)}")
+            raise FormatError(f"{where}: expected {n_parts} blocks, got {len(parts)}")
         (length,) = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size + length
         parts.append(data[at - length : at])

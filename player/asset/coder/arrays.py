@@ -1,4 +1,5 @@
-"""Decodes a channel's symbols in numpy, all lanes at a time. `player.asset.coder.compiled` is its twin."""
+"""Encodes and decodes a channel's symbols in numpy, all lanes at a time. `player.asset.coder.compiled` is its
+twin."""
 
 from __future__ import annotations
 
@@ -19,6 +20,29 @@ from player.asset.coder.tables import (
 
 _PLACE, _COUNT, _FIRST = np.uint32(TOTAL - 1), np.uint32(BITS), np.uint32(0xFFFF)
 _LOW, _WORD = np.uint32(1 << 16), np.uint32(16)
+
+
+def encode_channel(states: np.ndarray, counts: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Encode the symbols of a channel, the last one first.
+
+    Args:
+        states: [n_lanes] uint32, changed.
+        counts: [n] uint32 places of the symbol at each position, in the order of coding.
+        first: [n] uint32 where they begin.
+
+    Returns:
+        [n_words] uint16 in the order in which they are read.
+    """
+    n_lanes, words = len(states), []
+    for begin in reversed(range(0, len(counts), n_lanes)):
+        count, start = counts[begin : begin + n_lanes], first[begin : begin + n_lanes]
+        x = states[: len(count)]
+        full = (x >> np.uint32(32 - BITS)) >= count
+        words.append(x[full].astype(np.uint16))
+        x = np.where(full, x >> _WORD, x)
+        times = x // count
+        states[: len(count)] = (times << _COUNT) + (x - times * count) + start
+    return np.concatenate(words[::-1])
 
 
 def decode_channel(

@@ -1,6 +1,6 @@
 """An entropy coder for small integers: interleaved rANS, decoded in many lanes that go forward in step.
 
-A *section* has n rows and some channels. Its symbols are coded channel by channel, and within a channel in
+A *block* has n rows and some channels. Its symbols are coded channel by channel, and within a channel in
 the order of `player.asset.coder.lanes`. Each lane has a state x of 32 bits, from 2^16 on, which it keeps from
 one channel to the next. The symbol's context chooses a table (`player.asset.coder.tables`), in which each
 symbol has `count` of the 4096 places, from `first` on. A lane decodes so:
@@ -12,7 +12,7 @@ symbol has `count` of the 4096 places, from `first` on. A lane decodes so:
 All lanes take their words from one stream: in a step, the lanes that need one in their order. In the end each
 state is 2^16 again and all words are taken, which is checked, and which hardly any damage passes.
 
-A section's bytes, all numbers little-endian:
+A block's bytes, all numbers little-endian:
 
     uint32 n_lanes, 1 to 4096 and at most n; uint32 n_packed; uint32 n_words
     n_packed bytes: the tables
@@ -20,7 +20,7 @@ A section's bytes, all numbers little-endian:
     uint16 [n_words]: the words
     uint8 [...]: for each symbol -63 or 63, in the order of channels and rows, how much it is beyond, 0 to 192
 
-A section of no rows or no channels has no bytes.
+A block of no rows or no channels has no bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ import numpy as np
 
 from player.asset.coder.lanes import Lanes, Neighbours
 from player.asset.coder.tables import (
-    BITS,
     CONTEXT_OF_SUM,
     END,
     HALF,
@@ -61,7 +60,7 @@ _LANE_BITS = 2048
 def encode(
     symbols: np.ndarray, neighbours: Neighbours, classes: Sequence[np.ndarray], n_classes: int
 ) -> bytes:
-    """Symbols as the bytes of a section.
+    """Symbols as the bytes of a block.
 
     Args:
         symbols: [n, n_channels] integers, -255 to 255; the more of them are 0, the fewer bytes they take.
@@ -98,8 +97,8 @@ def encode(
         context = _contexts(rows[channel], known, classes[channel])
         named = found.of_context[channel].reshape(-1).take(context)
         index = lanes.in_order(named.astype(np.int32) * N_SYMBOLS + rows[channel] + END)
-        words += _encode_channel(states, counts.reshape(-1).take(index), first.take(index))
-    stream = np.concatenate(words[::-1]) if words else np.zeros(0, np.uint16)
+        words.append(_twin().encode_channel(states, counts.reshape(-1).take(index), first.take(index)))
+    stream = np.concatenate(words[::-1])
     sizes = np.abs(symbols.T.astype(np.int16))
     beyond = sizes[sizes >= END] - END
     packed = found.packed()
@@ -144,29 +143,8 @@ def _fit(
     return fit_tables(seen.reshape(len(rows), n_classes, N_CONTEXTS, N_SYMBOLS))
 
 
-def _encode_channel(states: np.ndarray, counts: np.ndarray, first: np.ndarray) -> list[np.ndarray]:
-    """Encode a channel's symbols, the last one first; the words of each step are in the order of the lanes.
-
-    Args:
-        states: [n_lanes] uint32, changed.
-        counts: [n] uint32 places of the symbol at each position.
-        first: [n] uint32 where they begin.
-    """
-    n, n_lanes = len(counts), len(states)
-    words = []
-    for begin in reversed(range(0, n, n_lanes)):
-        count, start = counts[begin : begin + n_lanes], first[begin : begin + n_lanes]
-        x = states[: len(count)]
-        full = (x >> np.uint32(32 - BITS)) >= count
-        words.append(x[full].astype(np.uint16))
-        x = np.where(full, x >> np.uint32(16), x)
-        times = x // count
-        states[: len(count)] = (times << np.uint32(BITS)) + (x - times * count) + start
-    return words
-
-
 class Decoder:
-    """Decodes a section channel by channel, for classes that follow from the channels before.
+    """Decodes a block channel by channel, for classes that follow from the channels before.
 
     >>> rows = Neighbours(np.full((3, 4), -1, np.int32))
     >>> none = np.zeros(4, np.uint8)
@@ -181,13 +159,13 @@ class Decoder:
         self, data: bytes, neighbours: Neighbours, n_channels: int, n_classes: int, where: str
     ) -> None:
         """Args:
-            data: a section's bytes.
+            data: a block's bytes.
             neighbours: those of the n rows.
             n_channels, n_classes: as it was encoded.
-            where: the section's name in error messages.
+            where: the block's name in error messages.
 
         Raises:
-            FormatError: not a section of so many rows and channels. Memory is bounded by the rows, by the
+            FormatError: not a block of so many rows and channels. Memory is bounded by the rows, by the
                 length of `data`, and by 2 MB.
         """
         self._where, self._neighbours, self._n_classes = where, neighbours, n_classes
@@ -272,15 +250,15 @@ def decode(
     """Undo `encode`.
 
     Args:
-        data: a section's bytes.
+        data: a block's bytes.
         neighbours, classes, n_classes: as for `encode`.
-        where: the section's name in error messages.
+        where: the block's name in error messages.
 
     Returns:
         [n, n_channels] int16, the symbols of a channel one after the other in memory.
 
     Raises:
-        FormatError: it is no section of so many rows and channels. What is taken in memory is bounded by
+        FormatError: it is no block of so many rows and channels. What is taken in memory is bounded by
             their number and the length of `data`, the time by their number.
     """
     decoder = Decoder(data, neighbours, len(classes), n_classes, where)
@@ -292,7 +270,7 @@ def decode(
 
 
 def _twin() -> ModuleType:
-    """Whichever decodes a channel: compiled code where there is numba, and numpy elsewhere."""
+    """Whichever encodes and decodes a channel: compiled code where there is numba, and numpy elsewhere."""
     from player import compiling
 
     if compiling.available():

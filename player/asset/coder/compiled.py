@@ -1,4 +1,5 @@
-"""Decodes a channel's symbols in compiled code, lane by lane. `player.asset.coder.arrays` is its twin."""
+"""Encodes and decodes a channel's symbols in compiled code, lane by lane. `player.asset.coder.arrays` is its
+twin."""
 
 from __future__ import annotations
 
@@ -17,6 +18,33 @@ from player.asset.coder.tables import (
 )
 from player.compiling import compiled
 from player.scratch import check_scratch, scratch
+
+
+def encode_channel(states: np.ndarray, counts: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """As `player.asset.coder.arrays.encode_channel`."""
+    words = scratch(len(counts), np.uint16)  # a symbol takes one word or none
+    at = _encode(states, counts, first, words)
+    check_scratch(words)
+    return words[at:].copy()
+
+
+@compiled
+def _encode(states, counts, first, words):
+    n, n_lanes = len(counts), len(states)
+    bits, word, full = np.uint32(BITS), np.uint32(16), np.uint32(32 - BITS)
+    at = n
+    begin = (n - 1) // n_lanes * n_lanes
+    while begin >= 0:
+        for lane in range(min(n_lanes, n - begin) - 1, -1, -1):  # words are written from the last one on
+            x, count = states[lane], counts[begin + lane]
+            if x >> full >= count:
+                at -= 1
+                words[at] = np.uint16(x & np.uint32(0xFFFF))
+                x = np.uint32(x >> word)
+            times = np.uint32(x // count)
+            states[lane] = np.uint32((times << bits) + (x - times * count) + first[begin + lane])
+        begin -= n_lanes
+    return at
 
 
 def decode_channel(

@@ -1,6 +1,6 @@
 """In which order symbols are coded: rows dealt to lanes that go forward in step.
 
-The n rows of a section are cut into `n_lanes` runs of successive rows, the first `n % n_lanes` of them one
+The n rows of a block are cut into `n_lanes` runs of successive rows, the first `n % n_lanes` of them one
 row longer than the others. At step t every lane codes the t-th row of its run, lane after lane. What has been
 coded at an earlier step is known, in whichever lane.
 """

@@ -2,7 +2,7 @@
 
 A symbol is an integer from -63 to 63; the two ends stand for anything beyond as well. The context of a symbol
 is the `context` of its neighbours' symbols, and a class that is known beforehand; each channel has contexts
-of its own. A section has up to 64 tables, and every context names one of them.
+of its own. A block has up to 64 tables, and every context names one of them.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Lookup(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """The tables of a section."""
+    """The tables of a block."""
 
     counts: np.ndarray
     """[n_tables, 127] uint16: the 4096ths of the symbols -63 ... 63 in each table; rows add up to 4096."""

@@ -95,7 +95,7 @@ export class Decoder {
   // - neighbours: [alongZ, alongY, alongX], each Int32Array [n]: the rows beside each row, n for one that is not there;
   // - nChannels, nClasses: as it was encoded;
   // - where: the section's name in messages.
-  // Rejects with an Error if it is not a section of so many rows and channels. Memory is bounded by the rows, by the
+  // Rejects with an Error if it is not a block of so many rows and channels. Memory is bounded by the rows, by the
   // length of `bytes`, and by 2 MB.
   static async open(bytes, neighbours, nChannels, nClasses, where) {
     const n = neighbours[0].length;

@@ -49,7 +49,7 @@ function piecesOf(data, n, where) {
   const pieces = [];
   let at = 0;
   for (let i = 0; i < n; i++) {
-    if (data.length < at + 4) throw new Error(`${where}: expected ${n} sections, got ${i}`);
+    if (data.length < at + 4) throw new Error(`${where}: expected ${n} blocks, got ${i}`);
     const begin = at + 4;
     at = begin + view.getUint32(at, true);
     pieces.push(data.subarray(begin, at));

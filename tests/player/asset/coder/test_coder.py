@@ -70,7 +70,7 @@ def twin(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Mod
 
 
 def use(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Decode with this twin alone."""
+    """Encode and decode with this twin alone."""
     from player.asset.coder import compiled
 
     assert compiling.available()
@@ -131,6 +131,15 @@ def test_what_was_encoded_is_decoded(name: str, twin: ModuleType) -> None:
         ROUND_TRIP.check(oracle(data, neighbours, classes, n_classes), symbols)
     else:
         assert data == b""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_twins_write_the_same_bytes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for twin in TWINS:
+        use(twin, monkeypatch)
+        found.append(encode(*case(*CASES[name])))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("value", [-255, -64, -63, -62, 62, 63, 64, 255])
