@@ -7,7 +7,6 @@ on the size of a task.
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 from collections.abc import Callable, Iterable
@@ -31,6 +30,7 @@ from player.march.march import MarchResult
 from player.march.normals import composited_normals
 from player.march.pixels import EVERY, Planes, write_pixels
 from player.march.view import View
+from player.threads import bounded_threads, default_threads
 
 Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
@@ -45,8 +45,6 @@ with what rounds it 6."""
 TASK_BLOCKS = {"numba": 256, "numpy": 128}
 """Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks;
 numpy arrays of more blocks do not stay in cache."""
-MOST_THREADS = 16
-"""Threads a core, at most: more finish nothing sooner, and each has scratch arrays of its own."""
 TASKS_A_THREAD = {"numba": 8, "numpy": 1}
 """Tasks at least, where there are blocks enough: shared out evenly. A call of numpy takes as long for ten
 rays as for a hundred, and threads wait for one another between calls."""
@@ -88,20 +86,6 @@ class Frame:
         if self.background == "transparent":
             return to_8_bit(np.concatenate([self.rgb, self.opacity[..., None]], axis=-1))
         return to_8_bit(self.rgb)
-
-
-def default_threads() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def bounded_threads(n_threads: int) -> int:
-    """So many, but at most MOST_THREADS a core; raises ConfigError for none."""
-    if n_threads < 1:
-        raise ConfigError(f"threads: expected at least 1, got {n_threads}")
-    return min(n_threads, MOST_THREADS * default_threads())
 
 
 class Renderer:

@@ -25,7 +25,7 @@ from player.errors import ShapeError
 from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.fetches import MIN_TOTAL, stored_features
-from player.render import default_threads
+from player.threads import default_threads
 
 _ROWS = 1 << 16  # vertices at a time: some megabytes of scratch memory a thread
 

@@ -20,7 +20,8 @@ from exporters.surface.depth_views import TOLERANCE, DepthView, cosines_in_view
 from exporters.surface.marching_cubes import voxel_size
 from player.asset.asset import Asset
 from player.head.head import Head
-from player.render import choose_march, default_threads
+from player.render import choose_march
+from player.threads import default_threads
 
 STAND_OFF = 3.0
 """How many voxels above the surface a ray starts."""

@@ -8,7 +8,6 @@ corners. No more than that is ever decoded, whatever a file holds.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -27,6 +26,7 @@ from player.asset.symbols import LevelRows, decode_level, level_rows
 from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
+from player.threads import default_threads
 
 LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127, 127)}
 """The lowest and the highest code of a value."""
@@ -211,7 +211,7 @@ class PartsReader:
             for stored in sections
             if stored.section.kind == "symbols"
         ]
-        with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(MAX_THREADS, default_threads())) as pool:
             rows = {}
             for section in (stored.section for _, stored in symbols):
                 if (section.grid, section.level) not in rows:

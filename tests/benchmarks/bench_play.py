@@ -43,7 +43,8 @@ from player.cameras.camera import Camera, orbit
 from player.cameras.transforms import read_cameras
 from player.head.graph import read_head
 from player.march.march import MIN_OPACITY
-from player.render import Frame, Renderer, default_threads
+from player.render import Frame, Renderer
+from player.threads import default_threads
 from tests.benchmarks import against
 from vfr_bake.bench.process import Clock
 

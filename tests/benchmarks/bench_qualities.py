@@ -21,7 +21,7 @@ import numpy as np
 
 from player.app.option_types import positive, size
 from player.asset.asset import Asset
-from player.render import default_threads
+from player.threads import default_threads
 from tests.benchmarks.against import QUALITIES, Player, views
 from tests.benchmarks.bench_specks import test_views
 from vfr_bake.bench.timing import notch

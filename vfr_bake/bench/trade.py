@@ -23,7 +23,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
 from player.march.interpolation import Quality
-from player.render import bounded_threads
+from player.threads import bounded_threads
 from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.commands import bake_command, play_command
 from vfr_bake.bench.process import Process

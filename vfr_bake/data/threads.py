@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
+
+from player.threads import default_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -15,8 +16,9 @@ Progress = Callable[[int, int], object]
 
 
 def n_threads() -> int:
-    """As many threads as cores, up to eight: each holds a decoded picture and a block of products."""
-    return min(8, os.cpu_count() or 1)
+    """As many as the cores that this process may use, up to eight: each holds a decoded picture and a block
+    of products."""
+    return min(8, default_threads())
 
 
 def in_threads(
