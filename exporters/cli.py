@@ -13,6 +13,7 @@ from exporters.options import FOLDERS, FORMATS, POINTS, ExportOptions
 from player.app.commands import run
 from player.app.option_types import gigabytes, joined_negatives, number, part, size, whole
 from player.app.options import MAX_MEMORY
+from player.progress import Bars
 
 _DESCRIPTION = """\
 Write a baked asset, or a part of it, for another program.
@@ -88,7 +89,8 @@ def _export(argv: list[str]) -> int:
     arguments = make_parser().parse_args(argv)
     from exporters import export  # only now: `--help` needs no numpy
 
-    summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), _bar)
+    with Bars() as bars:
+        summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), bars.count)
     print(json.dumps(summary) if arguments.json else _sentence(summary))
     return 0
 
@@ -127,7 +129,8 @@ def make_parser() -> argparse.ArgumentParser:
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
     value("--time-limit", "S", "seconds that laying out a texture may take (300)", type=seconds)
     value("--points", "N", f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})", type=cloud)
-    value("--cameras", "FILE", "views of a transforms.json (the training cameras)", type=Path)
+    views = "views of a transforms.json, camera_path.json or COLMAP model (the training cameras)"
+    value("--cameras", "FILE", views, type=Path)
     value("--views", "A:B", "a slice of the views, as in Python", type=part)
     value("--size", "WxH", "size of the pictures (the cameras' own)", type=size)
     add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
@@ -138,14 +141,6 @@ def make_parser() -> argparse.ArgumentParser:
     value("--max-memory", "GB", MAX_MEMORY, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
     return parser
-
-
-def _bar(stage: str, done: int, total: int) -> None:
-    """A progress bar on stderr, if that is a terminal."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K[{'#' * (24 * done // total):24}] {stage} {done}/{total}")
-        sys.stderr.write("\n" if done == total else "")
-        sys.stderr.flush()
 
 
 def _sentence(summary: dict[str, Any]) -> str:

@@ -30,8 +30,8 @@ from exporters.surface.asset_surface import AssetSurface
 from exporters.surface.inner_region import inner_region
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.cameras.transforms import frame_names, read_cameras
-from player.cameras.views import asset_cameras
+from player.cameras.transforms import frame_names
+from player.cameras.views import asset_cameras, read_views
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
 from player.page.page import is_site_file
@@ -177,7 +177,7 @@ def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str
     """The cameras to render, and the names of their files: as `vfr-play` would call them."""
     width, height = asset.manifest.view_size
     given = options.cameras
-    cameras = asset_cameras(asset) if given is None else read_cameras(given, (width, height))
+    cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
     part = options.views or slice(None)
     cameras, names = cameras[part], frame_names(cameras)[part]
     return ([c.resized(*options.size) for c in cameras] if options.size else cameras), names

@@ -84,7 +84,8 @@ class ExportOptions:
     points: int | None = None
     """Points of a cloud."""
     cameras: Path | None = None
-    """A transforms.json with the views of the pictures; None is the training cameras."""
+    """Views of the pictures: a transforms.json, nerfstudio's camera_path.json or a COLMAP model; None is the
+    training cameras."""
     views: slice | None = None
     """The views to take; None is all."""
     size: tuple[int, int] | None = None

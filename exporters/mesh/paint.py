@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from exporters.extras import needs
-from exporters.shapes.colour import KnownColours, to_bytes
+from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from player.errors import DataError
+from player.files.images import to_8_bit
 
 _AT_ONCE = 1 << 22  # how many candidate texels are looked at together
 
@@ -55,7 +56,7 @@ def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints)
     if not known.any():
         raise DataError(f"--texture: expected colours on the surface, got none at {len(texels)} points")
     image = np.zeros((size, size, 3), np.uint8)
-    image.reshape(-1, 3)[texels[known]] = to_bytes(rgb[known])
+    image.reshape(-1, 3)[texels[known]] = to_8_bit(rgb[known])
     covered = np.zeros((size, size), bool)
     covered.reshape(-1)[texels[known]] = True
     return Texture(uvs.astype(np.float32), padded(image, covered))

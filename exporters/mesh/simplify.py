@@ -14,9 +14,9 @@ from __future__ import annotations
 import numpy as np
 
 from exporters.extras import needs, require_open3d
-from exporters.shapes.colour import to_bytes
 from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
 from player.errors import ConfigError, DataError
+from player.files.images import to_8_bit
 
 FIRST = 12
 """Edges are collapsed from this many times the faces that are asked for; what is finer is clustered first."""
@@ -66,7 +66,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     vertices = np.asarray(result.vertices)[used]
     faces = numbers.reshape(-1, 3).astype(np.int32)
     colours = np.empty((len(used), 4), np.uint8)
-    colours[:, :3] = to_bytes(np.asarray(result.vertex_colors)[used])
+    colours[:, :3] = to_8_bit(np.asarray(result.vertex_colors)[used])
     colours[:, 3] = _alpha(mesh, vertices)
     normals = unit_normals(np.asarray(result.vertex_normals)[used], vertices, faces, 1e-6)
     return TriangleMesh(vertices, faces, normals, colours)

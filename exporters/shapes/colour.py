@@ -39,12 +39,3 @@ def srgb_from_linear(linear: ArrayLike) -> np.ndarray:
     """
     value = np.asarray(linear, np.float64)
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0) ** (1 / 2.4) - 0.055)
-
-
-def to_bytes(srgb: np.ndarray) -> np.ndarray:
-    """uint8 values nearest to numbers in [0, 1], any shape; what lies outside is clipped, halves go to even.
-
-    >>> to_bytes(np.array([-0.1, 0.5, 1.0])).tolist()
-    [0, 128, 255]
-    """
-    return np.rint(np.clip(srgb, 0, 1) * 255).astype(np.uint8)

@@ -13,7 +13,7 @@ import numpy as np
 
 from exporters.mesh.rays import MeshRays
 from exporters.progress import Report
-from exporters.shapes.colour import KnownColours, to_bytes
+from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import Surface, TriangleMesh, take_faces
 from exporters.surface.components import remove_small_components
 from exporters.surface.depth_views import (
@@ -31,6 +31,7 @@ from exporters.surface.shaded_colours import surface_colours
 from exporters.surface.tsdf import fuse_depth
 from player.asset.asset import Asset
 from player.errors import DataError, MissingExtraError
+from player.files.images import to_8_bit
 
 FLOATER_FRACTION = 1e-4
 """Connected parts with a smaller share of the faces are floaters and go."""
@@ -126,7 +127,7 @@ class AssetSurface:
         rest = np.flatnonzero(~known)
         rgb[rest], known[rest] = self.shaded(mesh.vertices[rest], mesh.normals[rest])
         colours = mesh.colours.copy()
-        colours[:, :3] = to_bytes(rgb)
+        colours[:, :3] = to_8_bit(rgb)
         return replace(mesh, colours=_from_around(colours, known, mesh.faces))
 
     def _played(self, max_pixels: int) -> list[DepthView]:
