@@ -301,7 +301,8 @@ def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
     if psnr is not None:
         bar.close()
         unbounded = trainer.field.config.unbounded
-        text = expectation(psnr.every, seconds_a_step, trainer.pace.steps, trainer.minutes, unbounded)
+        length = trainer.pace.steps, trainer.minutes
+        text = expectation(psnr.every, trainer.seconds, seconds_a_step, *length, unbounded)
         print(f"vfr-train: {text}", file=sys.stderr)
 
 

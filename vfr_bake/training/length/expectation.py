@@ -28,18 +28,20 @@ def typical_step(ends: list[float]) -> float:
     return statistics.median(after - before for before, after in pairwise(ends))
 
 
-def expectation(psnr: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool) -> str:
-    """What to expect of a training that has `psnr` dB after EXPECTED_AT steps and ends after `n_steps` or
-    `minutes`.
+def expectation(
+    psnr: float, seconds: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool
+) -> str:
+    """What to expect of a training that has `psnr` dB after EXPECTED_AT steps, which took `seconds`, most of
+    them to compile code, and ends after `n_steps` or `minutes`.
 
-    >>> expectation(18.0, 0.025, 1_000_000, 10.0, False)
-    '25 ms a step: about 24,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
+    >>> expectation(18.0, 30.0, 0.025, 1_000_000, 10.0, False)
+    '25 ms a step: about 23,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
     """
-    possible = min(n_steps, round(60 * minutes / seconds_a_step))
+    possible = min(n_steps, EXPECTED_AT + round((60 * minutes - seconds) / seconds_a_step))
     doublings = max(0.0, math.log2(possible / EXPECTED_AT))
     low, high = (round(psnr + gain * doublings) for gain in DB_PER_DOUBLING[unbounded])
     rounded = round(possible, 1 - len(str(possible)) + 1)
-    taken = min(minutes, possible * seconds_a_step / 60)
+    taken = min(minutes, (seconds + max(possible - EXPECTED_AT, 0) * seconds_a_step) / 60)
     return (
         f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {taken:.2g} minutes at most, "
         f"which give scenes like this {low} to {high} dB"

@@ -94,9 +94,13 @@ def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.Mo
 
 
 def test_the_expectation_counts_the_steps_that_come_first() -> None:
-    assert "about 1,000 steps in 0.42 minutes" in expectation(18.0, 0.025, 1000, 10.0, True)
-    assert "about 400 steps" in expectation(18.0, 0.025, 400, 10.0, True)
-    assert "18 to 18 dB" in expectation(18.0, 0.025, 10, 10.0, True)
+    assert "about 1,000 steps in 0.42 minutes" in expectation(18.0, 10.0, 0.025, 1000, 10.0, True)
+    assert "about 400 steps" in expectation(18.0, 10.0, 0.025, 400, 10.0, True)
+    assert "18 to 18 dB" in expectation(18.0, 10.0, 0.025, 10, 10.0, True)
+
+
+def test_the_expectation_leaves_out_the_time_that_compiling_took() -> None:
+    assert "about 1,000 steps in 2 minutes" in expectation(18.0, 90.0, 0.05, 1_000_000, 2.0, False)
 
 
 def test_efforts_are_minutes_at_most() -> None:
