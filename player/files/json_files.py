@@ -24,16 +24,18 @@ def read_json(path: str | Path, what: str) -> bytes:
     return read_bytes(Path(path), what, MAX_FILE_BYTES)
 
 
-def parse_json(data: bytes, where: str, most_values: int = MOST_VALUES) -> Any:
-    """What the bytes say, if it is at most so many values; NaN and Infinity are not JSON. Raises FormatError.
+def parse_json(data: bytes, where: str) -> Any:
+    """What the bytes say, if it is at most MOST_VALUES values; NaN and Infinity are not JSON.
+
+    Raises FormatError.
 
     >>> parse_json(b"[1, NaN]", "numbers")
     Traceback (most recent call last):
     player.errors.FormatError: numbers: expected JSON, got NaN, which is not a number of JSON
     """
     n_values = 1 + sum(map(data.count, (b",", b"[", b"{")))
-    if n_values > most_values:
-        raise FormatError(f"{where}: expected at most {most_values} values in JSON, got about {n_values}")
+    if n_values > MOST_VALUES:
+        raise FormatError(f"{where}: expected at most {MOST_VALUES} values in JSON, got about {n_values}")
     try:
         return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:

@@ -167,7 +167,7 @@ class _Bake:
         with self._part("codes"):
             arrays = self._spend(weights, needed, teacher, tuning.ranges, len(head))
             level_steps = detail.level_steps(layout.played(arrays), self.config.max_loss_db)
-        manifest = self._manifest(layout, arrays, {}, level_steps)
+        manifest = self._manifest(layout, arrays, level_steps)
         del teacher, needed, layout  # what is written is played and meshed in their room
         with self._part("agreement"):
             manifest = replace(manifest, agreement=self._agreement(manifest, arrays, head, tuning.kept))
@@ -406,7 +406,7 @@ class _Bake:
             any_ranges = [(0.0, 1.0)] * (2 + len(weights.directional)) if self.choice.head_bits == 8 else None
             return head_onnx(weights, any_ranges)
 
-        manifest = self._manifest(layout, arrays, {}, (1,))
+        manifest = self._manifest(layout, arrays, (1,))
 
         def measure(width: int, n_fetches: int) -> float:
             with TemporaryDirectory() as folder:
@@ -416,9 +416,8 @@ class _Bake:
         same_head = self.config.head_width is not None or not self.choice.refine_steps
         return keep_to_time(self.choice, target_ms, measure, same_head, self.config.k != "auto")
 
-    def _manifest(
-        self, layout: Layout, arrays: GridArrays, figures: dict[str, Any], level_steps: tuple[int, ...]
-    ) -> Manifest:
+    def _manifest(self, layout: Layout, arrays: GridArrays, level_steps: tuple[int, ...]) -> Manifest:
+        """What a player needs to know; what the bake measures is added once it is known."""
         model = self.model
         camera = model.cameras[0]
         return Manifest(
@@ -442,7 +441,6 @@ class _Bake:
                 "bake": asdict(self.config) | asdict(self.choice),
                 "train": model.train,
                 "trained": model.figures,
-                "baked": figures,
             },
         )
 
