@@ -18,6 +18,9 @@ from exporters.formats.ply import read_ply
 from exporters.options import ExportOptions, check_options
 from player.app.option_types import part, size
 from player.asset.asset import Asset
+from player.cameras.nerfstudio import write_camera_path
+from player.cameras.transforms import frame_names
+from player.cameras.views import asset_cameras, read_views
 from player.errors import ConfigError, ParityError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -138,6 +141,19 @@ def test_read_only_folder_and_file(
         assert (locked / "old.stl").read_text() == "mine"
     finally:
         locked.chmod(0o755)
+
+
+def test_pictures_are_taken_from_a_camera_path_as_vfr_play_takes_them(
+    shells_asset: Path, tmp_path: Path
+) -> None:
+    cameras = [camera.resized(6, 4) for camera in asset_cameras(Asset.open(shells_asset))[:2]]
+    path = tmp_path / "camera_path.json"
+    path.write_bytes(write_camera_path(cameras, fps=30))
+    options = ["--format", "exr", "--cameras", str(path)]
+    assert cli.main([str(shells_asset), str(tmp_path / "frames"), *options]) == 0
+    names = [f"{name}.exr" for name in frame_names(read_views(path))]
+    assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == sorted(names)
+    assert len(names) == 2
 
 
 @pytest.mark.parametrize("kind", ["exr", "colmap"])
