@@ -23,6 +23,8 @@ SHORT = [
 
 N_WITNESSES = 15_000
 """A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
+N_RAYS, N_SEEING = 100_000, 500_000
+"""Fewer rays tell how much each stored value matters, and which cells are seen: minutes less."""
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +33,11 @@ def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("lego")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
+        patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
+        patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
         assert train_main([str(lego_400), str(out / "model.pt"), *SHORT]) == 0
-    arguments = [
-        str(out / "model.pt"),
-        str(out / "asset"),
-        "--mesh-resolution",
-        "64",
-        "--refine-steps",
-        "60",
-    ]
-    assert bake_main(arguments) == 0
+        settings = ["--mesh-resolution", "64", "--refine-steps", "60"]
+        assert bake_main([str(out / "model.pt"), str(out / "asset"), *settings]) == 0
     cameras = str(lego_400 / "transforms_test.json")
     options = ["--frames", "0:200:100", "--json", str(out / "play.json")]
     assert play([str(out / "asset"), "--cameras", cameras, "--output", str(out / "frames"), *options]) == 0

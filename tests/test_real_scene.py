@@ -36,15 +36,17 @@ TRAIN = [
     *("--n-levels", "8", "--max-resolution", "512", "--log2-table-size", "15", "--head-width", "32"),
 ]
 BAKE = [
-    *("--resolution", "192", "--feature-resolution", "128", "--refine-steps", "60", "--check-views", "1"),
+    *("--resolution", "192", "--feature-resolution", "128", "--refine-steps", "40", "--check-views", "1"),
     *("--mesh-resolution", "48", "--max-memory", "1.4", "--head-width", "0", "--weight-floor", "0.01"),
 ]
 
 N_WITNESSES = 15_000
 """A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
 N_RAYS = 20_000
-"""A fifth of the rays that tell how much each stored value matters: those of so young a model have a hundred
-samples."""
+"""Rays that tell how much each stored value matters, and what coarser levels show: those of so young a model
+have a hundred samples."""
+N_SEEING = 300_000
+"""Rays that tell which cells are seen, a tenth of all pixels."""
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,8 @@ def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
         patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
+        patch.setattr("vfr_bake.baking.detail.detail.N_COMPARED", N_RAYS)
+        patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
         assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
         assert bake_main([model, asset, *BAKE, "--json", str(out / "bake.json")]) == 0
     view = ["--view", "0", "--output", str(out / "view.png"), "--json", str(out / "play.json")]
