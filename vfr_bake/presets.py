@@ -96,7 +96,8 @@ PRESETS: dict[Preset, BakeChoice] = {
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
     "fidelity": {"refine_steps": 200, "feature_share": 1.0, "n_channels": 24},
     "balanced": {
-        "refine_steps": 1200,
+        "refine_steps": 1600,
+        "minutes": 10,
         "feature_share": 1.0,
         "n_channels": 24,
         "channel_loss_db": 0.03,

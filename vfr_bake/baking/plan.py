@@ -37,8 +37,11 @@ PROGRAM_BYTES = 800_000_000
 N_RAYS = 4_000_000
 """Rays that head and stored values are trained on, where there is memory for them: half of them meet
 something. The fewer they are, the more what is stored suits them alone."""
-UNBOUNDED_RAYS = 1_000_000
+UNBOUNDED_RAYS = 1_500_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
+RAYS_OF_DRAW, FEW_DRAWN = 2, 500_000
+"""Rays for each that the steps of refinement draw, at most: half of them meet something, so that each is
+drawn once. The least that this may leave: what is stored is chosen by some of them, too."""
 PHOTOGRAPHED = {False: 1 / 4, True: 1 / 2}
 """Share of the rays that go through training pixels, where the model has so many, by whether the scene is
 unbounded: as many as of the others meet something."""
@@ -81,9 +84,9 @@ REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_
 files; and by how much it is longer with the model's own head."""
 CHOSEN_COST = {False: 0.36, True: 0.12}
 """Time of a vertex when it is chosen what is stored of refined values, detail and codes, in the same unit."""
-COMPILE_SECONDS = 28.0
-"""Time in which the first bake after an installation compiles its code: make demo's takes 107 s in a fresh
-checkout, and 78 s in one that has baked before."""
+COMPILE_SECONDS = 45.0
+"""Time in which the first bake after an installation compiles its code: about half a minute of the bake of
+`make demo` with AVX-512, and a minute without."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ class Plan:
     """Bytes while it is decided which cells are stored; the room is not taken yet."""
     page_cells: float
     """Cells that fit into a page of the asset; infinitely many where the resolution was given."""
+    most_rays: int
+    """Training rays that refinement has use for."""
 
     @property
     def ray_bytes(self) -> int:
@@ -111,15 +116,14 @@ class Plan:
     def most_cells(self) -> int:
         """The number of cells that fit beside the rays that teach them. Where there is no room for all rays,
         they have a share of it: with few of them refinement gains little."""
-        every = (UNBOUNDED_RAYS if self.unbounded else N_RAYS) * self.ray_bytes
+        every = self.most_rays * self.ray_bytes
         rays = max(min(every, RAYS_SHARE * self.room), FEWEST_RAYS * self.ray_bytes)
         return int((self.room - rays) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
         """Training rays for so many cells, as many as they need and for which there is room beside them."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
-        most = UNBOUNDED_RAYS if self.unbounded else N_RAYS
-        return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, most))
+        return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, self.most_rays))
 
     @property
     def n_bytes(self) -> int:
@@ -143,7 +147,10 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     given = config.resolution or config.feature_resolution
     page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
-    plan = Plan(resolutions, _cells(model, coarse), cell_bytes, field.unbounded, room, marks, page_cells)
+    drawn = max(RAYS_OF_DRAW * choice.refine_steps * BATCH, FEW_DRAWN)
+    most_rays = min(UNBOUNDED_RAYS if field.unbounded else N_RAYS, drawn)
+    n_cells = _cells(model, coarse)
+    plan = Plan(resolutions, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
     plan = replace(plan, n_cells=min(plan.n_cells, max(plan.most_cells, 0), page_cells))
     if plan.most_cells <= 0 or marks > room:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)

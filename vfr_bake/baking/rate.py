@@ -49,7 +49,7 @@ from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_c
 
 RAYS_AT_ONCE = 1 << 12
 """Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
-N_RAYS = 1_000_000
+N_RAYS = 500_000
 """Rays that tell how much vertices change what is seen, at most: more of them tell it better."""
 AROUND: dict[Grid, float] = {"densities": 5.0, "features": 1.0}
 """What a vertex has more importance than those rays say, because others will meet it: a share of the mean

@@ -25,6 +25,7 @@ from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
     COMPILE_SECONDS,
+    FEW_DRAWN,
     FEWEST_RAYS,
     HEAD_COST,
     N_RAYS,
@@ -32,6 +33,7 @@ from vfr_bake.baking.plan import (
     OWN_REST_COST,
     PROGRAM_BYTES,
     RAYS_OF_CELL,
+    RAYS_OF_DRAW,
     STEP_COST,
     UNBOUNDED_RAYS,
     VERTEX_COST,
@@ -124,8 +126,9 @@ def test_less_memory_means_fewer_rays(model: Model) -> None:
 
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_as_many_cells_as_fit_leave_room_for_the_rays_that_teach_them(unbounded: bool, model: Model) -> None:
-    plan = replace(make_plan(model, BakeConfig(resolution=48)), unbounded=unbounded, cell_bytes=244.0)
     enough = UNBOUNDED_RAYS if unbounded else N_RAYS
+    plan = make_plan(model, BakeConfig(resolution=48))
+    plan = replace(plan, unbounded=unbounded, cell_bytes=244.0, most_rays=enough)
     for gigabytes in (1.0, 3.2, 12.0):
         room = replace(plan, room=1e9 * gigabytes)
         assert room.n_rays(room.most_cells) >= min(0.299e9 * gigabytes / room.ray_bytes, 0.999 * enough)
@@ -135,6 +138,11 @@ def test_as_many_cells_as_fit_leave_room_for_the_rays_that_teach_them(unbounded:
 def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:
     plan = make_plan(model, BakeConfig(resolution=48))
     assert [plan.n_rays(n) for n in (1e3, 5e5, 3e6)] == [FEWEST_RAYS, 5e5 * RAYS_OF_CELL, N_RAYS]
+
+
+def test_few_steps_are_given_no_more_rays_than_they_draw(model: Model) -> None:
+    found = [make_plan(model, BakeConfig(resolution=48, refine_steps=n)).n_rays(3e6) for n in (0, 100, 2000)]
+    assert found == [FEW_DRAWN, RAYS_OF_DRAW * 100 * BATCH, N_RAYS]
 
 
 def test_what_was_refined_is_gone_when_the_mesh_is_made(
