@@ -14,7 +14,6 @@ from player.compiled.march import enter
 from player.compiled.packets import N_SAMPLES, SUMS, TAU, march_packet_ways, place_fetches
 from player.compiling import compiled
 from player.march.fetches import Samples
-from player.march.path import Path, path_of
 from player.scratch import check_scratch, scratch
 
 F32 = np.float32
@@ -23,9 +22,8 @@ MOST_AT_ONCE = 1 << 20
 
 
 class PlacedSamples(NamedTuple):
-    """n rays and what they meet: a `player.march.march.SampledRays`, and where that is."""
+    """n rays and what they meet, as in `player.march.march.SampledRays`, and where that is."""
 
-    path: Path
     samples: Samples
     ways: np.ndarray
     tau: np.ndarray
@@ -62,10 +60,7 @@ def sample_rays(
         met.ray[:] += first
     met, tau, counts = zip(*parts, strict=True)
     ray, s, weights, ways, points = map(np.concatenate, zip(*met, strict=True))
-    path = path_of(grid, rays_o, rays_d)
-    return PlacedSamples(
-        path, Samples(ray, s, weights), ways, np.concatenate(tau), np.concatenate(counts), points
-    )
+    return PlacedSamples(Samples(ray, s, weights), ways, np.concatenate(tau), np.concatenate(counts), points)
 
 
 def _sample(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[_Met, np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ from player.compiled.samples import sample_rays
 from player.errors import TrainingError
 from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
 from player.march.march import MIN_OPACITY, MarchResult
+from player.march.path import path_of
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.kernels.stored_features import compose, composite, corner_rows, interpolate, padded, take_runs
@@ -316,7 +317,7 @@ class PlayerFetches(NamedTuple):
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
     `player.march.march` composes them with k = `n_fetches`."""
-    entries, samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
+    samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
     is_hit = np.zeros(len(opacity), bool)
@@ -327,7 +328,7 @@ def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_f
     ray, points, weights, lengths = (column[kept] for column in (samples.ray, places, samples.weights, ways))
     if merged.any():
         bins = equal_mass_bins(Samples(*(column[merged] for column in samples)), n_fetches)
-        at = np.ascontiguousarray(entries.at(bins.ray, bins.s).T)
+        at = np.ascontiguousarray(path_of(grid, rays_o, rays_d).at(bins.ray, bins.s).T)
         gaps = np.flatnonzero(~corners(grid.rows, at * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
         if len(gaps):
             at[gaps] = places[merged][heaviest(bins, gaps)]

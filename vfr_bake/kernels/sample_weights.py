@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from player.compiled.lanes import LANES
-from player.compiled.packets import march_packet, place_fetches
 from vfr_bake.kernels import njit
 
 BLOCKS = 4
@@ -11,30 +9,21 @@ BLOCKS = 4
 
 
 @njit(cache=True, error_model="numpy")
-def add_sample_weights(lookup, steps, packets, samples, sums, places, weights, totals):
-    """Add the weights of all samples of the rays in `packets` to `totals` [n_slots * BLOCKS**3] float64, at
-    the slot and the block of 2 x 2 x 2 cells of the finest level that each is in.
+def add_block_weights(points, weights, table, n_per_axis, resolution, totals):
+    """Add the `weights` [n] of samples to `totals` [n_slots * BLOCKS**3] float64, at the slot and the block
+    of 2 x 2 x 2 cells that each of `points` [n, 3] is in, cells of the finest level.
 
-    The grid has one level. `samples` [2, n, LANES], `sums`, `places` [3, LANES] and `weights` [LANES] float32
-    are worked in.
+    `table` is that of a grid of one level, `n_per_axis` bricks and `resolution` cells along an axis.
     """
-    last, n_per_axis = lookup.resolution - 1, lookup.n_per_axis
-    for number in range(len(packets)):
-        rows = march_packet(lookup, steps, packets, number, samples, sums)
-        for j in range(rows):
-            for lane in range(LANES):
-                weights[lane] = samples[1, j, lane]
-            place_fetches(steps, packets, number, samples, j * LANES, places, weights)
-            for lane in range(LANES):
-                if not weights[lane] > 0:
-                    continue
-                x = min(max(int(places[0, lane]), 0), last)
-                y = min(max(int(places[1, lane]), 0), last)
-                z = min(max(int(places[2, lane]), 0), last)
-                slot = lookup.table[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)] >> 3
-                if slot >= 0:  # a place found again may round to the brick beside its own
-                    block = ((x & 7) >> 1) * 16 + ((y & 7) >> 1) * 4 + ((z & 7) >> 1)
-                    totals[slot * 64 + block] += weights[lane]
+    last = resolution - 1
+    for i in range(len(weights)):
+        x = min(max(int(points[i, 0]), 0), last)
+        y = min(max(int(points[i, 1]), 0), last)
+        z = min(max(int(points[i, 2]), 0), last)
+        slot = table[((x >> 3) * n_per_axis + (y >> 3)) * n_per_axis + (z >> 3)] >> 3
+        if slot >= 0:  # a place found again may round to the brick beside its own
+            block = ((x & 7) >> 1) * 16 + ((y & 7) >> 1) * 4 + ((z & 7) >> 1)
+            totals[slot * 64 + block] += weights[i]
 
 
 @njit(cache=True)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import get_num_threads
 
 from player.asset.grid import SPARE, SparseGrid, brick_number, build_grid, vertex_rows
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
@@ -145,7 +146,7 @@ def samples_of(grid: SparseGrid, rays: TeacherRays) -> Iterator[Segments]:
     """The samples with weight of the rays, some rays at a time."""
     for first in range(0, len(rays.opacity), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
-        sampled = sample_rays(grid, rays.rays_o[some], rays.rays_d[some])
+        sampled = sample_rays(grid, rays.rays_o[some], rays.rays_d[some], get_num_threads())
         samples = sampled.samples
         weights = samples.weights.astype(np.float64)
         running = np.cumsum(weights)

@@ -17,19 +17,18 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numba import get_num_threads
 
 from player.asset.bricks import bricks_per_axis, dense_index, stored_bits
 from player.asset.grid import SparseGrid
 from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
-from player.compiled.lanes import LANES
-from player.compiled.march import enter
-from player.compiled.packets import SUMS
+from player.compiled.samples import sample_rays
 from vfr_bake.baking.cells import Progress
 from vfr_bake.baking.grids import Layout, Vertices
-from vfr_bake.kernels.sample_weights import BLOCKS, add_sample_weights
+from vfr_bake.kernels.sample_weights import BLOCKS, add_block_weights
 
-RAYS_AT_ONCE = 1 << 16
+RAYS_AT_ONCE = 1 << 14
 BRICKS_AT_ONCE = 1 << 12
 
 
@@ -50,11 +49,10 @@ def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress
         rays_o, rays_d = camera.resized(*size).rays()
         for first in range(0, len(rays_o), RAYS_AT_ONCE):
             rows = slice(first, first + RAYS_AT_ONCE)
-            lookup, steps, packets, most_samples = enter(grid, rays_o[rows], rays_d[rows])
-            samples = np.empty((2, most_samples, LANES), np.float32)
-            sums, places = np.empty((SUMS, LANES), np.float32), np.empty((3, LANES), np.float32)
-            weights = np.empty(LANES, np.float32)
-            add_sample_weights(lookup, steps, packets, samples, sums, places, weights, totals)
+            met = sample_rays(grid, rays_o[rows], rays_d[rows], get_num_threads())
+            add_block_weights(
+                met.points, met.samples.weights, grid.table, grid.n_per_axis, grid.resolution, totals
+            )
         progress(index + 1, len(cameras))
     return totals.reshape(-1, BLOCKS, BLOCKS, BLOCKS)
 
