@@ -26,6 +26,7 @@ from player.cameras.keyframes import camera_on_path
 from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
+from vfr_bake.data.threads import in_threads
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.length.witness_loss import Loss, WitnessLoss
 from vfr_bake.training.model_file import Model
@@ -49,6 +50,8 @@ RAYS_OF_A_VIEW = 20_000
 """Most rays of a view that is measured."""
 RAYS_BESIDE_WITNESSES = 5_000
 """The same where there are witnesses: with them there are about as many rays."""
+RAYS_AT_ONCE = 1 << 13
+"""Rays that a thread marches at a time."""
 N_DIRECTIONS = 6
 """Other directions from which a colour is looked at, to see whether it depends on them."""
 SEED = 2
@@ -276,7 +279,16 @@ class HeldOut:
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """What the player composes on the rays."""
-        return choose_march("auto")[1].march(grid, self.rays_o, self.rays_d, n_fetches)
+        march = choose_march("auto")[1].march
+
+        def some(first: int) -> MarchResult:
+            rows = slice(first, first + RAYS_AT_ONCE)
+            return march(grid, self.rays_o[rows], self.rays_d[rows], n_fetches)
+
+        firsts = range(0, len(self.rays_o), RAYS_AT_ONCE)
+        parts = in_threads(some, firsts, None)
+        hits = [first + part.hits for first, part in zip(firsts, parts, strict=True)]
+        return MarchResult(*map(np.concatenate, zip(*parts, strict=True)))._replace(hits=np.concatenate(hits))
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, and keep the result under `name`."""

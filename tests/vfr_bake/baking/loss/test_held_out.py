@@ -12,6 +12,8 @@ import pytest
 from player.asset.asset import Asset
 from player.files.images import to_8_bit
 from player.render import render
+from tests.player.march.pyramid_scene import random_scene
+from vfr_bake.baking import held_out
 from vfr_bake.baking.bake import BakeResult, bake
 from vfr_bake.baking.held_out import HeldOut, Shown, expected_loss
 from vfr_bake.config import BakeConfig
@@ -35,6 +37,16 @@ def quiet(*_: object) -> None:
 def baked(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BakeResult]:
     folder = tmp_path_factory.mktemp("baked") / "asset"
     return folder, bake(model, folder, SMALL, quiet)
+
+
+def test_rays_are_marched_in_parts_as_at_once(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, grid = HeldOut(model, 1), random_scene(40, 40, (1, 2), seed=3).grid
+    monkeypatch.setattr(held_out, "RAYS_AT_ONCE", len(shown.rays_o))
+    whole = shown.march(grid, 3)
+    assert len(whole.hits) > 1000
+    monkeypatch.setattr(held_out, "RAYS_AT_ONCE", 1000)
+    for name, a, b in zip(whole._fields, whole, shown.march(grid, 3), strict=True):
+        assert a.dtype == b.dtype and np.array_equal(a, b), name
 
 
 def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
