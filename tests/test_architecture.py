@@ -154,7 +154,12 @@ STARTERS = re.compile(
     r"|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*)\b|mp\.spawn"
 )
 """What starts an interpreter, or decides where one looks for modules."""
-SUBPROCESSES = {"player/proof.py", "exporters/mesh/unwrap.py", "vfr_bake/bench/process.py"}
+SUBPROCESSES = {
+    "player/proof.py",
+    "exporters/mesh/unwrap.py",
+    "vfr_bake/bench/process.py",
+    "vfr_bake/demo.py",
+}
 
 
 @pytest.mark.parametrize("path", [*MODULES, *sorted((REPOSITORY / "examples").glob("*.py"))], ids=str)
