@@ -48,16 +48,17 @@ def processors() -> list[str]:
     return [name for name, needs in NEEDS.items() if all(here.get(feature) for feature in needs)]
 
 
-def run(name: str, tests: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
-    """Run tests with numba compiling for the processor `name`."""
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {
-            "NUMBA_CPU_NAME": name,
-            "NUMBA_CPU_FEATURES": "",
-            "NUMBA_CACHE_DIR": cache,
-        }
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
-        return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+def environment_of(name: str, cache: str) -> dict[str, str]:
+    """The environment in which numba compiles for the processor `name`, and keeps the code in `cache`."""
+    settings = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": cache}
+    return dict(os.environ) | settings
+
+
+def run(name: str, tests: tuple[str, ...], cache: str) -> subprocess.CompletedProcess[str]:
+    """Run tests with numba compiling for the processor `name`, what is not in `cache` yet."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
+    environment = environment_of(name, cache)
+    return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
 
 
 def main() -> int:
@@ -69,7 +70,8 @@ def main() -> int:
     failed = 0
     for name in processors():
         begin = time.perf_counter()
-        done = run(name, tests)
+        with tempfile.TemporaryDirectory() as cache:
+            done = run(name, tests, cache)
         failed += done.returncode != 0
         last = (done.stdout.strip().splitlines() or ["no output"])[-1]
         sys.stdout.write(

@@ -14,7 +14,7 @@ from llvmlite import binding
 from player.compiled.lanes import LANES
 from player.compiled.processor import has_wide_registers, multiplies_bytes, multiplies_shorts, target
 from player.head.dense_tiles import MULTIPLIES_BYTES
-from tests.reliability.processors import REPOSITORY, SHORT, processors, run
+from tests.reliability.processors import REPOSITORY, SHORT, environment_of, processors, run
 
 ARM = "aarch64-unknown-linux-gnu"
 
@@ -90,12 +90,14 @@ def test_numba_s_own_settings_are_obeyed() -> None:
 
 
 @pytest.mark.parametrize("name", processors())
-def test_compiled_code_is_right_on_lesser_processors(name: str) -> None:
-    done = run(name, SHORT)
+def test_compiled_code_is_right_on_lesser_processors(name: str, tmp_path: Path, printed: Path) -> None:
+    cache = printed / "cache" if name == PRINTED_FOR else tmp_path
+    done = run(name, SHORT, str(cache))
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"\d\d+ passed", done.stdout) and "skipped" not in done.stdout
 
 
+PRINTED_FOR = "x86-64-v2"
 PRINTED = """
 import sys
 from pathlib import Path
@@ -126,21 +128,23 @@ for module in (head_compiled, march_compiled, pixels_compiled):
 """
 
 
-def test_code_for_arm_is_its_own(shells_folder: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def printed(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What numba hands to LLVM for PRINTED_FOR, a file for each function; the code is in "cache"."""
+    folder = tmp_path_factory.mktemp("printed")
+    subprocess.run(
+        [sys.executable, "-c", PRINTED, str(shells_folder), str(folder)],
+        env=environment_of(PRINTED_FOR, str(folder / "cache")), cwd=REPOSITORY, check=True,
+    )  # fmt: skip
+    return folder
+
+
+def test_code_for_arm_is_its_own(printed: Path) -> None:
     """What numba hands to LLVM, with vectors of eight, becomes code for AArch64: with its fused
     multiply-adds on registers, and with nothing that another processor has."""
-    environment = os.environ | {
-        "NUMBA_CPU_NAME": "x86-64-v2",
-        "NUMBA_CPU_FEATURES": "",
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-    }
-    subprocess.run(
-        [sys.executable, "-c", PRINTED, str(shells_folder), str(tmp_path)], env=environment, cwd=REPOSITORY,
-        check=True,
-    )  # fmt: skip
     machine = binding.Target.from_triple(ARM).create_target_machine(cpu="generic", features="+neon", opt=2)
     fused: dict[str, int] = {}
-    for path in tmp_path.glob("*.ll"):
+    for path in printed.glob("*.ll"):
         text = path.read_text()
         assert "llvm.x86" not in text
         text = re.sub(r"^target triple = .*$", f'target triple = "{ARM}"', text, flags=re.MULTILINE)
