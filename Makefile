@@ -24,7 +24,7 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium g
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check docs env format system-libraries other-programs clean benchmarks numerics \
+.PHONY: help demo test check docs env format system-libraries debian-programs other-programs clean benchmarks numerics \
   test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
 
 help:  ## say what there is
@@ -35,7 +35,9 @@ help:  ## say what there is
 demo: $(VENV)/.train  ## train on the built-in scene, bake it, play it: pictures and figures in demo/
 	$(BIN)/python -m vfr_bake.demo --output demo --force
 
-test: $(VENV)/.dev system-libraries other-programs check  ## style, types and tests
+# While pip installs, so does apt.
+test:  ## style, types and tests
+	$(MAKE) --jobs=2 check system-libraries other-programs
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/.dev  ## style and types alone
@@ -139,15 +141,18 @@ endef
 
 # Shell lines, not make functions: asked each time, because libraries come and go without a file that make could watch.
 # Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
-system-libraries: $(VENV)/.dev  ## install the system libraries that a test needs, or say which
+system-libraries:  ## install the system libraries that a test needs, or say which
 	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
 	missing=; for pair in $(SYSTEM_LIBRARIES); do \
-	  $(BIN)/python -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
+	  $(PYTHON) -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
 	    || missing="$$missing $${pair#*:}"; \
 	done; \
 	$(INSTALL_MISSING)
 
-other-programs: $(VENV)/.dev $(VENV)/.gltf-validator  ## install the programs that a test runs, or say which
+other-programs: debian-programs $(VENV)/.gltf-validator  ## install the programs that a test runs, or say which
+
+# After the libraries: apt does one thing at a time.
+debian-programs: system-libraries
 	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
 	missing=; for pair in $(OTHER_PROGRAMS); do \
 	  command -v $${pair%%:*} >/dev/null || missing="$$missing $${pair#*:}"; \
