@@ -17,7 +17,7 @@ from vfr_bake.training.tensor_files import read_tensors, write_tensors
 from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-checkpoint"
-VERSION = [1, 5]
+VERSION = [1, 6]
 LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that goes on."""
 SAME = 1e-4

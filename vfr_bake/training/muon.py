@@ -15,6 +15,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from vfr_bake.training.optimiser import Adam
+
 MOMENTUM = 0.95
 DECAY = 0.3
 """By so many times the rate a matrix shrinks in a step. Directions of no use would else stay as large as they
@@ -37,14 +39,13 @@ class Muon:
         self._groups = [[p for p in matrices if p.shape == shape] for shape in shapes]
         self._momenta = [torch.zeros(len(group), *group[0].shape) for group in self._groups]
         of_groups = {id(p) for p in matrices}
-        self._adam = torch.optim.Adam([p for p in every if id(p) not in of_groups], fused=True)
+        self._adam = Adam(p for p in every if id(p) not in of_groups)
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
         """Move everything along the gradients, and drop them."""
-        self._adam.param_groups[0]["lr"] = rate
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        self._adam.step(rate)
+        self._adam.clear()
         for group, momentum in zip(self._groups, self._momenta, strict=True):
             gradients = torch.stack([_gradient(p) for p in group])
             momentum.mul_(MOMENTUM).add_(gradients)

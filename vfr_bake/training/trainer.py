@@ -39,6 +39,7 @@ from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.optimiser import (
     BETAS,
     EPSILON,
+    Adam,
     DeviceGridAdam,
     FusedGridAdam,
     GridAdam,
@@ -140,9 +141,7 @@ class Trainer:
         self._next: Sampled | None = None
         """The rays and samples of the next step, if they have been taken."""
         self._parameters = [*self._field.network_parameters(), *self.pilot.parameters()]
-        self._adam = torch.optim.Adam(
-            self._parameters, lr=self.pace.network_rate, eps=EPSILON, betas=BETAS, fused=True
-        )
+        self._adam = Adam(self._parameters, BETAS, EPSILON)
 
     def _use_numba(self, scene: Scene) -> None:
         self._composite = composite
@@ -280,13 +279,11 @@ class Trainer:
             if regulariser is not None:
                 loss = loss + regulariser / max(n_rays, 1)
             # A batch that met nothing (seen by no process) has nothing to teach.
-            self._adam.zero_grad(set_to_none=True)
+            self._adam.clear()
             if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
             factor = rate_factor(step, progress)
-            for group in self._adam.param_groups:
-                group["lr"] = self.pace.network_rate * factor
-            self._adam.step()
+            self._adam.step(self.pace.network_rate * factor)
             for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
             if seen is not None:
@@ -439,7 +436,7 @@ class Trainer:
             "generator": self._generator.get_state(),
             "field": self._field.state_dict(),
             "pilot": self.pilot.state_dict(),
-            "adam": self._adam.state_dict(),
+            "adam": self._adam.state(),
             "grid_adam": self._grid_adam.state(),
             "guide": self._guide.state(),
             "witnesses": pixel_content(self.witnesses),
@@ -457,7 +454,7 @@ class Trainer:
         self._generator.set_state(state["generator"])
         self._field.load_state_dict(state["field"])
         self.pilot.load_state_dict(state["pilot"])
-        self._adam.load_state_dict(state["adam"])
+        self._adam.restore(state["adam"])
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
         self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.training.optimiser import FusedGridAdam, GridAdam, rate_factor
+from vfr_bake.training.optimiser import Adam, FusedGridAdam, GridAdam, rate_factor
 from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 
 
@@ -29,6 +33,43 @@ def test_alpha_blends_over_the_background() -> None:
     rgba = np.array([[255, 0, 0, 0], [255, 0, 0, 255], [0, 0, 0, 51]], np.uint8)
     out = over_background(rgba, np.array([0.0, 0.5, 1.0]))
     np.testing.assert_allclose(out, [[0, 0.5, 1], [1, 0, 0], [0, 0.4, 0.8]], atol=1e-6)
+
+
+def test_adam_is_torchs_and_goes_on_where_it_was() -> None:
+    """Also where a tensor has no gradient in some steps, as the pilot's has none once it is done."""
+    torch.manual_seed(0)
+    start = [torch.randn(7, 5), torch.randn(5), torch.randn(3)]
+    ours, theirs = ([tensor.clone().requires_grad_() for tensor in start] for _ in range(2))
+    adam, reference = Adam(ours, (0.9, 0.99), 1e-15), torch.optim.Adam(theirs, betas=(0.9, 0.99), eps=1e-15)
+    for step in range(6):
+        for number, (own, other) in enumerate(zip(ours, theirs, strict=True)):
+            own.grad = None if number == step % 4 else torch.randn_like(own)
+            other.grad = None if own.grad is None else own.grad.clone()
+        if step == 3:
+            state = copy.deepcopy(adam.state())
+            adam = Adam(ours, (0.9, 0.99), 1e-15)
+            adam.restore(state)
+        rate = 0.1 / (step + 1)
+        reference.param_groups[0]["lr"] = rate
+        adam.step(rate)
+        reference.step()
+    for own, other, before in zip(ours, theirs, start, strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-6)
+        assert not torch.equal(own, before)
+    adam.clear()
+    assert all(own.grad is None for own in ours)
+    adam.step(0.1)  # no gradient anywhere
+    with pytest.raises(ValueError, match=r"expected \[3\], got \[7, 5\]"):
+        Adam(ours[2:]).restore(Adam(ours[:1]).state())
+
+
+def test_a_start_does_not_import_torchs_compiler() -> None:
+    """It takes three seconds."""
+    program = (
+        "import sys, torch; from vfr_bake.training.optimiser import Adam; x = torch.ones(2); "
+        "x.grad = torch.ones(2); Adam([x]).step(0.1); assert 'torch._dynamo' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_grid_adam_is_adam_where_there_is_a_gradient() -> None:
