@@ -5,7 +5,8 @@ VENV ?= .venv
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check
+# Modules are compiled when they are first imported, which most never are: torch alone has 2,000.
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile
 # What is installed: `make test-lowest` has a file of its own.
 CONSTRAINTS ?= constraints.txt
 INPUTS := pyproject.toml $(CONSTRAINTS)
@@ -168,19 +169,19 @@ $(VENV)/.gltf-validator: $(VENV)/.dev
 
 # The stamps: an extra is installed again only when what it is installed from has changed.
 $(VENV)/.dev $(VENV)/.train $(VENV)/.release: $(VENV)/.%: $(VENV)/.torch $(INPUTS)
-	$(PIP) install --quiet -c $(CONSTRAINTS) -e '.[$*]'
+	$(INSTALL) -c $(CONSTRAINTS) -e '.[$*]'
 	@touch $@
 
 # The manual alone needs no torch.
 $(VENV)/.docs: $(BIN)/python $(INPUTS)
-	$(PIP) install --quiet -c $(CONSTRAINTS) -e '.[docs]'
+	$(INSTALL) -c $(CONSTRAINTS) -e '.[docs]'
 	@touch $@
 
 # torch alone and first: with a GPU from PyPI, else from TORCH_INDEX (one retry, then pip falls back to its other indexes).
 $(VENV)/.torch: $(BIN)/python $(CONSTRAINTS)
 	@if test "$$(uname -s)" != Linux || nvidia-smi >/dev/null 2>&1; then index=; \
 	else index="--retries 1 --extra-index-url $(TORCH_INDEX)"; fi; set -x; \
-	$(PIP) install --quiet --no-deps -c $(CONSTRAINTS) $$index torch
+	$(INSTALL) --no-deps -c $(CONSTRAINTS) $$index torch
 	@touch $@
 
 $(BIN)/python:
