@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -98,13 +100,18 @@ def bake_compiled_beside() -> Iterator[None]:
     if is_compiled():
         yield
         return
-    command = python_command("vfr_bake.rehearsal")
-    rehearsal = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        rehearsal.terminate()
-        rehearsal.wait()
+    with TemporaryDirectory() as folder:  # what is ended in the middle cannot remove its own files
+        rehearsal = subprocess.Popen(
+            python_command("vfr_bake.rehearsal"),
+            env=os.environ | {"TMPDIR": folder},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            yield
+        finally:
+            rehearsal.terminate()
+            rehearsal.wait()
 
 
 def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path) -> float:

@@ -14,12 +14,11 @@ import numpy as np
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
-from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import Model, trained_model
 from vfr_bake.training.trainer import Trainer
 
 RADIUS = 0.4
-"""Of the ball that is baked, in model units."""
+"""Radius of the ball that is baked, in model units."""
 CELLS = 32
 """Cells along an axis of what marks it and of what is stored."""
 LATER = 10
@@ -33,9 +32,7 @@ def untrained_model() -> Model:
     config = TrainConfig(device="cpu", field=options, occupancy_resolution=CELLS)
     model = trained_model(Trainer(scene, config), scene, {})
     middles = (np.indices((CELLS,) * 3) + 0.5) * 2 / CELLS - 1
-    sampler = model.sampler
-    assert isinstance(sampler, OccupancyGrid)
-    sampler.set_occupied(np.linalg.norm(middles, axis=0) < RADIUS)
+    model.occupancy.set_occupied(np.linalg.norm(middles, axis=0) < RADIUS)
     return model
 
 
