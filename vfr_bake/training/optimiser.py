@@ -86,12 +86,8 @@ class Adam:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` returned. Raises ValueError or RuntimeError if that is of other tensors."""
-        for own, kept in (
-            (self._means, state["means"]),
-            (self._squares, state["squares"]),
-            (self._counts, state["counts"]),
-        ):
-            for tensor, of_state in zip(own, kept, strict=True):
+        for name, tensors in self.state().items():
+            for tensor, of_state in zip(tensors, state[name], strict=True):
                 if tensor.shape != of_state.shape:
                     raise ValueError(f"expected {list(tensor.shape)}, got {list(of_state.shape)}")
                 tensor.copy_(of_state)
