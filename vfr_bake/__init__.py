@@ -12,3 +12,9 @@ __version__ = "0.1.0"
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+# numpy's matrix products have threads of their own, which wait for one another in a busy loop at every block.
+# Where another program wants the cores, each wait lasts until that has had its turn: products of 100,000 rows
+# took 5 s instead of 0.4. What there is to multiply with numpy is small; torch and numba have the large work.
+# OpenBLAS reads this once, when numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -82,12 +82,12 @@ class Camera:
         c2w[:3, :3] /= scale
         return replace(self, c2w=c2w)
 
-    def rays(self, start: int = 0, stop: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Rays through the pixel centres `start:stop` in row-major order.
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rays through the centres of all pixels in row-major order.
 
         Returns `rays_o`, `rays_d` [n_rays, 3] float32, `rays_d` of unit length.
         """
-        return self.rays_through(np.arange(start, self.width * self.height if stop is None else stop))
+        return self.rays_through(np.arange(self.width * self.height))
 
     def rays_through(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rays through the centres of `pixels` [n], numbers in row-major order; as `rays` returns them.

@@ -97,7 +97,7 @@ class BakeReport:
         titles = ["after", "dB to the model's pictures", f"{loss}, dB", "give or take, dB"]
         titles += ["samples a ray, median", "95th percentile"]
         stages = [
-            row(stage["name"], *(_number(stage[key], digits) for key, digits in columns.items()))
+            row(stage["name"], *(number(stage[key], digits) for key, digits in columns.items()))
             for stage in self.stages
         ]
         spread = f" (give or take {last['loss_db_spread']:.2f} dB)" if measured else ""
@@ -173,7 +173,8 @@ def bars(values: dict[str, float], unit: str, digits: int) -> str:
     return f'<svg width="{BAR_WIDTH + 320}" height="{height}" role="img">{"".join(rows)}</svg>'
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
+    """A number with so many decimals; nothing where there is none."""
     return "" if value is None else f"{value:.{digits}f}"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from vfr_bake.baking.report import page, row, table, title_row
+from vfr_bake.baking.report import number, page, row, table, title_row
 from vfr_bake.bench.plot import Mark, plot
 from vfr_bake.bench.result import Setting, Trade
 from vfr_bake.bench.timing import Size, Times
@@ -69,7 +69,7 @@ def table_lines(trade: Trade) -> list[str]:
 
 def _front_cells(setting: Setting, times: Times) -> list[str]:
     time = f"{times.median:.0f} ±{times.uncertainty:.0f}"
-    quality = [_number(setting.scores[key], SCORES[key]) for key in ("psnr", "loss_db", "ssim")]
+    quality = [number(setting.scores[key], SCORES[key]) for key in ("psnr", "loss_db", "ssim")]
     return [setting.name, *quality, time, f"{times.p95:.0f}", f"{setting.n_bytes / 1e6:.1f}"]
 
 
@@ -92,19 +92,15 @@ def _marks(trade: Trade, x: str) -> dict[str, list[Mark]]:
     return series
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
 def _settings_table(trade: Trade) -> str:
     titles = ["setting", "preset", "head", "cells", "channels", "PSNR", "loss", "SSIM", "LPIPS",
               "PSNR to model", "SSIM to model", "MB", "peak MB", "first picture, ms"]  # fmt: skip
     rows = [title_row(*titles)]
     for setting in trade.settings:
         made = [str(setting.what.get(key) or "") for key in ("preset", "head", "resolution", "n_channels")]
-        quality = [_number(setting.scores[key], digits) for key, digits in SCORES.items()]
-        cost = [_number(setting.n_bytes / 1e6, 1), _number(setting.peak_mb, 0)]
-        cells = [setting.name, *made, *quality, *cost, _number(setting.first_picture_ms, 0)]
+        quality = [number(setting.scores[key], digits) for key, digits in SCORES.items()]
+        cost = [number(setting.n_bytes / 1e6, 1), number(setting.peak_mb, 0)]
+        cells = [setting.name, *made, *quality, *cost, number(setting.first_picture_ms, 0)]
         rows.append(row(*cells, bold=setting.on_front))
     return table(rows)
 
@@ -115,7 +111,7 @@ def _times_table(trade: Trade, size: Size) -> str:
         times = setting.times[size]
         low, high = times.quartiles
         whole = [f"{times.median:.0f}", f"{times.p95:.0f}", f"{low:.0f} to {high:.0f}"]
-        parts = [_number(part, 0) for part in (times.march, times.lookups, times.head, times.rest)]
+        parts = [number(part, 0) for part in (times.march, times.lookups, times.head, times.rest)]
         cells = [*whole, *(parts if setting.asset is not None else [""] * len(parts))]
         rows.append(row(setting.name, *cells, bold=setting.on_front))
     return f"<h2>ms a frame at {size[0]}x{size[1]}</h2>{table(rows)}"

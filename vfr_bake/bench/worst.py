@@ -74,8 +74,8 @@ def _peaks(error: np.ndarray) -> list[tuple[int, int]]:
 
 def _ray(asset: Asset, camera: Camera, x: int, y: int) -> tuple[int, float, tuple[tuple[float, float], ...]]:
     """Samples with weight, opacity, and the heaviest samples of one pixel's ray."""
-    index = y * camera.width + x
-    rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays(index, index + 1)
+    index = np.array([y * camera.width + x])
+    rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays_through(index)
     path, samples, _, tau, _ = sample_rays(asset.grid, rays_o, rays_d)
     heaviest = np.argsort(-samples.weights, kind="stable")[:N_WEIGHTS]
     t = path.distances(samples.ray[heaviest], samples.s[heaviest]) * asset.scale

@@ -72,9 +72,9 @@ def test_blender_axes():
     assert top_left[0] < 0 < top_left[1] and top_left[2] < 0
 
 
-def test_a_slice_of_the_rays_is_that_slice():
+def test_the_rays_through_some_pixels_are_those_of_all():
     camera = Camera("a", POSE, 7, 5, 6.0, 8.0, 3.1, 2.7)
-    np.testing.assert_array_equal(camera.rays(9, 20)[1], camera.rays()[1][9:20])
+    np.testing.assert_array_equal(camera.rays_through(np.arange(9, 20))[1], camera.rays()[1][9:20])
 
 
 def test_resized_keeps_the_view():
