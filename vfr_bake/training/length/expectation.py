@@ -1,8 +1,8 @@
 """What a training is likely to reach, told from its first steps.
 
-PSNR grows by much the same number of decibels whenever the number of steps doubles, so that what a look after
-EXPECTED_AT steps finds can be carried forward. By how many decibels differs from scene to scene: the result
-is a range.
+What a training gains with each doubling of its steps gets less: it grows with the root of the number of
+doublings, so that what a look after EXPECTED_AT steps finds can be carried forward. How fast it grows differs
+from scene to scene: the result is a range.
 """
 
 from __future__ import annotations
@@ -13,9 +13,13 @@ from itertools import pairwise
 
 TIMED_FROM, EXPECTED_AT = 300, 400
 """The speed is that of the steps between these two: before them the pilot network learns."""
-DB_PER_DOUBLING = {False: (2.0, 2.9), True: (1.5, 2.7)}
-"""Gain in dB at the least and at the most, by whether the scene is unbounded: of lego and the built-in scene,
-and of fox and can, from 400 steps to the end of 2 to 10 minutes."""
+DB_OF_DOUBLINGS = {False: (5.0, 7.0), True: (1.5, 4.5)}
+"""Gain in dB at the least and at the most, times the root of the number of doublings, by whether the scene is
+unbounded. From 400 steps to the end of 2 to 12 minutes it was 5.6 with lego, 6.7 to 7.0 with the built-in
+scene, 4.1 with fox and 1.5 with can (docs/notes/2026-11-28-rays-and-steps.md)."""
+LATER_STEP = {False: 1.0, True: 0.45}
+"""How long steps take on the whole, in steps of that look: rays through contracted space have ever fewer
+samples as surfaces form."""
 
 
 def typical_step(ends: list[float]) -> float:
@@ -37,9 +41,10 @@ def expectation(
     >>> expectation(18.0, 30.0, 0.025, 1_000_000, 10.0, False)
     '25 ms a step: about 23,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
     """
+    seconds_a_step *= LATER_STEP[unbounded]
     possible = min(n_steps, EXPECTED_AT + round((60 * minutes - seconds) / seconds_a_step))
     doublings = max(0.0, math.log2(possible / EXPECTED_AT))
-    low, high = (round(psnr + gain * doublings) for gain in DB_PER_DOUBLING[unbounded])
+    low, high = (round(psnr + gain * math.sqrt(doublings)) for gain in DB_OF_DOUBLINGS[unbounded])
     rounded = round(possible, 1 - len(str(possible)) + 1)
     taken = min(minutes, (seconds + max(possible - EXPECTED_AT, 0) * seconds_a_step) / 60)
     return (
