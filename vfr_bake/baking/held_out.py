@@ -210,6 +210,13 @@ class HeldOut:
         first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
         return Loss(second - first, None)
 
+    def shows(self, after: Shown, db: float) -> bool:
+        """Whether it is shown that `after` loses more than `db` dB; without witnesses, whether it is
+        expected."""
+        if self._witnesses is None or self.own.errors is None or after.errors is None:
+            return self.lost(self.own, after).least > db
+        return self._witnesses.shows(self.own.errors, after.errors, db)
+
     def loss_of_change(self, before: Shown, after: Shown) -> float:
         """The dB that a small change of the pictures loses, such as rounding, which knows no photographs.
 

@@ -66,6 +66,7 @@ class WitnessLoss:
         """`background`: [3] in [0, 1], over which pictures are compared."""
         self._photographs = _levels(over_background(witnesses.rgba, background))
         views = witnesses.views()
+        self._view = views.copy()
         self.is_whole = is_whole = np.isin(views, witnesses.whole)
         """[n_witnesses] bool: which of them are of whole views."""
         if len(witnesses.whole) == 1:
@@ -101,6 +102,19 @@ class WitnessLoss:
             lost = _decibels(mean + change)
             variance += (len(lost) - 1) / len(lost) * float(((lost - lost.mean()) ** 2).sum())
         return Loss(float(_decibels(mean)), float(np.sqrt(variance)))
+
+    def shows(self, before: np.ndarray, after: np.ndarray, db: float) -> bool:
+        """Whether more than `db` is lost beyond chance: at all witnesses, and in the mean of the whole views,
+        if there are any. Single pixels alone do not show it: some of what training has learned beside them
+        no other view has.
+        """
+        if self.loss(before, after).least <= db:
+            return False
+        of_views = [
+            _decibels(np.array([errors[self._view == view].mean() for errors in (before, after)]))
+            for view in np.unique(self._view[self.is_whole])
+        ]
+        return not of_views or float(np.mean(of_views)) > db
 
     def described(self) -> str:
         """What is measured on, in a sentence."""
