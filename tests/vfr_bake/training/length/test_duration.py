@@ -118,7 +118,7 @@ def test_what_is_expected_is_what_was_reached(
     unbounded: bool,
     reached: float,
 ) -> None:
-    """Of trainings on two cores with AVX2, whose steps and PSNR on test views were measured."""
+    """Four trainings on two cores with AVX2: their steps and PSNR on test views were measured."""
     said = expectation(psnr, seconds, seconds_a_step, 1_000_000, minutes, unbounded)
     found = re.search(r"about ([\d,]+) steps .* (\d+) to (\d+) dB", said)
     assert found
