@@ -1,17 +1,18 @@
 """What pictures lose against photographs, by their errors at the witnesses (`vfr_bake.data.witnesses`).
 
 Letters: e is the mean square error of a witness over its three channels, between 8-bit pictures as in an
-evaluation; S and W are the means of e over the single pixels and over the pixels of whole views. What `after`
-loses compared with `before` is
+evaluation; S is the mean of e over the single pixels, and W_v that over the pixels of the whole view v. What
+`after` loses compared with `before` is
 
-    loss = 10 log10(E_after / E_before) dB,    E = 2/3 S + 1/3 W,
+    loss = 1/3 dB(S) + 2/3 mean_v dB(W_v),    dB(E) = 10 log10(E_after / E_before),
 
-the difference of two PSNRs. Where there is one kind only, E is its mean.
+differences of PSNRs, as test views are compared: a view with large errors counts for no more than another.
+Where there is one kind only, it has all of the weight.
 
-A bake adds much the same error to single pixels as to views that the model does not know, but the model's own
-error there is smaller: single pixels alone tell a larger loss than there is. Whole views have both errors as
-test views have them, but four views are few: one that is hard counts too much. The weights are those that
-came nearest to the loss on all test views, over several scenes (docs/notes/2026-11-23-witnesses.md).
+Single pixels tell a larger loss than there is: the model has learned the pixels beside them, and some of what
+it has learned no other view shows. Whole views are seen as test views are, but four views are few. The
+weights are those that came near to the loss on all test views, over several scenes
+(docs/notes/2026-11-23-witnesses.md).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from player.files.images import to_8_bit
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.scores.metrics import over_background
 
-SINGLE_WEIGHT = 2 / 3
+SINGLE_WEIGHT = 1 / 3
 """Weight of the single pixels, where there are whole views too."""
 BLOCKS_OF_A_VIEW = 16
 """Where there is one whole view, its pixels are as many runs of rows, each of which is left out once."""
@@ -66,7 +67,6 @@ class WitnessLoss:
         """`background`: [3] in [0, 1], over which pictures are compared."""
         self._photographs = _levels(over_background(witnesses.rgba, background))
         views = witnesses.views()
-        self._view = views.copy()
         self.is_whole = is_whole = np.isin(views, witnesses.whole)
         """[n_witnesses] bool: which of them are of whole views."""
         if len(witnesses.whole) == 1:
@@ -77,6 +77,9 @@ class WitnessLoss:
         self._kinds = [np.unique(self._block[kind]) for kind in (~is_whole, is_whole) if kind.any()]
         """The blocks of the single pixels, and those of whole views."""
         self._weights = (SINGLE_WEIGHT, 1 - SINGLE_WEIGHT) if len(self._kinds) == 2 else (1.0,)
+        several = len(witnesses.whole) > 1
+        self._by_view = [several and blocks is self._kinds[-1] for blocks in self._kinds]
+        """Whether the blocks of a kind are whole views, each of which has a loss of its own."""
         self._n = np.bincount(self._block, minlength=self._n_blocks)
 
     def errors(self, rgb: np.ndarray) -> np.ndarray:
@@ -89,32 +92,28 @@ class WitnessLoss:
         The spread is that of a jackknife: every view (or a part of the only whole view) is left out once,
         because errors within a view have much to do with each other.
         """
-        sums = np.stack([np.bincount(self._block, e, self._n_blocks) for e in (before, after)], axis=1)
-        mean, changes = np.zeros(2), []
-        for blocks, weight in zip(self._kinds, self._weights, strict=True):
-            total, n = sums[blocks].sum(axis=0), self._n[blocks].sum()
-            mean += weight * total / n
-            if len(blocks) > 1:
-                without = (total - sums[blocks]) / (n - self._n[blocks])[:, None]
-                changes.append(weight * (without - total / n))
-        variance = 0.0
-        for change in changes:
-            lost = _decibels(mean + change)
-            variance += (len(lost) - 1) / len(lost) * float(((lost - lost.mean()) ** 2).sum())
-        return Loss(float(_decibels(mean)), float(np.sqrt(variance)))
+        db, variance = 0.0, 0.0
+        for (lost, without), weight in zip(self._of_kinds(before, after), self._weights, strict=True):
+            db += weight * lost
+            changes = weight * (without - without.mean())
+            variance += (len(changes) - 1) / len(changes) * float((changes**2).sum())
+        return Loss(db, float(np.sqrt(variance)))
 
     def shows(self, before: np.ndarray, after: np.ndarray, db: float) -> bool:
         """Whether more than `db` is lost beyond chance: at all witnesses, and in the mean of the whole views,
         if there are any. Single pixels alone do not show it: some of what training has learned beside them
         no other view has.
         """
-        if self.loss(before, after).least <= db:
-            return False
-        of_views = [
-            _decibels(np.array([errors[self._view == view].mean() for errors in (before, after)]))
-            for view in np.unique(self._view[self.is_whole])
+        of_last_kind, _ = self._of_kinds(before, after)[-1]
+        return self.loss(before, after).least > db and of_last_kind > db
+
+    def _of_kinds(self, before: np.ndarray, after: np.ndarray) -> list[tuple[float, np.ndarray]]:
+        """For each kind its loss in dB, and [n_blocks] the losses without each of its blocks."""
+        sums = np.stack([np.bincount(self._block, e, self._n_blocks) for e in (before, after)], axis=1)
+        return [
+            _with_and_without(sums[blocks], self._n[blocks], by_view)
+            for blocks, by_view in zip(self._kinds, self._by_view, strict=True)
         ]
-        return not of_views or float(np.mean(of_views)) > db
 
     def described(self) -> str:
         """What is measured on, in a sentence."""
@@ -122,6 +121,23 @@ class WitnessLoss:
             f"The loss is measured on {len(self._photographs):,} pixels of the photographs that training did "
             "not learn from."
         )
+
+
+def _with_and_without(sums: np.ndarray, n: np.ndarray, by_view: bool) -> tuple[float, np.ndarray]:
+    """The loss in dB of some blocks, and [n_blocks] the losses without each of them.
+
+    Args:
+        sums: [n_blocks, 2] errors added up, before and after.
+        n: [n_blocks] how many there are of each.
+        by_view: whether it is the mean of their own losses, of two blocks and more, or that of all of
+            their pixels together.
+    """
+    if by_view:
+        each = _decibels(sums / n[:, None])
+        return float(each.mean()), (each.sum() - each) / (len(n) - 1)
+    total = sums.sum(axis=0)
+    left = np.maximum(n.sum() - n, 1)[:, None]
+    return float(_decibels(total / n.sum())), _decibels((total - sums) / left)
 
 
 def _levels(rgb: np.ndarray) -> np.ndarray:

@@ -70,11 +70,11 @@ def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
             shown = to_8_bit(picture.reshape(-1, 3)[witnesses.pixels[rows]]) / 255
             means[name][view in witnesses.whole].append(((shown - photograph) ** 2).mean(axis=1))
     errors = {
-        name: SINGLE_WEIGHT * np.concatenate(kinds[False]).mean()
-        + (1 - SINGLE_WEIGHT) * np.concatenate(kinds[True]).mean()
+        name: [np.concatenate(kinds[whole]).mean() for whole in (False, True)]
         for name, kinds in means.items()
     }
-    loss = 10 * np.log10(errors["asset"] / errors["model"])
+    lost = 10 * np.log10(np.divide(errors["asset"], errors["model"]))
+    loss = lost @ [SINGLE_WEIGHT, 1 - SINGLE_WEIGHT]
     assert abs(loss) > 0.05, "so few channels change the pictures"
     # A frame's rays are rounded otherwise, which moves single samples.
     assert result.loss.db == pytest.approx(loss, abs=0.01)

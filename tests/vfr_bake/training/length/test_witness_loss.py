@@ -34,27 +34,29 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
             part = place * BLOCKS_OF_A_VIEW // int((views == view).sum())
             blocks.setdefault(("whole", part), []).append(i)
 
-    def loss(left_out: tuple | None) -> float:
-        means = {}
-        for kind in ("single", "whole"):
-            rows = [i for key, rows in blocks.items() if key[0] == kind and key != left_out for i in rows]
-            if rows:
-                means[kind] = [math.fsum(e[i] for i in rows) / len(rows) for e in (before, after)]
-        if len(means) == 2:
-            first, second = (
-                SINGLE_WEIGHT * means["single"][k] + (1 - SINGLE_WEIGHT) * means["whole"][k] for k in (0, 1)
-            )
-        else:
-            ((first, second),) = means.values()
+    def lost(rows: list[int]) -> float:
+        first, second = (math.fsum(e[i] for i in rows) / len(rows) for e in (before, after))
         return 10 * math.log10(second / first)
+
+    def loss(left_out: tuple | None) -> float:
+        of_kind = {}
+        for kind in ("single", "whole"):
+            kept = [rows for key, rows in blocks.items() if key[0] == kind and key != left_out]
+            if kind == "whole" and len(witnesses.whole) > 1:
+                of_kind[kind] = math.fsum(map(lost, kept)) / len(kept)
+            elif kept:
+                of_kind[kind] = lost([i for rows in kept for i in rows])
+        if len(of_kind) == 2:
+            return SINGLE_WEIGHT * of_kind["single"] + (1 - SINGLE_WEIGHT) * of_kind["whole"]
+        return next(iter(of_kind.values()))
 
     variance = 0.0
     for kind in ("single", "whole"):
         keys = [key for key in blocks if key[0] == kind]
         if len(keys) > 1:
-            lost = [loss(key) for key in keys]
-            mean = sum(lost) / len(lost)
-            variance += (len(lost) - 1) / len(lost) * sum((each - mean) ** 2 for each in lost)
+            without = [loss(key) for key in keys]
+            mean = sum(without) / len(without)
+            variance += (len(keys) - 1) / len(keys) * sum((each - mean) ** 2 for each in without)
     return loss(None), math.sqrt(variance)
 
 
