@@ -12,9 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.cores import keep_to_a_share
-
-keep_to_a_share()
 # Before player is imported, here and in every process that a test starts: compiled code that writes beside
 # its arrays is found out (`player.scratch`).
 os.environ["VFR_CANARIES"] = "1"

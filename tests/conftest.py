@@ -11,7 +11,11 @@ import pytest
 from hypothesis import settings
 
 import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to wait)
+from tests.cores import keep_to_a_share
 from tests.numerics import bounds
+
+# Before torch and numba as well, which ask once how many cores there are.
+keep_to_a_share()
 
 # A deadline measures the machine, not the code.
 settings.register_profile("any_machine", deadline=None)

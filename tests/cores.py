@@ -17,9 +17,14 @@ EVERY = sorted(os.sched_getaffinity(0)) if CAN_CHOOSE else []
 
 
 def keep_to_a_share() -> None:
-    """Every n-th core, where there are n processes and as many cores."""
+    """Every n-th core, where there are n processes and as many cores.
+
+    Compiled code still has as many threads as there are cores in all: what they might do to each other is to
+    be found out.
+    """
     worker, n_workers = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
     if worker and n_workers and len(EVERY) >= int(n_workers):
+        os.environ.setdefault("NUMBA_NUM_THREADS", str(len(EVERY)))
         os.sched_setaffinity(0, EVERY[int(worker.removeprefix("gw")) % int(n_workers) :: int(n_workers)])
 
 
