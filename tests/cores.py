@@ -11,6 +11,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from player.threads import default_threads
+
 CAN_CHOOSE = hasattr(os, "sched_setaffinity")
 EVERY = sorted(os.sched_getaffinity(0)) if CAN_CHOOSE else []
 """The cores that this process found."""
@@ -40,3 +42,16 @@ def every_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, own)
+
+
+@contextmanager
+def a_thread_for_each_core() -> Iterator[None]:
+    """Compiled code that is called meanwhile has no more threads than this process has cores."""
+    import numba  # not before the cores are chosen
+
+    n_threads = numba.get_num_threads()
+    numba.set_num_threads(min(n_threads, default_threads()))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(n_threads)
