@@ -11,22 +11,15 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from player.threads import default_threads
-
 CAN_CHOOSE = hasattr(os, "sched_setaffinity")
 EVERY = sorted(os.sched_getaffinity(0)) if CAN_CHOOSE else []
 """The cores that this process found."""
 
 
 def keep_to_a_share() -> None:
-    """Every n-th core, where there are n processes and as many cores.
-
-    Compiled code still has as many threads as there are cores in all: what they might do to each other is to
-    be found out.
-    """
+    """Every n-th core, where there are n processes and as many cores."""
     worker, n_workers = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
     if worker and n_workers and len(EVERY) >= int(n_workers):
-        os.environ.setdefault("NUMBA_NUM_THREADS", str(len(EVERY)))
         os.sched_setaffinity(0, EVERY[int(worker.removeprefix("gw")) % int(n_workers) :: int(n_workers)])
 
 
@@ -42,16 +35,3 @@ def every_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, own)
-
-
-@contextmanager
-def a_thread_for_each_core() -> Iterator[None]:
-    """Compiled code that is called meanwhile has no more threads than this process has cores."""
-    import numba  # not before the cores are chosen
-
-    n_threads = numba.get_num_threads()
-    numba.set_num_threads(min(n_threads, default_threads()))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(n_threads)

@@ -12,7 +12,6 @@ from PIL import Image
 
 from exporters.cli import main as export
 from player.app.cli import main as play
-from tests.cores import a_thread_for_each_core
 from vfr_bake.cli import bake_main, eval_main, train_main
 from vfr_bake.training.scores.metrics import over_background, psnr
 
@@ -32,7 +31,7 @@ N_RAYS, N_SEEING = 100_000, 500_000
 def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Model, asset and frames of a shortened run."""
     out = tmp_path_factory.mktemp("lego")
-    with pytest.MonkeyPatch.context() as patch, a_thread_for_each_core():
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
         patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
         patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)

@@ -14,7 +14,6 @@ from player.app.cli import main as play
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
 from player.render import Renderer
-from tests.cores import a_thread_for_each_core
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
 from vfr_bake.rendering.render import render_image
@@ -55,7 +54,7 @@ def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Model, asset and one training view, played."""
     out = tmp_path_factory.mktemp("fox")
     model, asset = str(out / "model.pt"), str(out / "asset")
-    with pytest.MonkeyPatch.context() as patch, a_thread_for_each_core():
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
         patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
         patch.setattr("vfr_bake.baking.detail.detail.N_COMPARED", N_RAYS)

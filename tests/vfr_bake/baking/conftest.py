@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
-from tests.cores import a_thread_for_each_core
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
-
-
-@pytest.fixture(scope="module", autouse=True)
-def threads() -> Iterator[None]:
-    """A bake whose threads wait for each other on one core takes a third longer."""
-    with a_thread_for_each_core():
-        yield
 
 
 @pytest.fixture(scope="session")  # files of other folders may be run between two of this one

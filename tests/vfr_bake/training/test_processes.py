@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import pytest
 
+from tests.cores import every_core
+
 PROGRAM = """
 import json, sys
 import numba, torch
@@ -52,9 +54,10 @@ def curves(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, list[floa
     program, one, two = (folder / name for name in ("program.py", "one.json", "two.json"))
     program.write_text(PROGRAM)
     # The joint batch is cut into as many parts either way: two threads, or two processes of one.
-    subprocess.run([sys.executable, program, one, "2", *KINDS], check=True, timeout=600)
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    subprocess.run([*torchrun, program, two, "1", *KINDS], check=True, timeout=600)
+    with every_core():
+        subprocess.run([sys.executable, program, one, "2", *KINDS], check=True, timeout=600)
+        subprocess.run([*torchrun, program, two, "1", *KINDS], check=True, timeout=600)
     return [json.loads(path.read_text()) for path in (one, two)]
 
 
