@@ -122,7 +122,7 @@ def _core() -> list[Part]:
     balanced = "bake_lego_balanced"
     return [
         Part("compiled", compiled, 3.0),
-        *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 13.5), (CAN, 13.5), (DEMO, 10.0))),
+        *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 13.5), (CAN, 13.5), (DEMO, 2.5))),
         *(_score(*pair) for pair in ((LEGO, 4.0), (FOX, 3.5), (CAN, 8.5), (DEMO, 1.0))),
         *presets,
         *(_bake(f"bytes_lego_{mb}", "train_lego", 3.5, "--max-mb", mb) for mb in LIMITS_MB),

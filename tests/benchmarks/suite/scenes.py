@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.suite.work import Work
+from vfr_bake.demo import TRAIN_MINUTES
 
 SEED = 0
 """The commands' own."""
@@ -43,7 +44,7 @@ SCENES = {
         Scene("lego", "lego_400", 9.25),
         Scene("fox", "fox", reading=("--downscale", "2"), unbounded=True, size="540x960", views=4, frames=6),
         Scene("can", "can", unbounded=True, photographs_alone=True, size="720x1280", views=3, frames=6),
-        Scene("demo", "demo", 10),
+        Scene("demo", "demo", TRAIN_MINUTES),
     )
 }
 
