@@ -5,8 +5,8 @@
     python -m tests.benchmarks --list                 # all parts, and which of them are there
     python -m tests.benchmarks render                 # the pages alone
 
-Each part is recorded in docs/benchmarks.json when it has ended, or in docs/benchmarks_avx2.json where the
-processor has no AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
+Each part is recorded in docs/benchmarks.json when it has ended, or in docs/benchmarks_avx512.json where
+the processor has AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
 build/benchmarks. Before each part the machine has to be quiet: a part waits for that. Data sets lie in the
 folder that VFR_DATA names. Linux alone.
 """
@@ -22,7 +22,7 @@ from tests.benchmarks.pages.documents import render_all
 from tests.benchmarks.suite import conditions
 from tests.benchmarks.suite.little import write_data_sets
 from tests.benchmarks.suite.parts import PARTS
-from tests.benchmarks.suite.results import RESULTS, RESULTS_AVX2, read_results, results_path
+from tests.benchmarks.suite.results import RESULTS, RESULTS_AVX512, read_results, results_path
 from tests.benchmarks.suite.runner import Runner, Settings
 
 BUILD = conditions.REPOSITORY / "build"
@@ -93,7 +93,7 @@ def _list(missing: set[str]) -> int:
 
 
 def _render() -> int:
-    for path in render_all(read_results(RESULTS), read_results(RESULTS_AVX2)):
+    for path in render_all(read_results(RESULTS), read_results(RESULTS_AVX512)):
         print(path.relative_to(conditions.REPOSITORY))
     return 0
 

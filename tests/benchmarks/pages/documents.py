@@ -26,7 +26,7 @@ BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)"
 def rendered(text: str, results: Results, second: Results) -> str:
     """A document with its blocks made anew. Raises KeyError for a block that nobody knows.
 
-    `results`: of a processor with AVX-512; `second`: of one without.
+    `results`: of a processor without AVX-512; `second`: of one with it.
     """
 
     def block(found: re.Match[str]) -> str:

@@ -11,9 +11,9 @@ from player.files.files import write_bytes
 from tests.benchmarks.suite.conditions import REPOSITORY
 
 RESULTS = REPOSITORY / "docs" / "benchmarks.json"
-RESULTS_AVX2 = REPOSITORY / "docs" / "benchmarks_avx2.json"
+RESULTS_AVX512 = REPOSITORY / "docs" / "benchmarks_avx512.json"
 """Beside the pages that are rendered from them, so that the source package has all; the first is of
-processors with AVX-512, the second of those without."""
+processors without AVX-512, which most people have, the second of those with it."""
 KEYS = {
     *("commit", "date", "machine", "load_before", "load_after", "others_before", "others", "libraries"),
     *("seeds", "commands", "seconds", "figures"),
@@ -28,9 +28,9 @@ def results_path(machine: dict[str, Any]) -> Path:
     """The file for what is measured on such a machine.
 
     >>> results_path({"features": ["avx2", "avx512f"]}).name, results_path({"features": ["avx2"]}).name
-    ('benchmarks.json', 'benchmarks_avx2.json')
+    ('benchmarks_avx512.json', 'benchmarks.json')
     """
-    return RESULTS if "avx512f" in machine["features"] else RESULTS_AVX2
+    return RESULTS_AVX512 if "avx512f" in machine["features"] else RESULTS
 
 
 def read_results(path: Path = RESULTS) -> Results:
