@@ -274,7 +274,7 @@ def test_a_wrong_command_is_found(line: str) -> None:
         check_line(line)
 
 
-def _options_of(command: str) -> set[str]:
+def _help_of(command: str) -> str:
     from contextlib import redirect_stdout, suppress
     from io import StringIO
 
@@ -284,7 +284,26 @@ def _options_of(command: str) -> set[str]:
             exporters_cli.make_parser().parse_args(["--help"])
         else:
             PARSERS[command](["--help"])
-    return set(re.findall(r"--[a-z][a-z0-9-]+", out.getvalue()))
+    return out.getvalue()
+
+
+def _options_of(command: str) -> set[str]:
+    return set(re.findall(r"--[a-z][a-z0-9-]+", _help_of(command)))
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_the_help_has_examples_that_parse(command: str) -> None:
+    """Behind the command, two spaces or more apart, stands what it does."""
+    found = re.findall(rf"^  ({command} .+?)(?:  |$)", _help_of(command), re.MULTILINE)
+    assert len(found) >= 2
+    for line in found:
+        check_line(line)
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_the_help_has_no_word_of_python(command: str) -> None:
+    text = _help_of(command)
+    assert not re.search(r"\bNone\b|\bFalse\b|\(default: *\)", text)
 
 
 def test_options_in_sentences_exist() -> None:

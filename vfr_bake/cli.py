@@ -66,11 +66,12 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
     import tyro
 
     from vfr_bake import options as classes
-    from vfr_bake.option_types import registry
+    from vfr_bake.option_types import described, registry
 
-    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+    conf = tyro.conf
+    config = (conf.OmitArgPrefixes, conf.FlagCreatePairsOff, conf.PositionalMetavarFromFieldName)
     with registry():
-        return tyro.cli(getattr(classes, options), prog=name, args=argv, config=config)
+        return tyro.cli(described(getattr(classes, options)), prog=name, args=argv, config=config)
 
 
 def _train(options: Any) -> int:

@@ -195,8 +195,8 @@ EFFORT_MINUTES = {"draft": (2.0, 2.0), "good": (10.0, 12.0), "best": (60.0, 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of `vfr-train`. What is None follows from the device: the defaults of a CPU are made for two
-    cores, those of a GPU are the paper's."""
+    """Settings of the training. Those that are not given follow from the device: on a CPU they are made for
+    two cores, on a GPU they are the paper's."""
 
     kind: SceneKind = "auto"
     """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted. Auto: an object
@@ -306,7 +306,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
-    """Settings of `vfr-bake`; what is None follows from the preset (`choice`)."""
+    """Settings of the bake. Those that are not given follow from the preset."""
 
     preset: Preset = "balanced"
     """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: fewer

@@ -1,13 +1,21 @@
-"""Numbers on the command lines that `tyro` makes: their errors say what is expected."""
+"""Options of the command lines that `tyro` makes: how `--help` describes them, and errors of numbers that say
+what is expected."""
 
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from typing import Any, Literal, get_args, get_origin
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from player.app.option_types import number, whole
 
 _READERS = {int: ("INT", whole()), float: ("FLOAT", number("", "2.5"))}
+_METAVARS = {str: "NAME", float: "FLOAT"}
+_UNSAID = (None, False, (), MISSING)
+"""Defaults that the help does not give: its text says what happens without the option."""
 
 
 def registry() -> Any:
@@ -66,3 +74,46 @@ def _parts(kind: Any) -> tuple[type, tuple[str, ...]] | None:
     if len(numbers) != 1 or numbers[0] not in _READERS or get_origin(kind) is tuple:
         return None
     return numbers[0], tuple(words)
+
+
+@cache
+def described(options: type) -> type:
+    """The same dataclass of options, its help in whole paragraphs and without the word None.
+
+    tyro keeps the line breaks of attribute docstrings, and gives None as a value and as a default.
+    """
+    from docstring_parser import parse_from_object
+    from tyro.conf import arg
+
+    kinds = [kind for kind in reversed(options.__mro__) if is_dataclass(kind)]
+    told = {doc.arg_name: doc.description or "" for kind in kinds for doc in parse_from_object(kind).params}
+    hints = get_type_hints(options, include_extras=True)
+    for option in fields(options):
+        hint = hints[option.name]
+        if is_dataclass(hint):
+            described(hint)
+            continue
+        text = " ".join(told[option.name].split())
+        default = "" if option.default in _UNSAID else None
+        shown = arg(help=text, metavar=_metavar(hint), help_behavior_hint=default)
+        options.__annotations__[option.name] = Annotated[hint, shown]
+    return options
+
+
+def _metavar(kind: Any) -> str | None:
+    """What stands for the value of an option that may be None; None for other options, and for numbers.
+
+    >>> _metavar(Path | None), _metavar(Literal["alex", "vgg"] | None), _metavar(tuple[str, float] | None)
+    ('PATH', '{alex,vgg}', 'NAME FLOAT')
+    >>> _metavar(Path), _metavar(int | None)
+    (None, None)
+    """
+    parts = [part for part in get_args(kind) if part is not NoneType]
+    if len(parts) != 1 or NoneType not in get_args(kind):
+        return None
+    (part,) = parts
+    if get_origin(part) is Literal:
+        return "{" + ",".join(get_args(part)) + "}"
+    if get_origin(part) is tuple:
+        return " ".join(_METAVARS[some] for some in get_args(part))
+    return "PATH" if part is Path else None

@@ -14,15 +14,22 @@ from vfr_bake.config import BakeConfig, BenchConfig, TrainConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a Volume Feature Rendering field on posed photographs.
+    """Train a Volume Feature Rendering field on photographs.
 
     The model file holds everything that vfr-bake needs. Ctrl-C ends training early and keeps the model.
+
+    examples:
+      vfr-train photos/ model.pt                  estimate the cameras, and train for at most 12 minutes
+      vfr-train photos/ --check                   are the pictures good enough? Ten seconds, no training
+      vfr-train photos/ model.pt --effort draft   two minutes, for a first look
+      vfr-train photos/ model.pt --preview        and write a picture every minute
+      vfr-train photos/ model.pt --resume         go on where an interrupted run stopped
     """
 
     data: Positional[str]
-    """Folder with transforms_train.json (NeRF-synthetic), transforms.json or a COLMAP model (sparse/0), or
-    `demo` for the built-in scene; a folder of photographs, a ZIP of them or a video without cameras has them
-    estimated first."""
+    """A folder of photographs, a ZIP of them or a video, whose cameras are estimated first; or a folder with
+    cameras: transforms_train.json (NeRF-synthetic), transforms.json or a COLMAP model (sparse/0); or `demo`,
+    the built-in scene."""
     model: Positional[Path | None] = None
     """The model file to write, for example model.pt; none with --check."""
     check: bool = False
@@ -50,8 +57,13 @@ class Bake:
     """Bake a trained model into an asset: sparse 8-bit grid, ONNX head and mesh, played by vfr-play on any
     CPU.
 
-    The data set is not needed; the model file holds the training cameras. `vfr-bake --convert old/ new/`
-    rewrites an asset of an earlier version of the format without its model.
+    The data set is not needed; the model file holds the training cameras.
+
+    examples:
+      vfr-bake model.pt out/                   small and quick to play
+      vfr-bake model.pt out/ --preset phone    the fewest bytes, for pages on phones
+      vfr-bake model.pt out/ --max-mb 5        as good as five megabytes allow
+      vfr-bake --convert old/ new/             rewrite an asset of an earlier version of the format
     """
 
     model: Positional[Path]
@@ -72,7 +84,12 @@ class Bake:
 @dataclass(frozen=True, kw_only=True)
 class Eval:
     """Render the test views with the full model and compare them with the photographs, over the
-    model's background."""
+    model's background.
+
+    examples:
+      vfr-eval model.pt photos/
+      vfr-eval model.pt photos/ --pictures views/    and look at every view beside its photograph
+    """
 
     model: Positional[Path]
     """A model file written by vfr-train."""
@@ -96,6 +113,10 @@ class Bench(BenchConfig):
     lookups a ray.
 
     Prints the Pareto front, with the commands that bake and play its settings, and what to choose.
+
+    examples:
+      vfr-bench out/ --data photos/
+      vfr-bench out/ fast/ --data photos/ --model model.pt --html trade.html
     """
 
     assets: Positional[tuple[Path, ...]]
