@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,14 +111,29 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-
-    def value(name: str, metavar: str, text: str, **kind: Any) -> None:
-        add(name, metavar=metavar, help=text, **kind)
-
     add("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
     add("file", type=Path, metavar="FILE", help="file or folder to write: " + ", ".join(FORMATS) + ", DIR/")
-    value("--format", "NAME", "exr, colmap or web for a folder; or a suffix without its dot")
+    _value(parser, "--format", "NAME", "exr, colmap or web for a folder; or a suffix without its dot")
     add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
+    add("--force", action="store_true", help="replace FILE if it exists")
+    _value(parser, "--max-memory", "GB", MAX_MEMORY, type=gigabytes)
+    add("--json", action="store_true", help="print the summary as one line of JSON")
+    _add_shapes(parser.add_argument_group("meshes, points and volumes"))
+    _add_pictures(parser.add_argument_group("pictures and cameras"))
+    add = parser.add_argument_group("the head").add_argument
+    add("--decode", action="store_true", help="take 8-bit codes and weights instead of features")
+    pages = parser.add_argument_group("pages")
+    most = "megabytes of graphics memory that a page may take (512)"
+    _value(pages, "--max-gpu-mb", "N", most, type=whole(example=256))
+    return parser
+
+
+def _value(group: argparse._ActionsContainer, name: str, metavar: str, text: str, **kind: Any) -> None:
+    group.add_argument(name, metavar=metavar, help=text, **kind)
+
+
+def _add_shapes(group: argparse._ArgumentGroup) -> None:
+    value, add = partial(_value, group), group.add_argument
     value("--crop", "X,Y,Z,W,D,H[,YAW]", "only what is in this box of the world; or a .json file")
     faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
     value("--faces", "N", "simplify the mesh to N faces, or as few as can be reached", type=faces)
@@ -129,18 +145,17 @@ def make_parser() -> argparse.ArgumentParser:
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
     value("--time-limit", "S", "seconds that laying out a texture may take (300)", type=seconds)
     value("--points", "N", f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})", type=cloud)
+    add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
+
+
+def _add_pictures(group: argparse._ArgumentGroup) -> None:
+    value = partial(_value, group)
     views = "views of a transforms.json, camera_path.json or COLMAP model (the training cameras)"
     value("--cameras", "FILE", views, type=Path)
-    value("--views", "A:B", "a slice of the views, as in Python", type=part)
+    value("--views", "A:B", "only these of the views, as a slice in Python", type=part)
     value("--size", "WxH", "size of the pictures (the cameras' own)", type=size)
-    add("--half", action="store_true", help="16 bits for colour, normals and features; places stay float")
-    add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
-    add("--decode", action="store_true", help="ONNX: take 8-bit codes and weights instead of features")
-    value("--max-gpu-mb", "N", "page: graphics memory that it may take (512)", type=whole(example=256))
-    add("--force", action="store_true", help="replace FILE if it exists")
-    value("--max-memory", "GB", MAX_MEMORY, type=gigabytes)
-    add("--json", action="store_true", help="print the summary as one line of JSON")
-    return parser
+    half = "16 bits for colour, normals and features; places stay float"
+    group.add_argument("--half", action="store_true", help=half)
 
 
 def _sentence(summary: dict[str, Any]) -> str:

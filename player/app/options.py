@@ -177,36 +177,48 @@ def make_parser() -> argparse.ArgumentParser:
         type=asset_folder,
         nargs="*",
         metavar="asset",
-        help="more of them, to switch to in the viewer",
+        help="more folders, whose assets the viewer can switch to",
     )
     views = parser.add_argument_group("views").add_mutually_exclusive_group()
     views.add_argument(
         "--cameras",
         type=Path,
         metavar="FILE",
-        help="those of a transforms.json, a nerfstudio camera_path.json or a COLMAP folder",
+        help="the views of a transforms.json, a nerfstudio camera_path.json or a COLMAP folder",
     )
     views.add_argument(
         "--orbit", type=whole(1, MOST_VIEWS, 60), metavar="N", help="a turn around the scene in N pictures"
     )
     views.add_argument(
-        "--view", type=whole(example=3), metavar="N", help="training view N, from 0; -1 is the last one"
+        "--view",
+        type=whole(example=3),
+        metavar="N",
+        help="one of the training views, from 0; -1 is the last one",
     )
     views.add_argument("--info", action="store_true", help="no view: say what is in the asset")
     views.add_argument("--check", action="store_true", help="no view: compare every file with its checksum")
     _add_files(parser.add_argument_group("files"))
     add = parser.add_argument_group("pictures").add_argument
-    add("--size", type=size, metavar="WxH", help="their size (the camera file's, else as trained)")
+    add("--size", type=size, metavar="WxH", help="size of the pictures (the camera file's, else as trained)")
     add(
         "--background",
         type=background,
         metavar="COLOUR",
         help="white, black, transparent or R,G,B in 0..255",
     )
-    add("--samples", type=whole(0), metavar="K", help="fetches a ray (the asset's own); 0: at every sample")
+    add(
+        "--samples",
+        type=whole(0),
+        metavar="K",
+        help="feature lookups a ray (the asset's own number); 0: one at every sample",
+    )
     add("--quality", choices=("exact", "high", "fast"), help=QUALITY)
-    add("--threads", type=positive, metavar="N", help="threads (one for each core)")
-    add("--march", choices=("auto", "numpy", "numba"), help="implementation (numba if there)")
+    add("--threads", type=positive, metavar="N", help="threads of the processor (one for each core)")
+    add(
+        "--march",
+        choices=("auto", "numpy", "numba"),
+        help="what rays are marched with (numba if it is installed)",
+    )
     add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
     add = parser.add_argument_group("viewer").add_argument
     add("--host", metavar="ADDRESS", help="address to serve at (127.0.0.1: this machine alone)")
@@ -217,8 +229,8 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_files(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add("--output", type=Path, metavar="PATH", help="folder, or one picture (.png, .webp), or a video (.mp4)")
-    add("--format", choices=("png", "webp"), help="of the pictures in a folder (png)")
-    add("--frames", type=part, metavar="A:B", help="a slice of the views, as in Python")
+    add("--format", choices=("png", "webp"), help="format of the pictures in a folder (png)")
+    add("--frames", type=part, metavar="A:B", help="only these of the views, as a slice in Python")
     add(
         "--fps",
         type=number("frames a second", "30", 0, 1000),
@@ -226,8 +238,8 @@ def _add_files(group: argparse._ArgumentGroup) -> None:
         help="frames a second of a video (the camera path's, else 30)",
     )
     add("--resume", action="store_true", help="go on where an interrupted run with these options stopped")
-    add("--force", action="store_true", help="replace what is there")
-    add("--json", metavar="FILE", help="write figures as JSON; - is standard output")
+    add("--force", action="store_true", help="replace files that exist")
+    add("--json", metavar="FILE", help="also write times and counts as JSON; - is standard output")
     add("--dask", metavar="ADDRESS", help="render on the Dask cluster whose scheduler is at tcp://HOST:PORT")
 
 
