@@ -32,7 +32,7 @@ DIALS = {
 MINUTES = (1.0, 2.0, 5.0)
 """Shorter trainings of lego."""
 SEEDS = (0, 1, 2)
-REFINED_AT = {"every": "0", "k3": "3", "k5": "5", "k8": "8"}
+REFINED_AT = {"every": "0", "k5": "5"}
 """Numbers of lookups that the assets of the part `lookups` are baked and refined for; 0: every sample."""
 
 
