@@ -199,12 +199,16 @@ def presets(results: Results) -> list[str]:
 
 
 def curve(results: Results) -> list[str]:
-    names = [*(f"bytes_lego_{mb}" for mb in LIMITS_MB), "bake_lego_balanced"]
+    """Loss against bytes: the presets, and what limits on the size give."""
+    names = [
+        *(f"bytes_lego_{mb}" for mb in LIMITS_MB),
+        *(f"bake_lego_{preset}" for preset in PRESETS["lego"]),
+    ]
     there, lacking = present(results, names)
     rows = []
     for name in sorted(there, key=lambda name: results[name]["figures"]["n_bytes"]):
         found = results[name]["figures"]
-        asked = f"at most {name.rpartition('_')[2]} MB" if name.startswith("bytes") else "no limit"
+        asked = f"`{'--max-mb' if name.startswith('bytes') else '--preset'} {name.rpartition('_')[2]}`"
         row = [asked, where(results, name), megabytes(found["n_bytes"])]
         row += [f"{found['resolution']}, {found['feature_resolution']}", f"{found['n_channels']}"]
         lost = give_or_take(found["loss_db"], found["loss_db_spread"], 2)

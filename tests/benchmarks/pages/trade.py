@@ -51,11 +51,11 @@ WISHES = (
         lambda row, ms: (ms, row["n_bytes"]),
     ),
     Wish(
-        "moving around: 10 frames a second",
-        lambda row, ms: ms <= 100,
+        "moving around: 5 frames a second",
+        lambda row, ms: ms <= 200,
         lambda row, ms: (_loss(row), ms),
     ),
-    Wish("moving smoothly: 25 frames a second", lambda row, ms: ms <= 40, lambda row, ms: (_loss(row), ms)),
+    Wish("moving smoothly: 10 frames a second", lambda row, ms: ms <= 100, lambda row, ms: (_loss(row), ms)),
     Wish(
         "a small download: at most 3 MB",
         lambda row, ms: row["n_bytes"] <= 3e6,
