@@ -14,8 +14,6 @@ from player.app.option_types import number, whole
 
 _READERS = {int: ("INT", whole()), float: ("FLOAT", number("", "2.5"))}
 _METAVARS = {str: "NAME", float: "FLOAT"}
-_UNSAID = (None, False, (), MISSING)
-"""Defaults that the help does not give: its text says what happens without the option."""
 
 
 def registry() -> Any:
@@ -78,9 +76,10 @@ def _parts(kind: Any) -> tuple[type, tuple[str, ...]] | None:
 
 @cache
 def described(options: type) -> type:
-    """The same dataclass of options, its help in whole paragraphs and without the word None.
+    """The dataclass of options itself, annotated so that its help has whole paragraphs and no word None.
 
-    tyro keeps the line breaks of attribute docstrings, and gives None as a value and as a default.
+    tyro keeps the line breaks of attribute docstrings, and gives None as a value and as a default. Where the
+    default is None, False or nothing, the text alone says what happens without the option.
     """
     from docstring_parser import parse_from_object
     from tyro.conf import arg
@@ -94,8 +93,8 @@ def described(options: type) -> type:
             described(hint)
             continue
         text = " ".join(told[option.name].split())
-        default = "" if option.default in _UNSAID else None
-        shown = arg(help=text, metavar=_metavar(hint), help_behavior_hint=default)
+        is_said = option.default is not False and option.default not in (None, (), MISSING)
+        shown = arg(help=text, metavar=_metavar(hint), help_behavior_hint=None if is_said else "")
         options.__annotations__[option.name] = Annotated[hint, shown]
     return options
 

@@ -84,6 +84,7 @@ def test_the_help_names_the_defaults_that_hold(
         f"GPU {gpu.network_rate:g}, as in the paper, CPU {cpu.network_rate:g}.",
         f"Adam learning rate of the hash grids; {cpu.grid_rate:g}.",
         f"objects {cpu.distortion:g}, within a hundredth of the box; scenes {scenes.distortion:g},",
+        f"Seed of every random number. (default: {TrainConfig().seed})",
     ):
         assert text.replace(" ", "") in said, text
 
