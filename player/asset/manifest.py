@@ -77,7 +77,7 @@ MAX_VALUES = 1 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_LEVEL_STEP = 128
-AGREEMENT = {False: (20.0, 40.0), True: (16.0, 40.0)}
+AGREEMENT = {False: (20.0, 40.0), True: (14.0, 40.0)}
 """`agreement` where it is absent, by `contracted`."""
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
