@@ -130,16 +130,16 @@ def _core() -> list[Part]:
         *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 12.5), (CAN, 13.5), (DEMO, 2.5))),
         *(_score(*pair) for pair in ((LEGO, 2.5), (FOX, 1.5), (CAN, 4.0), (DEMO, 0.5))),
         *presets,
-        _trade("trade_lego", LEGO, bakes(LEGO), 8.0),
-        _trade("trade_fox", FOX, bakes(FOX), 4.5),
-        _trade("trade_can", CAN, bakes(CAN), 4.0),
+        _trade("trade_lego", LEGO, bakes(LEGO), 9.0),
+        _trade("trade_fox", FOX, bakes(FOX), 6.0),
+        _trade("trade_can", CAN, bakes(CAN), 6.5),
         _trade("trade_demo", DEMO, bakes(DEMO), 1.5),
         *(
             _play(scene, name, of)
             for scene in (LEGO, FOX)
             for name, of in zip(plays(scene), bakes(scene), strict=True)
         ),
-        Part("export_lego", partial(played.exports, asset_of=balanced), 8.5, (balanced,)),
+        Part("export_lego", partial(played.exports, asset_of=balanced), 6.5, (balanced,)),
         *(Part(name, partial(played.page, asset_of=of), 1.0, (of,)) for name, of in PAGES.items()),
     ]
 

@@ -32,8 +32,8 @@ class Scene:
     """Whether its cameras are left out and estimated."""
     size: str = "800x800"
     """Pixels of the frames that are timed."""
-    views: int = 8
-    """Test views of which the trade is measured."""
+    views: int = 25
+    """Test views of which the trade is measured, at most."""
     frames: int = 12
     """Timed frames of a setting, with which the trade's median is known."""
 
@@ -42,8 +42,8 @@ SCENES = {
     scene.name: scene
     for scene in (
         Scene("lego", "lego_400", 9.25),
-        Scene("fox", "fox", reading=("--downscale", "2"), unbounded=True, size="540x960", views=4, frames=6),
-        Scene("can", "can", unbounded=True, photographs_alone=True, size="720x1280", views=3, frames=6),
+        Scene("fox", "fox", reading=("--downscale", "2"), unbounded=True, size="540x960", frames=6),
+        Scene("can", "can", unbounded=True, photographs_alone=True, size="720x1280", frames=6),
         Scene("demo", "demo", TRAIN_MINUTES),
     )
 }
