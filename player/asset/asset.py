@@ -231,7 +231,7 @@ class _Opening:
             if self._verify or not parts.n_read:
                 raise
             missing = f"{error}: shown as the first {parts.n_read} of {len(manifest.parts)} parts have it"
-        arrays = GridArrays(parts.values("densities"), parts.values("features"))
+        arrays = GridArrays(*parts.values())
         return Asset(folder, manifest, arrays, parts.n_read, missing)
 
 

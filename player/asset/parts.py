@@ -8,10 +8,11 @@ corners. No more than that is ever decoded, whatever a file holds.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
 from player.threads import default_threads
+
+T = TypeVar("T")
 
 LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127, 127)}
 """The lowest and the highest code of a value."""
@@ -79,7 +82,8 @@ class PyramidReader:
         """The rows of a level that is there; before its symbols are read, which it makes room for."""
         rows = level_rows(self.pyramid.vertices[level])
         if not len(self._symbols[level]):
-            self._symbols[level] = np.zeros((rows.neighbours.n, self.n_channels), np.int16)
+            shape = (rows.neighbours.n, self.n_channels)
+            self._symbols[level] = np.zeros(shape, np.int16, order="F")  # as they are decoded
         return rows
 
     def read_symbols(self, stored: StoredSection, rows: LevelRows) -> None:
@@ -144,6 +148,12 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     return max(decoding, kept + tables + max(densities_built, features_built))
 
 
+def _of_both(work: Callable[[Grid], T]) -> list[T]:
+    """What `work` gives for the densities and for the features, at the same time."""
+    with ThreadPoolExecutor(min(len(GRIDS), default_threads())) as pool:
+        return list(pool.map(work, GRIDS))
+
+
 class PartsReader:
     """The parts of an asset, read one after another."""
 
@@ -170,33 +180,58 @@ class PartsReader:
         allowed = self._allowed - self._taken
         check_memory(self._stated_bytes(n_parts), allowed, str(self._folder))
         read: list[list[StoredSection]] = []
-        n_whole, error = 0, None
+        error = None
         for part in parts:
             try:
                 read.append(self._sections(part))
-                self._read_structures(read[-1], part)
-                n_whole += 1
             except FormatError as found:
                 error = found
                 break
+        n_whole, error = self._read_structures(read, error)
+        self._forget(read[n_whole:])
+        read = read[:n_whole]
         taken = self._exact_bytes(n_parts)
         if n_parts < len(self._manifest.parts):  # symbols are kept for the parts to come
             taken += sum(reader.n_symbol_bytes for reader in self._grids.values())
         check_memory(taken, allowed, str(self._folder))
-        n_whole, error = self._read_symbols(read[:n_whole], error)
-        for stored in reversed([stored for sections in read[n_whole:] for stored in sections]):
-            self._grids[stored.section.grid].forget(stored.section)
+        n_whole, error = self._read_symbols(read, error)
+        self._forget(read[n_whole:])
         self.n_read += n_whole
         self._taken = taken
         if error is not None:
             raise error
 
-    def _read_structures(self, sections: Sequence[StoredSection], part: Part) -> None:
-        for stored in sections:
-            if stored.section.kind == "structure":
-                self._grids[stored.section.grid].read_structure(stored)
-        if not self._grids["features"].pyramid.levels[-1].masks.any():  # every sample is given one
-            raise FormatError(f"{self._folder / part.file}: expected a live cell of the features, got none")
+    def _forget(self, read: Sequence[Sequence[StoredSection]]) -> None:
+        """Undo what was read of parts, of which some sections may not have been begun."""
+        for stored in reversed([stored for sections in read for stored in sections]):
+            self._grids[stored.section.grid].forget(stored.section)
+
+    def _read_structures(
+        self, read: Sequence[Sequence[StoredSection]], error: FormatError | None
+    ) -> tuple[int, FormatError | None]:
+        """Decode the structures of parts, both pyramids' at the same time.
+
+        Returns how many parts are whole, and what is wrong with the next: `error` if all of these are.
+        """
+
+        def of_grid(grid: Grid) -> tuple[int, FormatError | None]:
+            reader = self._grids[grid]
+            for number, sections in enumerate(read):
+                own = [stored for stored in sections if stored.section.grid == grid]
+                try:
+                    for stored in own:
+                        if stored.section.kind == "structure":
+                            reader.read_structure(stored)
+                    if grid == "features" and not reader.pyramid.levels[-1].masks.any():
+                        file = self._folder / self._manifest.parts[self.n_read + number].file
+                        raise FormatError(  # every sample is given one
+                            f"{file}: expected a live cell of the features, got none"
+                        )
+                except FormatError as found:
+                    return number, found
+            return len(read), error
+
+        return min(_of_both(of_grid), key=itemgetter(0))
 
     def _read_symbols(
         self, read: Sequence[Sequence[StoredSection]], error: FormatError | None
@@ -246,9 +281,9 @@ class PartsReader:
             first = end
         return found
 
-    def values(self, grid: Grid) -> PyramidValues:
-        """What is known of a pyramid so far."""
-        return self._grids[grid].values()
+    def values(self) -> list[PyramidValues]:
+        """What is known of the densities and of the features so far."""
+        return _of_both(lambda grid: self._grids[grid].values())
 
     def _stated_bytes(self, n_parts: int) -> int:
         """What the first parts will take by the numbers of the manifest: every brick has vertices."""

@@ -99,7 +99,7 @@ class Vertices:
     @cached_property
     def on_border(self) -> np.ndarray:
         """[n] bool."""
-        return stored_bits(self.border)[stored_bits(self.bricks.masks)]
+        return stored_bits(self.border).reshape(-1)[stored_bits(self.bricks.masks).reshape(-1)]
 
     @cached_property
     def index(self) -> np.ndarray:
@@ -111,10 +111,10 @@ class Vertices:
     @cached_property
     def row_of_bit(self) -> np.ndarray:
         """[n_bricks * 512] int32: the row of each vertex of each brick, -1 where there is none."""
-        there = stored_bits(self.bricks.masks)
-        rows = np.full(there.shape, -1, np.int32)
+        there = stored_bits(self.bricks.masks).reshape(-1)
+        rows = np.full(len(there), -1, np.int32)
         rows[there] = np.arange(self.n, dtype=np.int32)
-        return rows.reshape(-1)
+        return rows
 
     def rows(self, index: np.ndarray) -> np.ndarray:
         """[n] int32: the rows of vertices [n, 3]; -1 where there is none."""

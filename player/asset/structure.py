@@ -33,7 +33,10 @@ from player.errors import FormatError, ShapeError
 N_CHILDREN = 8
 MUST = 49
 N_CLASSES = 50
-_DEAD, _LIVE, _UNKNOWN = 0, 1, 2
+_DEAD, _LIVE, _UNKNOWN = 1, 7, 0
+"""What a neighbour adds to the class of a child."""
+_QUARTERS = np.array([[0x0F0F0F0F, 0xF0F0F0F0]], np.uint64) << np.array([[0], [32]], np.uint64)
+"""[2, 2] uint64: the bits of a mask's word that are in the half along y and along z."""
 _LENGTH = struct.Struct("<I")
 
 
@@ -159,7 +162,8 @@ def _check_inside(bricks: Bricks, cells_per_axis: int, where: str) -> None:
 
 def _octants(bricks: Bricks) -> _Octants:
     cells = stored_bits(bricks.masks).reshape(-1, 2, 4, 2, 4, 2, 4)
-    brick, x, y, z = np.nonzero(cells.any(axis=(2, 4, 6)))
+    words = np.bitwise_or.reduce(bricks.masks.reshape(-1, 2, 4), axis=2)
+    brick, x, y, z = np.nonzero(words[:, :, None, None] & _QUARTERS)
     coords = bricks.coords.astype(np.int64)[brick] * 2 + np.stack([x, y, z], axis=-1)
     order = np.lexsort(coords.T[::-1])
     return _Octants(coords[order], cells[brick, x, :, y, :, z][order])
@@ -182,8 +186,9 @@ def _parents(octants: _Octants, refined: np.ndarray) -> _Parents:
     used = octants.live & refined[:, None, None, None]
     n = int(np.count_nonzero(used))
     row = np.full((len(used) + 1, 4, 4, 4), n, np.int32)  # the last is that of octants without live cells
-    row[:-1][octants.live] = n + 1
-    row[:-1][used] = np.arange(n, dtype=np.int32)
+    flat = row[:-1].reshape(-1)
+    flat[octants.live.reshape(-1)] = n + 1
+    flat[used.reshape(-1)] = np.arange(n, dtype=np.int32)
     named = _named(octants.coords)
     beside = np.empty((3, 2, n), np.int32)
     for axis in range(3):
@@ -215,17 +220,16 @@ class _Children:
         """[n] uint8: the class of a child of each parent."""
         n = self._beside.shape[2]
         counts = np.zeros(n, np.uint8)
-        count = np.array([1, 7, 0], np.uint8)  # of a dead, a live and an unknown neighbour
         for axis, bit in enumerate((4, 2, 1)):
             known = self._known[child ^ bit]
-            counts += count[known[:n]]
-            counts += count[known[self._beside[axis, 1 if child & bit else 0]]]
+            counts += known[:n]
+            counts += known.take(self._beside[axis, 1 if child & bit else 0])
         if child == N_CHILDREN - 1:
             counts[~(self._known[: N_CHILDREN - 1, :n] == _LIVE).any(axis=0)] = MUST
         return counts
 
     def tell(self, child: int, live: np.ndarray) -> None:
-        self._known[child, : len(live)] = live
+        self._known[child, : len(live)] = np.where(live, np.uint8(_LIVE), np.uint8(_DEAD))
 
 
 def _encode_children(octants: _Octants, refined: np.ndarray, children: Bricks) -> bytes:
@@ -248,19 +252,19 @@ def _decode_children(data: bytes, octants: _Octants, refined: np.ndarray, where:
     parents = _parents(octants, refined)
     decoder = Decoder(data, _neighbours(parents), N_CHILDREN, N_CLASSES, where)
     known = _Children(parents)
-    live = np.empty((len(parents.octant), N_CHILDREN), bool)
+    live = np.empty((N_CHILDREN, len(parents.octant)), bool)
     for child in range(N_CHILDREN):
         found = decoder.channel(known.classes(child))
-        live[:, child] = found == 1
-        if not (live[:, child] | (found == 0)).all():
+        live[child] = found == 1
+        if not (live[child] | (found == 0)).all():
             raise FormatError(f"{where}: cells: expected 0 or 1 for each child, got others")
-        known.tell(child, live[:, child])
+        known.tell(child, live[child])
     decoder.finish()
-    if not live.any(axis=1).all():
+    if not live.any(axis=0).all():
         raise FormatError(f"{where}: cells: expected a live child of each live cell, got none of some")
     coords = octants.coords[refined]
     cells = np.zeros((len(coords), 4, 2, 4, 2, 4, 2), bool)
-    cells[_places(parents)] = live.reshape(-1, 2, 2, 2)
+    cells[_places(parents)] = live.T.reshape(-1, 2, 2, 2)
     return Bricks(coords.astype(np.uint16), packed_bits(cells.reshape(-1, 8, 8, 8)))
 
 

@@ -58,16 +58,15 @@ def decode_channel(
 ) -> tuple[np.ndarray, int]:
     """As `player.asset.coder.arrays.decode_channel`."""
     n = len(classes)
-    found, near = scratch(n, np.int16), scratch(n + 1, np.int16, 0)
-    symbols = scratch(len(states), np.uint8)
+    near, of_lane = scratch(n + 1, np.uint8, END), scratch(len(states), np.uint8)
     table_of_sum = of_context[:, CONTEXT_OF_SUM].reshape(-1)
-    at = _decode(words, at, states, lookup, table_of_sum, classes, neighbours, MIXED, found, near, symbols)
-    check_scratch(found, near, symbols)
-    return found, at
+    at = _decode(words, at, states, lookup, table_of_sum, classes, neighbours, MIXED, near, of_lane)
+    check_scratch(near, of_lane)
+    return np.subtract(near[:n], END, dtype=np.int16), at
 
 
 @compiled
-def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed, found, near, symbols):
+def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed, near, of_lane):
     n, n_lanes = len(classes), len(states)
     n_words, n_steps, n_longer = len(words) - n_lanes, n // n_lanes, n % n_lanes
     symbol_of, places = lookup
@@ -76,11 +75,12 @@ def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed,
     begin = 0
     for step in range(n_steps + 1):
         n_active = n_lanes if step < n_steps else n_longer
-        for lane in range(n_active):
+        for lane in range(n_active):  # apart from what waits for the states: the loads overlap
             i = np.uint64(begin + lane)
-            total = near[along_z[i]] + near[along_y[i]] + near[along_x[i]] + HALF
-            table = np.uint32(table_of_sum[np.uint32(classes[i] * N_MIXED + total)])
-            x = states[lane]
+            total = mixed[near[along_z[i]]] + mixed[near[along_y[i]]] + mixed[near[along_x[i]]] + HALF
+            of_lane[lane] = table_of_sum[np.uint32(classes[i] * N_MIXED + total)]
+        for lane in range(n_active):
+            table, x = np.uint32(of_lane[lane]), states[lane]
             place = x & np.uint32(TOTAL - 1)
             symbol = np.uint32(symbol_of[(table << bits) | place])
             entry = places[(table << np.uint32(SYMBOL_BITS)) | symbol]
@@ -90,12 +90,10 @@ def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed,
             more = np.uint32((x << word) | words[np.uint64(at)])
             states[lane] = more if is_low else x
             at += is_low
-            symbols[lane] = symbol
+            of_lane[lane] = symbol
         row = np.uint64(step)
         for lane in range(n_active):  # only now: what is coded at the same step is not known
-            symbol = symbols[lane]
-            near[row] = mixed[symbol]
-            found[row] = np.int16(symbol) - END
+            near[row] = of_lane[lane]
             row += np.uint64(n_steps + (lane < n_longer))
         begin += n_lanes
         if at > n_words:

@@ -29,7 +29,8 @@ def add_to_prediction(
             the brick begins.
         coarse_rows: [n_coarse_bricks * 729] int32: the rows of the coarser level's vertices.
         coarse: [n_coarse, n_channels] values of the coarser level.
-        symbols: [n_stored, n_channels] int16; [0, n_channels] if all are 0.
+        symbols: [n_stored, n_channels] int16, a channel after the other in memory; [0, n_channels] if all are
+            0.
         limits: step, lowest and highest value.
         sums: [n_channels] int32, room for sums.
         out: [n, n_channels].

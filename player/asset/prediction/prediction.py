@@ -55,7 +55,7 @@ def values_from(
         sums = np.empty(coarse.shape[1], np.int32)
         add_to_prediction(
             masks, border, places.bricks, places.rows, np.ascontiguousarray(coarse),
-            np.ascontiguousarray(symbols, np.int16), (step, *limits), sums, out,
+            np.asfortranarray(symbols, np.int16), (step, *limits), sums, out,
         )  # fmt: skip
         return out
     row = first_symbol = 0
