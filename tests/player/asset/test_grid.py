@@ -134,6 +134,22 @@ def test_grid_against_dense_arrays(share: float) -> None:
             assert -entry == min(nearest, MAX_DISTANCE)
 
 
+def test_the_table_of_many_places_says_how_far_the_nearest_brick_is() -> None:
+    """More places along an axis than a distance can say, and not eight times a number of them."""
+    cells = 8 * np.array([[1, 2, 3], [1, 2, 12], [4, 21, 0]]) + 3
+    coords, masks, order = pack_vertices((cells[:, None] + list(np.ndindex(2, 2, 2))).reshape(-1, 3))
+    one = VertexBricks(coords, masks, np.ones(len(order), np.uint8))
+    grid = build_grid(
+        from_vertices(one, 355), from_vertices(one, 355), np.array([[-1] * 3, [1] * 3]), 0.1, (1,), (0, 1)
+    )
+    n = grid.n_per_axis
+    assert n == 45 > MAX_DISTANCE
+    away = np.abs(np.indices((n, n, n)).reshape(3, 1, -1) - grid.slot_coords.T[:, :, None]).max(axis=0)
+    nearest = np.minimum(away.min(axis=0), MAX_DISTANCE)
+    assert nearest.max() == MAX_DISTANCE < away.min(axis=0).max()
+    assert (np.maximum(-grid.table, 0) == nearest).all()
+
+
 def test_grid_of_the_asset_keeps_every_vertex(asset: Asset) -> None:
     stored = asset.arrays.features
     assert stored.pyramid.vertices[0].n == len(asset.grid.features)

@@ -224,6 +224,27 @@ def test_a_vouched_part_that_breaks_the_format_leaves_those_before_it(broken: Pa
         Asset.open(broken, verify=True)
 
 
+@pytest.mark.parametrize("grids", [("densities", "features"), ("features", "densities")])
+def test_of_two_broken_structures_the_first_is_told(
+    grids: tuple[str, str], whole: Path, broken: Path
+) -> None:
+    """Those of both pyramids are decoded at the same time: one of them goes on behind what ends the other."""
+    for number, grid in enumerate(grids, 1):
+        part = read_manifest(broken).parts[number]
+        data, first = bytearray((broken / part.file).read_bytes()), 0
+        for section in part.sections:
+            if section.kind == "structure" and section.grid == grid:
+                data[first : first + section.bytes] = bytes(section.bytes)
+            first += section.bytes
+        vouch(broken, part.file, bytes(data))
+    asset, wanted = Asset.open(broken), Asset.open(whole, parts=1)
+    assert asset.n_parts == 1 and asset.missing is not None
+    assert f"part_1.bin: {grids[0]}" in asset.missing
+    assert same(asset.arrays.densities, wanted.arrays.densities)
+    assert same(asset.arrays.features, wanted.arrays.features)
+    assert [grown.n_parts for grown in Asset.growing(broken)] == [1, 1]
+
+
 def structures(document: dict[str, Any]) -> list[dict[str, Any]]:
     return [s for part in document["parts"] for s in part["sections"] if s["kind"] == "structure"]
 
