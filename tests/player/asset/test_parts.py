@@ -239,7 +239,7 @@ def test_of_two_broken_structures_the_first_is_told(
         vouch(broken, part.file, bytes(data))
     asset, wanted = Asset.open(broken), Asset.open(whole, parts=1)
     assert asset.n_parts == 1 and asset.missing is not None
-    assert f"part_1.bin: {grids[0]}" in asset.missing
+    assert f"part_1.bin: {grids[0]}, level 1, structure: " in asset.missing
     assert same(asset.arrays.densities, wanted.arrays.densities)
     assert same(asset.arrays.features, wanted.arrays.features)
     assert [grown.n_parts for grown in Asset.growing(broken)] == [1, 1]
