@@ -33,7 +33,7 @@ class LevelRows(NamedTuple):
 def level_rows(vertices: Vertices) -> LevelRows:
     """The rows of a level; every section of the level can use them.
 
-    Takes 14 bytes a vertex, and 4 kB a brick of vertices meanwhile.
+    Takes 13 bytes a vertex, and 5 kB a brick of vertices meanwhile.
     """
     bricks = vertices.bricks
     stored = stored_bits(bricks.masks & ~vertices.border).reshape(-1)
