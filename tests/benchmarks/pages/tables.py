@@ -156,8 +156,8 @@ def baking(results: Results) -> list[str]:
     rows = []
     for name in there:
         found, played = results[name]["figures"], own_setting(results, name)
-        trade = results.get(f"trade_{name.split('_')[1]}")
-        if trade is not None and trade["commit"] != results[name]["commit"]:
+        n_bytes = found["n_bytes"] - found["bytes"]["manifest.json"]
+        if played is not None and played["n_bytes"] != n_bytes:
             played = None  # of another asset
         row = [
             asset_name(name),

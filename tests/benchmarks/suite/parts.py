@@ -93,7 +93,8 @@ def _bake(name: str, model_of: str, minutes: float, *options: str, core: bool = 
 
 def _play(scene: Scene, name: str, of: str) -> Part:
     measure = partial(played.qualities, scene=scene, asset_of=of)
-    return Part(name, measure, 4.0 if scene.unbounded else 1.5, (of,), scene.data)
+    core = not name.endswith("_phone")  # whose frames the trade has, too, but those of the slow march
+    return Part(name, measure, 4.0 if scene.unbounded else 1.5, (of,), scene.data, core)
 
 
 def _trade(name: str, scene: Scene, of: tuple[str, ...], minutes: float, core: bool = True) -> Part:
@@ -130,9 +131,9 @@ def _core() -> list[Part]:
         *(_training(*pair) for pair in ((LEGO, 9.5), (FOX, 12.5), (CAN, 13.5), (DEMO, 2.5))),
         *(_score(*pair) for pair in ((LEGO, 2.5), (FOX, 1.5), (CAN, 4.0), (DEMO, 0.5))),
         *presets,
-        _trade("trade_lego", LEGO, bakes(LEGO), 9.0),
+        _trade("trade_lego", LEGO, bakes(LEGO), 11.0),
         _trade("trade_fox", FOX, bakes(FOX), 6.0),
-        _trade("trade_can", CAN, bakes(CAN), 6.5),
+        _trade("trade_can", CAN, bakes(CAN), 7.5),
         _trade("trade_demo", DEMO, bakes(DEMO), 1.5),
         *(
             _play(scene, name, of)
