@@ -217,10 +217,9 @@ class PartsReader:
         def of_grid(grid: Grid) -> tuple[int, FormatError | None]:
             reader = self._grids[grid]
             for number, sections in enumerate(read):
-                own = [stored for stored in sections if stored.section.grid == grid]
                 try:
-                    for stored in own:
-                        if stored.section.kind == "structure":
+                    for stored in sections:
+                        if stored.section.grid == grid and stored.section.kind == "structure":
                             reader.read_structure(stored)
                     if grid == "features" and not reader.pyramid.levels[-1].masks.any():
                         file = self._folder / self._manifest.parts[self.n_read + number].file
