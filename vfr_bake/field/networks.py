@@ -69,6 +69,10 @@ class DensityNetwork(nn.Module):
         """Density [n] in 1/model unit."""
         return TruncatedExp.apply(self.logits(features))  # type: ignore[return-value]
 
+    def matrices(self) -> list[Tensor]:
+        """The weights of its layers, without the biases."""
+        return [p for p in self.parameters() if p.ndim == 2]
+
     def arrays(self) -> DensityArrays:
         """The weights as the kernels take them."""
         w2 = self.out.weight.detach().numpy()[0]

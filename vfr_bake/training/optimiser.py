@@ -20,6 +20,11 @@ BETAS, EPSILON = (0.9, 0.99), 1e-15
 GRID_BETAS = 0.9, 0.95
 """The decay rates of hash grids, which learn more with a shorter memory of squared gradients; networks do not
 (docs/notes/2026-11-25-learning-rates.md)."""
+DENSITY_DECAY = 0.05
+"""By so many times the rate the density network's matrices shrink in a step (decoupled weight decay,
+Loshchilov and Hutter, ICLR 2019). With nothing to hold them they grow at the whole rate, and what a step of
+the grid does to a density grows with them, until after some 20,000 steps a capture's geometry falls apart
+(docs/notes/2026-11-29-densities-that-steepen.md)."""
 WARMUP_STEPS = 100
 HELD = 0.5
 """Share of a training with the whole rate."""
@@ -36,6 +41,19 @@ def rate_factor(step: int, progress: float) -> float:
     """
     warm_up = min(1.0, 0.01 + 0.99 * step / WARMUP_STEPS)
     return warm_up * min(1.0, (1 - progress) / (1 - HELD))
+
+
+@torch.no_grad()
+def shrink(tensors: Iterable[Tensor], share: float) -> None:
+    """Take a `share`, from 0 to 1, of every entry away, in place.
+
+    >>> weight = torch.tensor([4.0, -2.0])
+    >>> shrink([weight], 0.5)
+    >>> weight.tolist()
+    [2.0, -1.0]
+    """
+    for tensor in tensors:
+        tensor.mul_(1 - share)
 
 
 class Adam:

@@ -38,6 +38,7 @@ from vfr_bake.training.length.witness_errors import WitnessErrors
 from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.optimiser import (
     BETAS,
+    DENSITY_DECAY,
     EPSILON,
     Adam,
     DeviceGridAdam,
@@ -45,6 +46,7 @@ from vfr_bake.training.optimiser import (
     GridAdam,
     TableAdam,
     rate_factor,
+    shrink,
 )
 from vfr_bake.training.pixel_tensors import pixel_content, restore_witnesses
 from vfr_bake.training.processes import Processes
@@ -284,6 +286,7 @@ class Trainer:
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
             factor = rate_factor(step, progress)
             self._adam.step(self.pace.network_rate * factor)
+            shrink(self._field.density.matrices(), DENSITY_DECAY * self.pace.network_rate * factor)
             for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
             if seen is not None:

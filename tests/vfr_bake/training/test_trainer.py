@@ -24,6 +24,7 @@ from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradients
 from vfr_bake.training.model_file import trained_model
+from vfr_bake.training.optimiser import DENSITY_DECAY
 from vfr_bake.training.rays import RayBatch
 from vfr_bake.training.scores.evaluation import evaluate
 from vfr_bake.training.trainer import Trainer
@@ -74,6 +75,17 @@ def test_the_head_multiplies_as_the_processor_does_best(
         monkeypatch.setattr("vfr_bake.training.trainer.fast_products", lambda kind=kind: kind)
         head = Trainer(scene, config(steps=1)).field.head
         assert head.products == kind and all(p.dtype == torch.float32 for p in head.parameters())
+
+
+def test_densities_do_not_steepen_without_end(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decay holds the density network's matrices; a thousand times as much shows in a few steps."""
+    sizes = []
+    for decay in (0.0, 1000 * DENSITY_DECAY):
+        monkeypatch.setattr("vfr_bake.training.trainer.DENSITY_DECAY", decay)
+        trainer = Trainer(scene, config(steps=30, pilot_steps=0))
+        assert all(report.loss == report.loss for report in trainer.run())
+        sizes.append([float(matrix.detach().norm()) for matrix in trainer.field.density.matrices()])
+    assert len(sizes[0]) == 2 and all(held < 0.9 * free for free, held in zip(*sizes, strict=True))
 
 
 def test_the_minutes_end_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
