@@ -21,10 +21,10 @@ GRID_BETAS = 0.9, 0.95
 """The decay rates of hash grids, which learn more with a shorter memory of squared gradients; networks do not
 (docs/notes/2026-11-25-learning-rates.md)."""
 DENSITY_DECAY = 0.05
-"""By so many times the rate the density network's matrices shrink in a step (decoupled weight decay,
-Loshchilov and Hutter, ICLR 2019). With nothing to hold them they grow at the whole rate, and what a step of
-the grid does to a density grows with them, until after some 20,000 steps a capture's geometry falls apart
-(docs/notes/2026-11-29-densities-that-steepen.md)."""
+"""By so many times the rate the density network's matrix of an unbounded scene shrinks in a step (decoupled
+weight decay, Loshchilov and Hutter, ICLR 2019). With nothing to hold it, it grows at the whole rate, and what
+a step of the grid does to a density grows with it, until after some 20,000 steps the geometry falls apart.
+Objects do not, and learn a little more without (docs/notes/2026-11-29-densities-that-steepen.md)."""
 WARMUP_STEPS = 100
 HELD = 0.5
 """Share of a training with the whole rate."""

@@ -286,7 +286,8 @@ class Trainer:
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
             factor = rate_factor(step, progress)
             self._adam.step(self.pace.network_rate * factor)
-            shrink(self._field.density.matrices(), DENSITY_DECAY * self.pace.network_rate * factor)
+            if self._field.config.unbounded:
+                shrink(self._field.density.matrices(), DENSITY_DECAY * self.pace.network_rate * factor)
             for table in (self._grid_adam, *self._guide.tables(samples)):
                 table.step(self.pace.grid_rate * factor)
             if seen is not None:
