@@ -55,6 +55,7 @@ from vfr_bake.field.networks import Head
 from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
+from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import psnr
 
@@ -250,9 +251,11 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     share: float, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=8, k=4, refine_steps=20)
-    work = _Bake(replace(model, training_pixels=None), config, quiet)  # so that 8 bits do lose something
+    work = _Bake(model, config, quiet)
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
+    # What a few steps of training leave decides whether 8 bits lose anything at all: here they always do.
+    monkeypatch.setattr(work.held_out, "lost", lambda before, after: Loss(0.2, 0.0))
     monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)
     monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", -np.inf)  # 8 bits are tried
     monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", np.inf)

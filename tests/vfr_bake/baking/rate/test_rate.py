@@ -228,7 +228,9 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
         rgb = head(composed, rays.teacher.rays_d).astype(np.float64) - model.background
         return rgb * opacity[:, None]
 
-    some, codes = np.argsort(found.features)[-400::40], whole_codes(stored.features)
+    # Closer together at the top, where importance falls fastest: it has to differ by more than its own error.
+    ranks = np.union1d(np.geomspace(1, 400, 14).astype(int), np.arange(40, 400, 40))
+    some, codes = np.argsort(found.features)[-ranks], whole_codes(stored.features)
     changes, base = [], colours(latent(codes))
     for row in some:
         total = 0.0
@@ -239,7 +241,7 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
         changes.append(total)
     # Signs are random: a vertex that some hundred rays meet is known within a fifth, all together better.
     assert found.features[some].sum() == pytest.approx(np.sum(changes), rel=0.2)
-    assert np.corrcoef(np.log(found.features[some]), np.log(changes))[0, 1] > 0.5
+    assert np.corrcoef(np.log(found.features[some]), np.log(changes))[0, 1] > 0.7
 
 
 @pytest.mark.parametrize("power", [0.3, 0.7, 1.5])
