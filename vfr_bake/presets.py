@@ -67,36 +67,36 @@ PRESETS: dict[Preset, BakeChoice] = {
         cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.01, density_step=2, code_levels=127, head_width=0, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=400, minutes=5, mesh_resolution=128, target_loss_db=0.05,
+        head_bands=4, head_bits=8, refine_steps=1600, minutes=8, mesh_resolution=128, target_loss_db=0.05,
         page_mb=1024,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.03, density_step=4, code_levels=50, head_width=64, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=2000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        head_bands=4, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
     "fast": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.15, density_step=6, code_levels=50, head_width=48, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=2500, minutes=8, mesh_resolution=112, target_loss_db=1.0,
+        head_bands=3, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=112, target_loss_db=1.0,
         page_mb=512,
     ),
     "phone": BakeChoice(
         cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.2, density_step=6, code_levels=50, head_width=32, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=1800, minutes=8, mesh_resolution=64, target_loss_db=1.5,
+        head_bands=3, head_bits=8, refine_steps=3000, minutes=8, mesh_resolution=64, target_loss_db=1.5,
         page_mb=384,
     ),
 }  # fmt: skip
 
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
-    "fidelity": {"refine_steps": 200, "feature_share": 1.0, "n_channels": 24},
+    "fidelity": {"refine_steps": 400, "feature_share": 1.0, "n_channels": 24},
     "balanced": {
-        "refine_steps": 1600,
+        "refine_steps": 2400,
         "minutes": 10,
         "feature_share": 1.0,
         "n_channels": 24,
@@ -108,14 +108,14 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "target_loss_db": 0.5,
     },
     "fast": {
-        "refine_steps": 800,
+        "refine_steps": 1200,
         "feature_share": 0.58,
         "n_channels": 12,
         "channel_loss_db": 0.5,
         "sample_loss_db": 0.15,
         "code_loss_db": 0.1,
     },
-    "phone": {"refine_steps": 800, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
+    "phone": {"refine_steps": 1200, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
 }
 """What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
 which take their time; its features are most of what a grid of so few cells loses."""

@@ -34,26 +34,26 @@ from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
 """Bytes that Python, torch, numba and the model itself take."""
-N_RAYS = 4_000_000
-"""Rays that head and stored values are trained on, where there is memory for them: half of them meet
+N_RAYS = 6_000_000
+"""Rays that head and stored values are trained on, where there is memory for them: most of them meet
 something. The fewer they are, the more what is stored suits them alone."""
-UNBOUNDED_RAYS = 1_500_000
+UNBOUNDED_RAYS = 2_500_000
 """Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
-RAYS_OF_DRAW, FEW_DRAWN = 2, 500_000
-"""Rays for each that the steps of refinement draw, at most: half of them meet something, so that each is
+RAYS_OF_DRAW, FEW_DRAWN = 1.2, 500_000
+"""Rays for each that the steps of refinement draw, at most: five of six meet something, so that each is
 drawn once. The least that this may leave: what is stored is chosen by some of them, too."""
-PHOTOGRAPHED = {False: 1 / 4, True: 1 / 2}
-"""Share of the rays that go through training pixels, where the model has so many, by whether the scene is
-unbounded: as many as of the others meet something."""
+PHOTOGRAPHED = 3 / 4
+"""Share of the rays that go through training pixels, where the model has so many. Those of an object all lie
+on it or close to it; of its other rays a third meet something."""
 RAYS_SHARE = 0.3
 """Share of the memory for cells and rays that rays may take at least, if they need it."""
 FEWEST_RAYS = 100_000
 RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
-RAY_BYTES = {False: 130, True: 120}
+RAY_BYTES = {False: 220, True: 120}
 """Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what is to be shown,
 twice that for those that meet something in the grid, too, and as much again while they are put together.
-Half of an object's rays meet something, and their samples are kept, eight or nine of 16 bytes."""
+Five of six of an object's rays meet something, and their samples are kept, eight or nine of 16 bytes."""
 CHANNEL_BYTES = 8.5
 """Bytes that a stored channel takes in a cell, which has about 1.3 vertices, when codes are chosen: the two
 of what was trained, and one each of the codes that are tried, of the best ones so far, and of those that are
@@ -147,7 +147,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     room = config.max_memory * 1e9 - PROGRAM_BYTES
     given = config.resolution or config.feature_resolution
     page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
-    drawn = max(RAYS_OF_DRAW * choice.refine_steps * BATCH, FEW_DRAWN)
+    drawn = max(int(RAYS_OF_DRAW * choice.refine_steps * BATCH), FEW_DRAWN)
     most_rays = min(UNBOUNDED_RAYS if field.unbounded else N_RAYS, drawn)
     n_cells = _cells(model, coarse)
     plan = Plan(resolutions, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
@@ -200,7 +200,7 @@ def _cells(model: Model, resolution: int) -> float:
 def photographed(model: Model, n_rays: int) -> int:
     """How many of so many training rays go through training pixels of the model."""
     n_pixels = 0 if model.training_pixels is None else len(model.training_pixels.pixels)
-    return min(int(PHOTOGRAPHED[model.field.config.unbounded] * n_rays), n_pixels)
+    return min(int(PHOTOGRAPHED * n_rays), n_pixels)
 
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:

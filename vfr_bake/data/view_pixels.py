@@ -13,8 +13,8 @@ from player.cameras.camera import Camera
 from player.march.pixels import rays_of_pixels
 from vfr_bake.data.capture import PosedImages
 
-N_TRAINING_PIXELS = 1_000_000
-"""Number of training pixels at most: 8 MB of a model file."""
+N_TRAINING_PIXELS = 4_000_000
+"""Number of training pixels at most: 32 MB of a model file."""
 NEAR = 1 / 32
 """Share of a view's longer side. If a view has transparent pixels, those that are farther than this from
 everything else are not kept: there is nothing to learn from them."""

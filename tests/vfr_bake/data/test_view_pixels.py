@@ -19,7 +19,7 @@ def opaque(views: PosedImages) -> PosedImages:
 
 
 def test_training_pixels_are_those_of_learned_views_but_for_witnesses() -> None:
-    views = opaque(numbered_views(24, 300, 260))
+    views = opaque(numbered_views(24, 600, 520))
     witnesses = choose_witnesses(views)
     chosen = choose_training_pixels(views, witnesses, witnesses.learned())
     counts = chosen.counts[witnesses.learned()]
