@@ -389,7 +389,7 @@ class BakeConfig:
         >>> BakeConfig(k=3).choice().n_fetches, BakeConfig(k="auto").choice().n_fetches
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
-        2400
+        2100
         """
         preset = PRESETS[self.preset]
         if unbounded:

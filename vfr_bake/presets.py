@@ -96,7 +96,7 @@ PRESETS: dict[Preset, BakeChoice] = {
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
     "fidelity": {"refine_steps": 400, "feature_share": 1.0, "n_channels": 24},
     "balanced": {
-        "refine_steps": 2400,
+        "refine_steps": 2100,
         "minutes": 10,
         "feature_share": 1.0,
         "n_channels": 24,
