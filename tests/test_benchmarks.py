@@ -175,6 +175,21 @@ def test_two_processors_stand_side_by_side() -> None:
     ]
 
 
+def test_rows_name_the_machine_where_a_second_file_has_several() -> None:
+    baked = {"seconds": 192.0, "n_bytes": 4.94e6, "loss_db": 0.104, "loss_db_spread": 0.04}
+    second = {
+        "page_lego_fast": result({"first_picture_s": 2.0}, machine=MACHINE | {"processor": "another"}),
+        "bake_lego_fast": result(baked, machine=MACHINE | {"processor": "a third"}, others=0.4),
+    }
+    assert beside({"bake_lego_fast": result(baked)}, second) == [
+        "| what | one, 2 cores; 0a1b2c3 | B: another, 2 cores; C: a third, 2 cores |",
+        "|---|---|---|",
+        "| lego, fast: bake | 192 s, 4.9 MB, loses 0.10 ± 0.04 dB |"
+        " 192 s, 4.9 MB, loses 0.10 ± 0.04 dB (C*, 0a1b2c3) |",
+        "| lego, fast: first picture of the page |  | 2.0 s (B, 0a1b2c3) |",
+    ]
+
+
 def test_the_readme_tells_what_the_parts_found() -> None:
     baked = {"seconds": 192.0, "n_bytes": 4.94e6, "loss_db": 0.104, "loss_db_spread": 0.04}
     rows = [

@@ -92,11 +92,12 @@ def letter(index: int) -> str:
     return chr(ord("A") + index)
 
 
-def where(results: Results, name: str) -> str:
-    """Machine and commit of a part; * where other programs took more than counts as quiet."""
+def where(results: Results, name: str, first: int = 0) -> str:
+    """Machine and commit of a part; * where other programs took more than counts as quiet. The machines'
+    letters begin with that of the number `first`."""
     part = results[name]
     beside = "*" if max(part["others"], part["others_before"]) > QUIET else ""
-    return f"{letter(machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
+    return f"{letter(first + machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
 
 
 def measured_on(results: Results, names: Sequence[str]) -> list[str]:
