@@ -71,10 +71,10 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=1024,
     ),
     "balanced": BakeChoice(
-        cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.1,
+        cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.03, density_step=4, code_levels=50, head_width=64, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=4000, minutes=8, mesh_resolution=128, target_loss_db=0.4,
+        head_bands=4, head_bits=8, refine_steps=3600, minutes=8, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
     "fast": BakeChoice(

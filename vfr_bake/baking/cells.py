@@ -171,20 +171,23 @@ def cull(
     model: Model, resolution: int, held_out: HeldOut, floor: float | None, most_db: float, progress: Progress
 ) -> CulledCells:
     """The cells of a grid of `resolution` that weigh something in some view, gaps of one cell between them
-    closed.
+    closed, and the cells beside those in which the model may hold matter.
 
-    `floor` is the weight that they must have, or None for the highest of FLOORS that loses no more than
-    `most_db`. Raises TrainingError when no cell weighs a `floor` that was asked for.
+    `floor` is the weight that they must have, or None for the highest of FLOORS with which no more than
+    `most_db` is lost of what all cells show. Raises TrainingError when no cell weighs a `floor` that was
+    asked for.
     """
     held = occupied_cells(model, resolution)
     floors = FLOORS if floor is None else (floor,)
     marks = marked_cells(model, resolution, floors, progress)
+    every = _shown(model, held_out, held)
     lost: dict[float, float] = {}
     for level, tried in enumerate(floors):
-        visible = close_gaps(np.ascontiguousarray(marks[..., level]).view(bool))
-        if not visible.any():
+        weighty = close_gaps(np.ascontiguousarray(marks[..., level]).view(bool))
+        if not weighty.any():
             continue
-        loss = held_out.lost(held_out.own, _shown(model, held_out, visible))
+        visible = weighty | (held & beside(weighty))
+        loss = held_out.lost(every, _shown(model, held_out, visible))
         lost[tried] = loss.db
         if loss.most <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)
@@ -287,6 +290,20 @@ def close_gaps(cells: np.ndarray) -> np.ndarray:
         padded = ~_any_of_three(~padded, axis)
     # Outside the box nothing is known to be empty or full: what was marked stays.
     return padded[1:-1, 1:-1, 1:-1] | cells
+
+
+def beside(cells: np.ndarray) -> np.ndarray:
+    """[n, n, n] bool: cells that share a face with one of `cells` [n, n, n] bool, and those themselves.
+
+    Refinement needs them: it moves a surface by densities within a cell of it, and where there is none the
+    surface has a hole.
+
+    >>> one = np.zeros((5, 5, 5), bool)
+    >>> one[2, 2, 2] = True
+    >>> int(beside(one).sum())
+    7
+    """
+    return np.logical_or.reduce([_any_of_three(cells, axis) for axis in range(3)])
 
 
 def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:

@@ -77,6 +77,9 @@ and the following count what one thread waits for on two cores
 (docs/notes/2026-11-24-bakes-of-weak-models.md)."""
 VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 """Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
+ROUNDS = {False: 1.0, True: 1.5}
+"""Rounds of refinement that are expected: a capture needs the one with the lookups and bits that are played
+about every second time, an object hardly ever."""
 OWN_HEAD = 2
 """How many times as long a step takes with the model's own head."""
 REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
@@ -225,7 +228,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         steps = max(model.occupancy.step * coarse / 2, 1.0)
         work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
     n_steps = refined_steps(config, choice, n_met)
-    refined = n_steps * BATCH * STEP_COST[unbounded]
+    refined = ROUNDS[unbounded] * n_steps * BATCH * STEP_COST[unbounded]
     refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)
     if config.refine_steps is None:
