@@ -40,6 +40,14 @@ STEPS_PER_PROPOSAL_UPDATE, STEADY_STEPS = 5, 200
 one for so many steps, then in every second for as many, and so on."""
 
 
+GROWS_AFTER, GROWTH = 2000, 4.0
+"""From this step on the batches of an unbounded scene grow on a CPU, in proportion to the number of steps, to
+so many times their first size: a ray takes 150 kB. As many rays in more steps show less, and less yet of
+views that are not learned from (docs/notes/2026-11-29-batches-that-grow.md)."""
+SIZES = 4
+"""Sizes that a batch has until it has grown by as many rays as it had at first."""
+
+
 class Guide(ABC):
     """The sampler in training."""
 
@@ -245,10 +253,19 @@ class ProposalGuide(SpaceGuide):
 
     def __init__(self, settings: DeviceSettings, near: float) -> None:
         super().__init__(settings, ProposalSampler(near), GridAdam, distortion)
+        self._growth = 1.0
 
     @property
     def sampler(self) -> ProposalSampler:
         return self._sampler
+
+    def n_rays(self, pilot: bool) -> int:
+        return int(super().n_rays(pilot) * self._growth)
+
+    def prepare(self, step: int, field: VfrField) -> None:
+        super().prepare(step, field)
+        # Batches of one size for a while: memory that each frees suits the next one.
+        self._growth = min(max(1.0, step // (GROWS_AFTER // SIZES) / SIZES), GROWTH)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float

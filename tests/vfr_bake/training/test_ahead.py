@@ -42,6 +42,15 @@ def trainer(kind: SceneKind, pilot_steps: int) -> Trainer:
     return Trainer(replace(scene, has_alpha=True, masked=False), config)
 
 
+def test_batches_of_an_unbounded_scene_grow_with_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """64 rays, half of them in the pilot's steps; after 8 steps every second is 16 rays larger."""
+    monkeypatch.setattr("vfr_bake.training.guides.GROWS_AFTER", 8)
+    monkeypatch.setattr("vfr_bake.training.guides.GROWTH", 3.0)
+    drawn = [report.n_rays for report in trainer("unbounded", 4).run()]
+    assert drawn[:4] == [32] * 4 and drawn[4:10] == [64] * 6, "all rays of a scene without end are served"
+    assert drawn[10:18] == [80, 80, 96, 96, 112, 112, 128, 128] and drawn[24:] == [192] * 6
+
+
 def test_the_threads_are_shared_out_and_given_back(two_threads: None) -> None:
     second = SecondThread()
     assert second.is_there

@@ -11,6 +11,8 @@ import math
 import statistics
 from itertools import pairwise
 
+from vfr_bake.training.guides import GROWS_AFTER, GROWTH
+
 TIMED_FROM, EXPECTED_AT = 300, 400
 """The speed is that of the steps between these two: before them the pilot network learns."""
 DB_OF_DOUBLINGS = {False: (5.0, 7.0), True: (1.5, 4.5)}
@@ -32,6 +34,37 @@ def typical_step(ends: list[float]) -> float:
     return statistics.median(after - before for before, after in pairwise(ends))
 
 
+GROWN = GROWS_AFTER * (1 + GROWTH**2) / 2
+"""Time in which batches grow to their last size, in steps of their first."""
+
+
+def grown(n: float) -> float:
+    """Time of `n` steps of an unbounded scene on a CPU, in steps of its first batches: from the step S =
+    GROWS_AFTER on the step s takes s / S of them, and GROWTH at last.
+
+    >>> grown(1000), grown(2 * GROWS_AFTER) / GROWS_AFTER
+    (1000, 2.5)
+    """
+    if n <= GROWS_AFTER:
+        return n
+    if n <= GROWTH * GROWS_AFTER:
+        return (GROWS_AFTER + n**2 / GROWS_AFTER) / 2
+    return GROWN + GROWTH * (n - GROWTH * GROWS_AFTER)
+
+
+def steps_of(time: float) -> float:
+    """The number of steps that take so much `time`: the inverse of `grown`.
+
+    >>> [round(steps_of(grown(n))) for n in (1000, 5000, 20_000)]
+    [1000, 5000, 20000]
+    """
+    if time <= GROWS_AFTER:
+        return time
+    if time <= GROWN:
+        return math.sqrt(GROWS_AFTER * (2 * time - GROWS_AFTER))
+    return GROWTH * GROWS_AFTER + (time - GROWN) / GROWTH
+
+
 def expectation(
     psnr: float, seconds: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool
 ) -> str:
@@ -42,11 +75,13 @@ def expectation(
     '25 ms a step: about 23,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
     """
     seconds_a_step *= LATER_STEP[unbounded]
-    possible = min(n_steps, EXPECTED_AT + round((60 * minutes - seconds) / seconds_a_step))
+    later = (60 * minutes - seconds) / seconds_a_step
+    possible = min(n_steps, EXPECTED_AT + round(steps_of(later) if unbounded else later))
     doublings = max(0.0, math.log2(possible / EXPECTED_AT))
     low, high = (round(psnr + gain * math.sqrt(doublings)) for gain in DB_OF_DOUBLINGS[unbounded])
     rounded = round(possible, 1 - len(str(possible)) + 1)
-    taken = min(minutes, (seconds + max(possible - EXPECTED_AT, 0) * seconds_a_step) / 60)
+    later = max(possible - EXPECTED_AT, 0)
+    taken = min(minutes, (seconds + (grown(later) if unbounded else later) * seconds_a_step) / 60)
     return (
         f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {taken:.2g} minutes at most, "
         f"which give scenes like this {low} to {high} dB"
