@@ -225,10 +225,11 @@ class TrainConfig:
     batch_samples: int | None = None
     """Objects: samples along rays in a batch; GPU 262,144, CPU 4,096, because the time of a CPU step
     grows with it, and many small steps teach more than few large ones: the same 25 million samples gave lego
-    26.3 dB in steps of 16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096."""
+    26.3 dB in steps of 16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096. On a CPU it grows to
+    twice as many from step 6,000 on."""
     batch_rays: int | None = None
-    """Scenes: rays in a batch; GPU 8,192, CPU 512, for the same reason. On a CPU it grows to
-    four times as many after the first steps."""
+    """Scenes: rays in a batch; GPU 8,192, CPU 512, for the same reason. On a CPU it grows to four times as
+    many from step 2,000 on."""
     max_rays: int | None = None
     """Objects: rays in a batch at most, however few samples they need; GPU 65,536, CPU 16,384."""
     grid_rate: float | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from numba import get_num_threads
@@ -40,12 +40,34 @@ STEPS_PER_PROPOSAL_UPDATE, STEADY_STEPS = 5, 200
 one for so many steps, then in every second for as many, and so on."""
 
 
-GROWS_AFTER, GROWTH = 2000, 4.0
-"""From this step on the batches of an unbounded scene grow on a CPU, in proportion to the number of steps, to
-so many times their first size: a ray takes 150 kB. As many rays in more steps show less, and less yet of
-views that are not learned from (docs/notes/2026-11-29-batches-that-grow.md)."""
 SIZES = 4
-"""Sizes that a batch has until it has grown by as many rays as it had at first."""
+"""Sizes that a batch has until it has grown by as much as it had at first."""
+
+
+class Growth(NamedTuple):
+    """How batches grow on a CPU: in proportion to the number of steps, from one of them on and up to a size.
+
+    As many rays in more steps show less, and in a capture less yet of views that are not learned from
+    (docs/notes/2026-11-29-batches-that-grow.md).
+    """
+
+    after: int
+    """The step from which on batches grow."""
+    most: float
+    """How many times its first size a batch has at last."""
+
+    def size(self, step: int) -> float:
+        """How many times its first size the batch of a step has.
+
+        >>> [Growth(after=2000, most=4.0).size(step) for step in (0, 2400, 2500, 3000, 9000)]
+        [1.0, 1.0, 1.25, 1.5, 4.0]
+        """
+        # Batches of one size for a while: memory that each frees suits the next one.
+        return min(max(1.0, step // (self.after // SIZES) / SIZES), self.most)
+
+
+GROWTH = {False: Growth(6000, 2.0), True: Growth(2000, 4.0)}
+"""By whether the scene is unbounded; what limits the latter is memory, 150 kB a ray."""
 
 
 class Guide(ABC):
@@ -57,6 +79,8 @@ class Guide(ABC):
     def __init__(self, settings: DeviceSettings, distortion: Callable[..., Tensor]) -> None:
         """`distortion`: as `vfr_bake.rendering.compositing.distortion`, for the device."""
         self._settings, self._distortion = settings, distortion
+        self._size = 1.0
+        """How many times its first size the next batch has."""
 
     @property
     @abstractmethod
@@ -135,7 +159,8 @@ class BoxGuide(Guide):
 
     def _budget(self, pilot: bool) -> int:
         # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
-        return self._settings.batch_samples // 2 if pilot else self._settings.batch_samples
+        budget = self._settings.batch_samples * self._size
+        return int(budget / 2 if pilot else budget)
 
     def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
@@ -178,6 +203,7 @@ class OccupancyGuide(BoxGuide):
             # Every process has seen its own rays.
             self._processes.take_largest(torch.from_numpy(self._grid.densities))
         super().prepare(step, field)
+        self._size = GROWTH[False].size(step)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
@@ -220,7 +246,8 @@ class SpaceGuide(Guide):
         self._span = self._borders[1] - self._borders[0]
 
     def n_rays(self, pilot: bool) -> int:
-        return self._settings.batch_rays // 2 if pilot else self._settings.batch_rays
+        n_rays = self._settings.batch_rays * self._size
+        return int(n_rays / 2 if pilot else n_rays)
 
     def prepare(self, step: int, field: VfrField) -> None:
         x = min(1.0, step / ANNEAL_STEPS)
@@ -253,19 +280,14 @@ class ProposalGuide(SpaceGuide):
 
     def __init__(self, settings: DeviceSettings, near: float) -> None:
         super().__init__(settings, ProposalSampler(near), GridAdam, distortion)
-        self._growth = 1.0
 
     @property
     def sampler(self) -> ProposalSampler:
         return self._sampler
 
-    def n_rays(self, pilot: bool) -> int:
-        return int(super().n_rays(pilot) * self._growth)
-
     def prepare(self, step: int, field: VfrField) -> None:
         super().prepare(step, field)
-        # Batches of one size for a while: memory that each frees suits the next one.
-        self._growth = min(max(1.0, step // (GROWS_AFTER // SIZES) / SIZES), GROWTH)
+        self._size = GROWTH[True].size(step)
 
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float

@@ -15,6 +15,7 @@ from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
 from vfr_bake.training import ahead
 from vfr_bake.training.ahead import SecondThread
+from vfr_bake.training.guides import GROWTH, Growth
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=6, max_resolution=64, log2_table_size=12, head_width=24, density_width=16)
@@ -44,11 +45,19 @@ def trainer(kind: SceneKind, pilot_steps: int) -> Trainer:
 
 def test_batches_of_an_unbounded_scene_grow_with_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """64 rays, half of them in the pilot's steps; after 8 steps every second is 16 rays larger."""
-    monkeypatch.setattr("vfr_bake.training.guides.GROWS_AFTER", 8)
-    monkeypatch.setattr("vfr_bake.training.guides.GROWTH", 3.0)
+    monkeypatch.setitem(GROWTH, True, Growth(after=8, most=3.0))
     drawn = [report.n_rays for report in trainer("unbounded", 4).run()]
     assert drawn[:4] == [32] * 4 and drawn[4:10] == [64] * 6, "all rays of a scene without end are served"
     assert drawn[10:18] == [80, 80, 96, 96, 112, 112, 128, 128] and drawn[24:] == [192] * 6
+
+
+def test_batches_of_an_object_grow_with_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2,048 samples, half of them in the pilot's steps, which are filled up to the last ray."""
+    monkeypatch.setitem(GROWTH, False, Growth(after=8, most=2.0))
+    reports = list(trainer("object", 4).run())
+    most = [1024] * 4 + [2048] * 6 + [2560] * 2 + [3072] * 2 + [3584] * 2 + [4096] * 14
+    assert all(report.n_samples <= budget for report, budget in zip(reports, most, strict=True))
+    assert max(report.n_samples for report in reports[16:]) > 2048
 
 
 def test_the_threads_are_shared_out_and_given_back(two_threads: None) -> None:

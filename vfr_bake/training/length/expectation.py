@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import statistics
+from bisect import bisect_left
 from itertools import pairwise
 
-from vfr_bake.training.guides import GROWS_AFTER, GROWTH
+from vfr_bake.training.guides import GROWTH
 
 TIMED_FROM, EXPECTED_AT = 300, 400
 """The speed is that of the steps between these two: before them the pilot network learns."""
@@ -22,6 +23,9 @@ scene, 4.1 with fox and 1.5 with can (docs/notes/2026-11-28-rays-and-steps.md)."
 LATER_STEP = {False: 1.0, True: 0.45}
 """How long steps take on the whole, in steps of that look: rays through contracted space have ever fewer
 samples as surfaces form."""
+LARGER_BATCH = {False: 0.6, True: 1.0}
+"""What a batch of twice the size takes more, in steps of the first size: samples of an object share ever more
+rows of the table."""
 
 
 def typical_step(ends: list[float]) -> float:
@@ -34,35 +38,25 @@ def typical_step(ends: list[float]) -> float:
     return statistics.median(after - before for before, after in pairwise(ends))
 
 
-GROWN = GROWS_AFTER * (1 + GROWTH**2) / 2
-"""Time in which batches grow to their last size, in steps of their first."""
+def grown(n: int, unbounded: bool) -> float:
+    """Time of `n` steps on a CPU, in steps of its first batches: those of batches that grow take ever longer.
 
-
-def grown(n: float) -> float:
-    """Time of `n` steps of an unbounded scene on a CPU, in steps of its first batches: from the step S =
-    GROWS_AFTER on the step s takes s / S of them, and GROWTH at last.
-
-    >>> grown(1000), grown(2 * GROWS_AFTER) / GROWS_AFTER
-    (1000, 2.5)
+    >>> grown(1000, True), grown(4000, True), grown(10_000, True)
+    (1000.0, 5000.0, 25000.0)
     """
-    if n <= GROWS_AFTER:
-        return n
-    if n <= GROWTH * GROWS_AFTER:
-        return (GROWS_AFTER + n**2 / GROWS_AFTER) / 2
-    return GROWN + GROWTH * (n - GROWTH * GROWS_AFTER)
+    after, most = GROWTH[unbounded]
+    proportional = min(n, most * after)
+    added = max(0.0, proportional - after) ** 2 / (2 * after) + (most - 1) * (n - proportional)
+    return n + LARGER_BATCH[unbounded] * added
 
 
-def steps_of(time: float) -> float:
+def steps_of(time: float, unbounded: bool) -> int:
     """The number of steps that take so much `time`: the inverse of `grown`.
 
-    >>> [round(steps_of(grown(n))) for n in (1000, 5000, 20_000)]
+    >>> [steps_of(grown(n, True), True) for n in (1000, 5000, 20_000)]
     [1000, 5000, 20000]
     """
-    if time <= GROWS_AFTER:
-        return time
-    if time <= GROWN:
-        return math.sqrt(GROWS_AFTER * (2 * time - GROWS_AFTER))
-    return GROWTH * GROWS_AFTER + (time - GROWN) / GROWTH
+    return bisect_left(range(math.ceil(time)), time, key=lambda n: grown(n, unbounded))
 
 
 def expectation(
@@ -72,16 +66,16 @@ def expectation(
     them to compile code, and ends after `n_steps` or `minutes`.
 
     >>> expectation(18.0, 30.0, 0.025, 1_000_000, 10.0, False)
-    '25 ms a step: about 23,000 steps in 10 minutes at most, which give scenes like this 30 to 35 dB'
+    '25 ms a step: about 18,000 steps in 10 minutes at most, which give scenes like this 30 to 34 dB'
     """
     seconds_a_step *= LATER_STEP[unbounded]
     later = (60 * minutes - seconds) / seconds_a_step
-    possible = min(n_steps, EXPECTED_AT + round(steps_of(later) if unbounded else later))
+    possible = min(n_steps, EXPECTED_AT + steps_of(later, unbounded))
     doublings = max(0.0, math.log2(possible / EXPECTED_AT))
     low, high = (round(psnr + gain * math.sqrt(doublings)) for gain in DB_OF_DOUBLINGS[unbounded])
     rounded = round(possible, 1 - len(str(possible)) + 1)
-    later = max(possible - EXPECTED_AT, 0)
-    taken = min(minutes, (seconds + (grown(later) if unbounded else later) * seconds_a_step) / 60)
+    later = grown(max(possible - EXPECTED_AT, 0), unbounded)
+    taken = min(minutes, (seconds + later * seconds_a_step) / 60)
     return (
         f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {taken:.2g} minutes at most, "
         f"which give scenes like this {low} to {high} dB"
