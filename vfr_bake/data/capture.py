@@ -10,6 +10,7 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.errors import ShapeError
+from player.files.memory import give_back
 
 HOLD_OUT_EVERY = 8
 
@@ -60,7 +61,7 @@ class PosedImages:
 
     cameras: list[Camera]
     """One a picture, of the picture's size; in the model frame in a `Scene`, in the world in a `Capture`."""
-    images: Sequence[np.ndarray]
+    images: list[np.ndarray] | StoredImages
     """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha; in memory or on a disk."""
 
     def __post_init__(self) -> None:
@@ -94,6 +95,26 @@ class PosedImages:
         if isinstance(images, StoredImages):
             return PosedImages(cameras, images.some(chosen))
         return PosedImages(cameras, [images[i] for i in chosen])
+
+    def joined(self, numbers: Sequence[int]) -> np.ndarray:
+        """[n_pixels, 4] uint8: the pixels of the pictures in memory with these `numbers`, one picture behind
+        the other. The pictures are parts of it from then on, so that memory holds them once.
+
+        >>> from vfr_bake.data.demo import demo_capture
+        >>> train = demo_capture(size=16, n_train=4, n_test=1).train
+        >>> pixels = train.joined([1, 3])
+        >>> pixels.shape, bool(np.shares_memory(pixels, train.images[3]))
+        ((512, 4), True)
+        """
+        assert isinstance(self.images, list)
+        pixels = np.concatenate([self.images[i].reshape(-1, 4) for i in numbers])
+        end = 0
+        for i in numbers:
+            camera = self.cameras[i]
+            begin, end = end, end + camera.height * camera.width
+            self.images[i] = pixels[begin:end].reshape(camera.height, camera.width, 4)
+        give_back()
+        return pixels
 
     def opaque(self, number: int) -> bool:
         """Whether every pixel of a picture is opaque."""

@@ -74,15 +74,15 @@ class Pixels(NamedTuple):
     """[n_pictures, 4] float32: fx, fy, cx, cy in pixels."""
 
     @classmethod
-    def of(cls, views: PosedImages, chunk: int = 0) -> Pixels:
-        """Those of `views`; one `chunk` of them if they lie on a disk."""
+    def of(cls, views: PosedImages, joined: np.ndarray | None, chunk: int) -> Pixels:
+        """Those of `views`: `joined` [n_pixels, 4] if they are in memory, and one `chunk` if on a disk."""
         cameras, images = views.cameras, views.images
         sizes = np.array([camera.width * camera.height for camera in cameras])
         if isinstance(images, StoredImages):
             rgba, strides = images.chunk(chunk), images.strides
             places, behind = images.chunk_places(chunk)
         else:
-            rgba = np.concatenate([image.reshape(-1, 4) for image in images])
+            rgba = joined
             strides, places, behind = np.ones_like(sizes), np.zeros_like(sizes), sizes
         ends = np.cumsum(behind - places)
         return cls(
@@ -176,7 +176,8 @@ class PixelSampler:
 
         Raises TrainingError: there is nothing to draw.
         """
-        learned = range(len(views.cameras)) if witnesses is None else witnesses.learned()
+        learned = range(len(views.cameras)) if witnesses is None else witnesses.learned().tolist()
+        self._joined = None if isinstance(views.images, StoredImages) else views.joined(learned)
         self._views, self._generator, self._masked = views.some(learned), generator, masked
         self._singles = _single_pixels(witnesses, len(self._views.cameras))
         images = self._views.images
@@ -200,7 +201,7 @@ class PixelSampler:
         """Draw from a `chunk`, or from the next one that has something to draw."""
         for ahead in range(self._n_chunks):
             self._chunk = (chunk + ahead) % self._n_chunks
-            self._pixels = Pixels.of(self._views, self._chunk)
+            self._pixels = Pixels.of(self._views, self._joined, self._chunk)
             self._lottery = self._new_lottery()
             if self._lottery.n_lots:
                 self._n_left = max(1, int(CHUNK_SHARE * self._lottery.n_lots))

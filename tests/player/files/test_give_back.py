@@ -1,0 +1,38 @@
+"""Memory that was freed goes back to the machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from player.files.memory import give_back
+
+N_BYTES = 3_000_000
+"""Of a picture: little enough for the C library to keep it for the thread that has read it."""
+
+
+def held_bytes() -> int:
+    """Bytes of memory that this process has from the machine; 0 where the machine does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
+
+
+def test_what_threads_have_read_is_given_back() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        # Once it has freed a larger one, glibc keeps what is as large, and does not unmap it.
+        pool.submit(lambda: np.full(2 * N_BYTES, 1, np.uint8).sum()).result()
+        pictures = list(pool.map(lambda i: np.full(N_BYTES, i, np.uint8), range(60)))
+        kept = pictures.pop()
+        full = held_bytes()
+        pictures.clear()
+        give_back()
+        given = full - held_bytes()
+    assert (kept == 59).all()
+    assert given > 50 * N_BYTES or sys.platform != "linux"
