@@ -27,6 +27,7 @@ from player.asset.manifest import Manifest
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError
 from player.files.files import check_target
+from player.files.memory import give_back
 from player.head.head import Head
 from vfr_bake import __version__
 from vfr_bake.baking.agreement import compared_views, fitting_agreement
@@ -471,10 +472,12 @@ class _Bake:
 
     @contextmanager
     def _part(self, name: str) -> Iterator[None]:
-        """Time what is done here; parts within this one are not counted twice."""
+        """Time what is done here, and give back what it no longer needs; parts within this one are not
+        counted twice."""
         begin, others = time.monotonic(), sum(self.seconds.values())
         try:
             yield
         finally:
+            give_back()
             inside = sum(self.seconds.values()) - others
             self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - begin - inside
