@@ -14,16 +14,21 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.benchmarks.pages.beside import beside
 from tests.benchmarks.pages.documents import BESIDE, BLOCK, BLOCKS, DOCUMENTS, prose, rendered, rendered_files
 from tests.benchmarks.pages.plots import plots
+from tests.benchmarks.peers.compare import N_PIXELS, chosen_pixels, write_nerfstudio
 from tests.benchmarks.suite import conditions
 from tests.benchmarks.suite.parts import LONGEST_CORE, LONGEST_PART, PARTS
 from tests.benchmarks.suite.results import KEYS, RESULTS, RESULTS_AVX512, read_results, write_results
 from tests.benchmarks.suite.runner import Runner, Settings
 from tests.benchmarks.suite.work import Part, PartError, Work
+from vfr_bake.data.demo import demo_capture
+from vfr_bake.data.scene import build_scene
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MACHINE = {"processor": "one", "features": ["avx2"], "cores": 2, "memory_gb": 24}
@@ -426,6 +431,29 @@ def test_what_a_child_leaves_behind_counts_as_ours() -> None:
 def test_the_machine_without_flags_or_a_name_is_told_all_the_same() -> None:
     found = conditions.parse_machine("", "")
     assert found["processor"] and found["features"] == [] and found["memory_gb"] is None
+
+
+def test_another_tool_is_given_the_views_that_are_learned_from_and_held_out(tmp_path: Path) -> None:
+    scene = build_scene(demo_capture(size=16, n_train=6, n_test=2), "unbounded")
+    write_nerfstudio(scene, tmp_path)
+    frames = json.loads((tmp_path / "transforms.json").read_text(encoding="utf-8"))["frames"]
+    splits = [re.search("train|eval", frame["file_path"]).group() for frame in frames]  # type: ignore[union-attr]
+    assert splits == ["train"] * 6 + ["eval"] * 2
+    views = [
+        (view, camera)
+        for part in (scene.train, scene.test)
+        for view, camera in zip(part.images, part.cameras, strict=True)
+    ]
+    for frame, (view, camera) in zip(frames, views, strict=True):
+        with Image.open(tmp_path / frame["file_path"]) as picture:
+            assert np.array_equal(np.asarray(picture), view[..., :3])
+        assert np.array_equal(frame["transform_matrix"], camera.c2w) and frame["fl_x"] == camera.fx
+
+
+def test_pixels_of_every_test_view_are_looked_at() -> None:
+    scene = build_scene(demo_capture(size=16, n_train=6, n_test=2))
+    places = chosen_pixels(scene)
+    assert places.shape == (2, N_PIXELS // 2, 2) and places.min() == 0 and places.max() == 15
 
 
 MODULES = [
