@@ -25,7 +25,7 @@ from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.rendering.render import render_rays
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.metrics import over_background
+from vfr_bake.training.scores.metrics import over_background, psnr
 from vfr_bake.training.trainer import Trainer
 
 WHITE = np.ones(3)
@@ -38,7 +38,7 @@ class Mark(NamedTuple):
 
     steps: int
     seconds: float
-    """Of training alone."""
+    """What the training alone has taken."""
     colours: np.ndarray
     """[n_views, n, 3] in [0, 1], of the pixels that are looked at."""
 
@@ -67,18 +67,8 @@ def chosen_pixels(scene: Scene) -> np.ndarray:
     return generator.integers(0, sizes[:, None], size=(len(sizes), n, 2))
 
 
-def psnr(colours: np.ndarray, wanted: np.ndarray) -> float:
-    """Mean over the views of colours [n_views, n, 3] in [0, 1].
-
-    >>> round(psnr(np.full((2, 1, 3), 0.1), np.zeros((2, 1, 3))), 6)
-    20.0
-    """
-    errors = np.square(colours - wanted).mean(axis=(1, 2))
-    return float((-10 * np.log10(errors)).mean())
-
-
 def ours(scene: Scene, minutes: float, places: np.ndarray) -> Mark:
-    """A training of so many minutes."""
+    """A training of vfr-train that takes so many minutes."""
     trainer = Trainer(scene, TrainConfig(device="cpu", minutes=minutes))
     for _ in trainer.run():
         pass
@@ -91,10 +81,8 @@ def ours(scene: Scene, minutes: float, places: np.ndarray) -> Mark:
     return Mark(trainer.next_step, trainer.seconds, np.stack(colours))
 
 
-def nerfacto(
-    scene: Scene, options: argparse.Namespace, places: np.ndarray
-) -> list[tuple[int, float, np.ndarray]]:
-    """The same for each of the minutes of one training of nerfacto."""
+def nerfacto(scene: Scene, options: argparse.Namespace, places: np.ndarray) -> list[Mark]:
+    """One training of nerfacto, as it was after each of the minutes."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         if scene.unbounded:
@@ -108,7 +96,8 @@ def nerfacto(
         subprocess.run([str(options.nerfstudio), str(script), data[0], *files, *data[1:], *words], check=True)
         with np.load(folder / "colours.npz", allow_pickle=False) as found:
             colours = found["colours"].reshape(-1, *places.shape[:2], 3)
-            return [Mark(*mark) for mark in zip(found["steps"], found["seconds"], colours, strict=True)]
+            marks = zip(found["steps"].tolist(), found["seconds"].tolist(), colours, strict=True)
+            return [Mark(*mark) for mark in marks]
 
 
 def main() -> None:
@@ -132,11 +121,10 @@ def main() -> None:
     figures = []
     for tool, marks in found.items():
         for minutes, mark in zip(options.minutes, marks, strict=True):
-            steps, seconds, reached = int(mark.steps), float(mark.seconds), psnr(mark.colours, wanted)
-            print(f"| {minutes:g} | {tool} | {steps} | {seconds:.0f} | {reached:.2f} |")
-            figures.append(
-                {"tool": tool, "minutes": minutes, "steps": steps, "seconds": seconds, "psnr": reached}
-            )
+            reached = float(np.mean([psnr(*view) for view in zip(mark.colours, wanted, strict=True)]))
+            print(f"| {minutes:g} | {tool} | {mark.steps} | {mark.seconds:.0f} | {reached:.2f} |")
+            time = {"minutes": minutes, "steps": mark.steps, "seconds": mark.seconds}
+            figures.append({"tool": tool, "psnr": reached} | time)
     if options.json is not None:
         options.json.write_text(json.dumps(figures), encoding="utf-8")
 

@@ -12,7 +12,7 @@ import numpy as np
 from player.files.memory import give_back
 
 N_BYTES = 3_000_000
-"""Of a picture: little enough for the C library to keep it for the thread that has read it."""
+"""What a picture takes: little enough for the C library to keep it for the thread that has read it."""
 
 
 def held_bytes() -> int:
