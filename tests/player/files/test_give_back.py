@@ -28,11 +28,12 @@ def test_what_threads_have_read_is_given_back() -> None:
     with ThreadPoolExecutor(1) as pool:
         # Once it has freed a larger one, glibc keeps what is as large, and does not unmap it.
         pool.submit(lambda: np.full(2 * N_BYTES, 1, np.uint8).sum()).result()
+        # Not what is held with all pictures: they may lie where this process had free memory already.
+        before = held_bytes()
         pictures = list(pool.map(lambda i: np.full(N_BYTES, i, np.uint8), range(60)))
         kept = pictures.pop()
-        full = held_bytes()
         pictures.clear()
         give_back()
-        given = full - held_bytes()
+        more = held_bytes() - before
     assert (kept == 59).all()
-    assert given > 50 * N_BYTES or sys.platform != "linux"
+    assert more < 9 * N_BYTES or sys.platform != "linux"
