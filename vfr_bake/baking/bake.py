@@ -324,6 +324,7 @@ class _Bake:
         refined = held_out.look("refined", grid, head, self.n_fetches)
         del grid, stored
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
+        layout.forget()
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
         kept: dict[float, Spent] = {}

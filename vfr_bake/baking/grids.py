@@ -116,8 +116,16 @@ class Layout:
 
     @cached_property
     def pyramids(self) -> Pyramids:
-        """Densities and features with coarser levels."""
-        return Pyramids(pyramid_beneath(self.densities.pyramid), pyramid_beneath(self.features.pyramid))
+        """Densities and features with coarser levels; the same where they lie at the same vertices."""
+        densities = pyramid_beneath(self.densities.pyramid)
+        same = self.features is self.densities
+        return Pyramids(densities, densities if same else pyramid_beneath(self.features.pyramid))
+
+    def forget(self) -> None:
+        """Give up what was found of the vertices, some hundred megabytes; it is found again if asked for."""
+        vars(self).pop("pyramids", None)
+        for vertices in (self.densities, self.features):
+            vars(vertices).pop("pyramid", None)
 
     def _densities(self, codes: np.ndarray) -> PyramidValues:
         """The pyramid of density codes [n] that need not be whole."""

@@ -122,12 +122,12 @@ class Detail:
             teacher: rays of such views.
         """
         if cameras:
-            grid = layout.grid(density, features)
-            weights = block_weights(grid, cameras, N_SEEING, self.progress)
-            layout, density, features = self._without_unseen(grid, weights, layout, density, features)
+            layout, density, features = self._without_unseen(layout, density, features, cameras)
         grid = layout.grid(density, features)
         rays = teacher.some(N_COMPARED)
         densities, grid = self._densities(layout, density, grid, rays)
+        # The grid has the features' codes, which are found again, with those of the coarser levels.
+        grid = replace(grid, features=grid.features[:0].copy())
         return Needed(layout, density, features, densities, self._features(layout, features, grid, rays))
 
     def level_steps(self, grid: SparseGrid, max_loss_db: float | None) -> tuple[int, ...]:
@@ -151,15 +151,12 @@ class Detail:
         return self.held_out.look("detail", grid, self.head, self.n_fetches)
 
     def _without_unseen(
-        self,
-        grid: SparseGrid,
-        weights: np.ndarray,
-        layout: Layout,
-        density: np.ndarray,
-        features: np.ndarray,
+        self, layout: Layout, density: np.ndarray, features: np.ndarray, cameras: list[Camera]
     ) -> tuple[Layout, np.ndarray, np.ndarray]:
         """Layout, densities and features without cells in which the samples of all views together weigh next
         to nothing."""
+        grid = layout.grid(density, features)
+        weights = block_weights(grid, cameras, N_SEEING, self.progress)
         before = self._look(grid)
 
         def lost(share: float) -> Loss:
@@ -172,6 +169,7 @@ class Detail:
             return layout, density, features
         share = float(np.exp(found.amount))
         left = thinned(layout, heavy_blocks(weights, share))
+        layout.forget()
         n, n_left = len(layout.densities), len(left.layout.densities)
         self.left_out["hardly seen"] = (
             f"{1 - n_left / n:.0%} of the densities' vertices, and the features there: of all that the views "

@@ -25,6 +25,7 @@ from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
 from player.compiled.samples import sample_rays
 from vfr_bake.baking.cells import Progress
+from vfr_bake.baking.detail.shown import rows_within
 from vfr_bake.baking.grids import Layout, Vertices
 from vfr_bake.kernels.sample_weights import BLOCKS, add_block_weights
 
@@ -94,12 +95,8 @@ class Kept(NamedTuple):
 def corners_within(vertices: Vertices, cells: Bricks) -> Kept:
     """The corners of `cells`, which are some of the cells of which `vertices` are the corners."""
     corners = corners_of(cells)
-    index = np.empty((int(stored_bits(corners.masks).sum()), 3), np.int16)
-    brick, bit = np.nonzero(stored_bits(corners.masks))
-    for axis, shift in enumerate((6, 3, 0)):
-        index[:, axis] = corners.coords[brick, axis] * 8 + ((bit >> shift) & 7)
-    rows = vertices.pyramid.vertices[0].rows(index)
-    return Kept(Vertices(corners.coords, corners.masks, index, vertices.resolution), rows)
+    rows = rows_within(Bricks(vertices.coords, vertices.masks), corners)
+    return Kept(Vertices(corners.coords, corners.masks, vertices.index[rows], vertices.resolution), rows)
 
 
 def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) -> Bricks:
