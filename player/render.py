@@ -141,11 +141,11 @@ class Renderer:
         Args:
             camera: in the WORLD frame.
             n_fetches: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
-                can have.
+                can have. There are no more than the quality has.
             background: colour 0..1 or "transparent"; the asset's own if None.
             quality: "exact" marches every pixel; "high" and "fast" interpolate those between neighbours that
-                agree, and end rays earlier (`player.march.interpolation`), as far as the asset's `agreement`
-                allows.
+                agree (`player.march.interpolation`), fetch features at fewer places and end rays earlier, as
+                far as the asset's `agreement` and `quality_fetches` allow.
             layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
@@ -159,11 +159,11 @@ class Renderer:
         if background is None:
             red, green, blue = self.asset.manifest.background
             background = (red, green, blue)
-        high, fast = self.asset.manifest.agreement
-        levels = {"exact": 0.0, "high": high, "fast": fast}[quality]
-        k, opaque_depth = min(k, self._grid.most_samples), OPAQUE_DEPTH[quality if levels else "exact"]
-        picture = self._blank(camera, background, k, opaque_depth, layers)
-        for stage in stages(levels, picture.view.grid.contracted):
+        reduced = self._reduced(quality)
+        k = min((n for n in (k, reduced.n_fetches) if n), default=0)
+        k = min(k, self._grid.most_samples)
+        picture = self._blank(camera, background, k, reduced.opaque_depth, layers)
+        for stage in stages(reduced.levels, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
         planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
         normals = self._all_normals(picture.view, self._pool.map) if layers else None
@@ -176,6 +176,15 @@ class Renderer:
             None if features is None else features.reshape(*shape, -1),
             lambda: self._all_normals(picture.view) if normals is None else normals,
         )
+
+    def _reduced(self, quality: Quality) -> _Reduced:
+        """What pictures of a quality leave out, as the asset allows."""
+        levels, n_fetches = 0.0, 0
+        if quality != "exact":
+            number = ("high", "fast").index(quality)
+            levels = self.asset.manifest.agreement[number]
+            n_fetches = (self.asset.manifest.quality_fetches or (0, 0))[number]
+        return _Reduced(levels, n_fetches, OPAQUE_DEPTH[quality if levels or n_fetches else "exact"])
 
     def _blank(
         self,
@@ -252,6 +261,17 @@ class Renderer:
         for _ in each(find, self._tasks(view.blocks, len(EVERY))):
             pass
         return normals.reshape(view.camera.height, view.camera.width, 3)
+
+
+class _Reduced(NamedTuple):
+    """What pictures of a quality leave out."""
+
+    levels: float
+    """By how many 8-bit levels pixels may differ of which another becomes the mean; 0: all are marched."""
+    n_fetches: int
+    """Feature fetches of a ray, at most; 0: any number."""
+    opaque_depth: np.float32
+    """The optical depth at which rays stop."""
 
 
 class _Picture(NamedTuple):

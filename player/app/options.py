@@ -35,9 +35,9 @@ MOST_VIEWS = 100_000
 """Pictures of an orbit: an hour of a video at 30 frames a second has 108,000."""
 
 QUALITY = (
-    "exact renders every pixel (files); high interpolates pixels between neighbours that agree and loses "
-    "0.05 dB on average, fast 0.3 dB, a single picture up to three times that (the viewer: fast while "
-    "moving, exact when still)"
+    "exact renders every pixel (files); high interpolates pixels between neighbours that agree, or looks up "
+    "less, and loses 0.05 dB on average, fast 0.3 dB, a single picture up to three times that (the viewer: "
+    "fast while moving, exact when still)"
 )
 
 EXAMPLES = """examples:

@@ -30,7 +30,8 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `density_steps` | 1 to 8 integers, 1..255 | by how much a symbol changes a density code, on each level |
 | `n_channels` | integer, 1..1024 | of the features |
 | `feature_steps` | 1 to 8 integers, 1..255 | the same for features |
-| `agreement` | 2 numbers, 0..255 | levels for `high`, `fast`; [20, 40], contracted [16, 40], if absent |
+| `agreement` | 2 numbers, 0..255 | levels for `high`, `fast`; [20, 40], contracted [14, 28], if absent |
+| `quality_fetches` | 2 integers, 0..1024 | most fetches of a ray in `high`, `fast`; [0, 0] if absent |
 | `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
 | `colour_space` | "srgb" | |
 | `view_size` | 2 integers | width and height of the training pictures |
@@ -77,8 +78,10 @@ MAX_VALUES = 1 << 20
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_LEVEL_STEP = 128
-AGREEMENT = {False: (20.0, 40.0), True: (14.0, 40.0)}
+AGREEMENT = {False: (20.0, 40.0), True: (14.0, 28.0)}
 """`agreement` where it is absent, by `contracted`."""
+OPTIONAL = frozenset({"quality_fetches"})
+"""Keys that may be absent, and are None then."""
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
@@ -117,6 +120,7 @@ class Manifest:
     level_steps: tuple[int, ...] = (1,)
     n_fetches: int = 5
     agreement: Vector = AGREEMENT[False]
+    quality_fetches: tuple[int, ...] | None = None
     density_steps: tuple[int, ...] = (1,)
     feature_steps: tuple[int, ...] = (1,)
     background: Vector = (1.0, 1.0, 1.0)
@@ -128,7 +132,9 @@ class Manifest:
 
     def __post_init__(self) -> None:
         for key, parse in _PARSERS.items():
-            object.__setattr__(self, key, parse(f"manifest: {key}", getattr(self, key)))
+            value = getattr(self, key)
+            if value is not None or key not in OPTIONAL:
+                object.__setattr__(self, key, parse(f"manifest: {key}", value))
         _check_together(self)
 
     @property
@@ -172,7 +178,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
         document = _of_version_4(document, version)
     document.setdefault("agreement", AGREEMENT[document.get("contracted") is True])
     known = {f.name for f in fields(Manifest)}
-    missing = sorted(known - set(document))
+    missing = sorted(known - set(document) - OPTIONAL)
     if missing:
         raise FormatError(f"{where}: {missing[0]}: expected this key, got none (file not fully written?)")
     unknown = sorted(set(document) - known - {"format"})
@@ -180,9 +186,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
         raise FormatError(
             f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
-    values = {}
-    for key in known:
-        values[key] = _PARSERS[key](f"{where}: {key}", document[key])
+    values = {key: _PARSERS[key](f"{where}: {key}", document[key]) for key in known & set(document)}
     if complete:
         _check_files(f"{where}: files", version, values["files"], values["parts"])
     return Manifest(**values)
@@ -225,6 +229,7 @@ def _check_files(
 def manifest_bytes(manifest: Manifest) -> bytes:
     """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
     document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
+    document = {key: value for key, value in document.items() if value is not None}
     document["format"] = FORMAT
     document["parts"] = parts_as_json(manifest.parts)
     document["files"] = {
@@ -439,6 +444,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "n_channels": _integer(1, MAX_CHANNELS),
     "feature_steps": _steps_of_levels(255),
     "agreement": _numbers(2, 0, 255),
+    "quality_fetches": _integers(2, 0, 1024),
     "background": _numbers(3, 0, 1),
     "colour_space": _one_of("srgb"),
     "view_size": _integers(2, 1, 1 << 20),

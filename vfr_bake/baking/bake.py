@@ -30,7 +30,6 @@ from player.files.files import check_target
 from player.files.memory import give_back
 from player.head.head import Head
 from vfr_bake import __version__
-from vfr_bake.baking.agreement import compared_views, fitting_agreement
 from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import (
@@ -65,6 +64,7 @@ from vfr_bake.baking.limits import (
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
+from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
 from vfr_bake.baking.rate import (
     AIM,
     FIRST_PRICE,
@@ -170,8 +170,9 @@ class _Bake:
             level_steps = detail.level_steps(layout.played(arrays), self.config.max_loss_db)
         manifest = self._manifest(layout, arrays, level_steps)
         del teacher, needed, layout  # what is written is played and meshed in their room
-        with self._part("agreement"):
-            manifest = replace(manifest, agreement=self._agreement(manifest, arrays, head, tuning.kept))
+        with self._part("qualities"):
+            found = self._qualities(manifest, arrays, head, tuning.kept)
+            manifest = replace(manifest, agreement=found.agreement, quality_fetches=found.fetches)
         figures: dict[str, Any] = {
             "n_vertices": int(arrays.densities.first_rows[-1]),
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
@@ -379,15 +380,13 @@ class _Bake:
             price = 1 / highest_price(lambda rate: taken(1 / rate, max_mb), (AIM / share) ** 2 / price)
         return at(price).arrays
 
-    def _agreement(
-        self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage
-    ) -> tuple[float, float]:
-        """How nearly pixels have to agree in `high` and `fast` pictures of the asset."""
+    def _qualities(self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage) -> Qualities:
+        """What `high` and `fast` pictures of the asset may leave out."""
         views = compared_views(self.model, self.config.check_views)
         error = self.held_out.model_error * 10 ** (refined.loss.db / 10)
         with TemporaryDirectory() as folder:
             asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head})
-            return fitting_agreement(asset, views, error)
+            return fitting_qualities(asset, views, error)
 
     def _other_bytes(self, max_mb: float) -> int:
         """What the files of an asset of `max_mb` megabytes take beside the stored values and the

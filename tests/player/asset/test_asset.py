@@ -218,7 +218,19 @@ def test_agreement_may_be_absent(asset: Asset) -> None:
     del document["agreement"]
     assert parse_manifest(json.dumps(document).encode(), "m.json").agreement == (20.0, 40.0)
     space = {"contracted": True, "aabb": [[-2.0] * 3, [2.0] * 3]}
-    assert parse_manifest(json.dumps(document | space).encode(), "m.json").agreement == (14.0, 40.0)
+    assert parse_manifest(json.dumps(document | space).encode(), "m.json").agreement == (14.0, 28.0)
+
+
+def test_fetches_of_qualities_may_be_absent(asset: Asset) -> None:
+    document = json.loads(manifest_bytes(replace(asset.manifest, quality_fetches=(3, 0))))
+    parsed = parse_manifest(json.dumps(document).encode(), "m.json")
+    assert parsed.quality_fetches == (3, 0)
+    for wrong in ([3], [3, 1025], [-1, 3], [3, 1.5], None):
+        with pytest.raises(FormatError, match="quality_fetches: expected"):
+            parse_manifest(json.dumps(document | {"quality_fetches": wrong}).encode(), "m.json")
+    del document["quality_fetches"]
+    parsed = parse_manifest(json.dumps(document).encode(), "m.json")
+    assert parsed.quality_fetches is None and b"quality_fetches" not in manifest_bytes(parsed)
 
 
 def test_versions(asset: Asset) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -231,6 +232,36 @@ def test_marched_pixels_are_those_of_the_whole_picture(
         for frame in (exact, other)
     )
     (HIGH if quality == "high" else FAST).check(np.sqrt(np.mean((a - b) ** 2)))
+
+
+def with_fetches(asset: Asset, fetches: tuple[int, int] | None) -> Asset:
+    """The asset with so many fetches of a ray in `high` and `fast` pictures, whose pixels are all marched."""
+    changed = Asset.open(asset.folder)
+    manifest = replace(asset.manifest, agreement=(0.0, 0.0), quality_fetches=fetches)
+    object.__setattr__(changed, "manifest", manifest)
+    return changed
+
+
+@pytest.mark.parametrize("march", MARCHES)
+@pytest.mark.parametrize(
+    "quality, fetches, asked, expected",
+    [("fast", (3, 2), None, 2), ("high", (3, 2), None, 3), ("high", (3, 2), 1, 1), ("fast", (3, 2), 0, 2)],
+)
+def test_rays_fetch_no_more_than_the_quality_has(
+    march: str, quality: Quality, fetches: tuple[int, int], asked: int | None, expected: int, asset: Asset,
+    camera: Camera,
+) -> None:  # fmt: skip
+    got = render(with_fetches(asset, fetches), camera, quality, march, n_fetches=asked)
+    same = render_all(asset, camera, quality, march, n_fetches=expected)
+    MARCHED.holds(got.rgb.tobytes() == same.rgb.tobytes())
+
+
+@pytest.mark.parametrize("quality", LOSSY)
+def test_a_quality_that_leaves_out_nothing_is_exact(quality: Quality, asset: Asset, camera: Camera) -> None:
+    exact = render(asset, camera, "exact")
+    for fetches in ((0, 0), None):
+        got = render(with_fetches(asset, fetches), camera, quality)
+        MARCHED.holds(got.rgb.tobytes() == exact.rgb.tobytes())
 
 
 @pytest.mark.parametrize("march", MARCHES)

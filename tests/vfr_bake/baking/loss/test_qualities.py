@@ -1,4 +1,4 @@
-"""How nearly pixels have to agree in `high` and `fast` pictures: as much as each asset allows."""
+"""What `high` and `fast` pictures leave out: as much as each asset allows."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from player.asset.manifest import AGREEMENT
 from player.cameras.camera import Camera, orbit
 from player.march.interpolation import Quality
 from player.render import Renderer
-from vfr_bake.baking import agreement
-from vfr_bake.baking.agreement import ALLOWED_DB, SHARES, WORST, View, compared_views, fitting_agreement
+from vfr_bake.baking import qualities
 from vfr_bake.baking.bake import bake
+from vfr_bake.baking.limits import LOOKUPS
+from vfr_bake.baking.qualities import ALLOWED_DB, SHARES, WORST, View, compared_views, fitting_qualities
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
 
 @pytest.fixture(scope="module")
 def asset(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    folder = tmp_path_factory.mktemp("agreement") / "asset"
+    folder = tmp_path_factory.mktemp("qualities") / "asset"
     config = BakeConfig(
         resolution=96, feature_resolution=96, mesh_resolution=16, refine_steps=0, check_views=1
     )
@@ -32,7 +33,7 @@ def asset(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Asset:
 @pytest.fixture
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures so small are mostly edges: nearly all pixels may be marched here."""
-    monkeypatch.setattr(agreement, "MOST_MARCHED", 1.0)
+    monkeypatch.setattr(qualities, "MARCH", 0)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +57,12 @@ def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[View]:
     ]
 
 
+def fewest(asset: Asset) -> int:
+    """Half of the fetches of an exact picture, or the next larger number that is tried."""
+    own = asset.manifest.n_fetches
+    return min(n for n in (*LOOKUPS, own) if 2 * n >= own)
+
+
 def lost(asset: Asset, views: list[View], quality: Quality) -> np.ndarray:
     """[n_views] what pictures of a quality lose in dB, by a loop."""
     cameras = [view.camera for view in views]
@@ -74,46 +81,57 @@ def test_pictures_with_the_levels_that_are_found_lose_what_is_allowed(
     asset: Asset, cameras: list[Camera], noise: float
 ) -> None:
     views = views_with(asset, cameras, noise)
-    found = fitting_agreement(asset, views, 1.0)
-    agreed = Asset.open(asset.folder)
-    object.__setattr__(agreed, "manifest", replace(asset.manifest, agreement=found))
-    for quality, allowed in ALLOWED_DB.items():
-        loss = lost(agreed, views, quality)
-        assert loss.mean() <= allowed and loss.max() <= WORST * allowed
-    usual = AGREEMENT[False]
-    wider = replace(asset.manifest, agreement=tuple(levels / SHARES[1] for levels in found))
-    object.__setattr__(agreed, "manifest", wider)
-    for (quality, allowed), levels, most in zip(ALLOWED_DB.items(), found, usual, strict=True):
-        if 0 < levels < most:
-            loss = lost(agreed, views, quality)
-            bound = loss.mean() + 2 * loss.std(ddof=1) / np.sqrt(len(loss))
-            assert bound > allowed or loss.max() > WORST * allowed, "more levels would have been allowed"
+    found = fitting_qualities(asset, views, 1.0)
+
+    def playing(agreement: tuple[float, ...], fetches: tuple[int, ...]) -> Asset:
+        played = Asset.open(asset.folder)
+        manifest = replace(asset.manifest, agreement=agreement, quality_fetches=fetches)
+        object.__setattr__(played, "manifest", manifest)
+        return played
+
+    def too_much(agreement: tuple[float, ...], fetches: tuple[int, ...], quality: Quality) -> bool:
+        loss, allowed = lost(playing(agreement, fetches), views, quality), ALLOWED_DB[quality]
+        bound = loss.mean() + 2 * loss.std(ddof=1) / np.sqrt(len(loss))
+        return bool(bound > allowed or loss.max() > WORST * allowed)
+
+    wider = tuple(levels / SHARES[1] for levels in found.agreement)
+    for number, quality in enumerate(ALLOWED_DB):
+        loss = lost(playing(*found), views, quality)
+        assert loss.mean() <= ALLOWED_DB[quality] and loss.max() <= WORST * ALLOWED_DB[quality]
+        if 0 < found.agreement[number] < AGREEMENT[False][number]:
+            assert too_much(wider, (0, 0), quality), "more levels would have been allowed"
+        if found.fetches[number] != fewest(asset):
+            assert too_much(found.agreement, (fewest(asset),) * 2, quality), "fewer would have been allowed"
 
 
 @pytest.mark.usefixtures("any_share")
 def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras: list[Camera]) -> None:
     views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
-    found = [fitting_agreement(asset, views, error) for error in (1.0, 1e-3, 3e-4, 1e-9)]
+    every = [fitting_qualities(asset, views, error) for error in (1.0, 1e-3, 3e-4, 1e-9)]
+    found = [qualities.agreement for qualities in every]
     assert found[0] == AGREEMENT[False] and found[-1] == (0.0, 0.0)
     assert found == sorted(found, reverse=True) and found[1] > found[2]
     assert all(high <= fast for high, fast in found)
+    assert every[0].fetches == (fewest(asset),) * 2 and every[-1].fetches == (0, 0)
 
 
 @pytest.mark.usefixtures("any_share")
-def test_nothing_is_interpolated_where_nearly_all_would_be_marched(
+def test_where_most_would_be_marched_rays_fetch_less_instead(
     asset: Asset, cameras: list[Camera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
-    assert min(fitting_agreement(asset, views, 1.0)) > 0
-    monkeypatch.setattr(agreement, "MOST_MARCHED", 0.0)
-    assert fitting_agreement(asset, views, 1.0) == (0.0, 0.0)
+    assert min(fitting_qualities(asset, views, 1.0).agreement) > 0
+    monkeypatch.setattr(qualities, "MARCH", 1e9)
+    monkeypatch.setattr(qualities, "FEWER", 0.0)
+    found = fitting_qualities(asset, views, 1.0)
+    assert found.agreement == (0.0, 0.0) and found.fetches == (fewest(asset),) * 2
 
 
 @pytest.mark.usefixtures("any_share")
 def test_one_view_is_trusted_less(asset: Asset, cameras: list[Camera]) -> None:
     view = View(cameras[0], np.arange(96 * 80), None)
-    alone, twice = (fitting_agreement(asset, [view] * n, 1e-3) for n in (1, 2))
-    assert all(a <= b for a, b in zip(alone, twice, strict=True))
+    alone, twice = (fitting_qualities(asset, [view] * n, 1e-3) for n in (1, 2))
+    assert all(a <= b for a, b in zip(alone.agreement, twice.agreement, strict=True))
 
 
 def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> None:
@@ -128,4 +146,5 @@ def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> No
 
 
 def test_the_asset_has_what_was_found(model: Model, asset: Asset) -> None:
-    assert asset.manifest.agreement == fitting_agreement(asset, compared_views(model, 1), 1.0)
+    found = fitting_qualities(asset, compared_views(model, 1), 1.0)
+    assert (asset.manifest.agreement, asset.manifest.quality_fetches) == found

@@ -1,10 +1,15 @@
-"""How nearly pixels have to agree for another to become their mean, in `high` and `fast` pictures.
+"""What `high` and `fast` pictures of an asset leave out: how nearly pixels have to agree for another to
+become their mean, and at how many places a ray fetches features.
 
 What that costs in decibels depends on the asset: the sharper it is and the nearer to the photographs, the
-more the same levels lose. So the levels are chosen for each asset, by pixels of whole photographs that
-training has not learned from (`vfr_bake.data.witnesses`). Where there are none, pictures between the training
-views are compared with exact ones: these are off by E from photographs, and with a mean square difference e
-to them, which has nothing to do with that, 10 log10(1 + e / E) dB are lost.
+more the same levels lose. So both are chosen for each asset, by pixels of whole photographs that training has
+not learned from (`vfr_bake.data.witnesses`). Where there are none, pictures between the training views are
+compared with exact ones: these are off by E from photographs, and with a mean square difference e to them,
+which has nothing to do with that, 10 log10(1 + e / E) dB are lost.
+
+An interpolated picture is marched in stages, whose rays lie apart: they share neither steps nor cache lines,
+and take about APART times as long. Where most of them are left to march, pictures with fewer fetches, all of
+whose pixels are marched at once, are faster.
 """
 
 from __future__ import annotations
@@ -12,16 +17,19 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.asset import Asset
-from player.asset.manifest import AGREEMENT
+from player.asset.manifest import AGREEMENT, Manifest
 from player.cameras.camera import Camera
 from player.files.images import to_8_bit
+from player.head.head import read_head_file
 from player.march.interpolation import Quality
 from player.render import Renderer
 from vfr_bake.baking.held_out import SEED, views_between
+from vfr_bake.baking.limits import LOOKUPS
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import over_background
 
@@ -37,9 +45,10 @@ SHARES = tuple(0.85**n for n in range(16))
 """Shares of the usual levels that are tried; behind the last, every pixel is marched."""
 MOST_PIXELS = 1_500_000
 """Pixels of all pictures that are compared, at most, but for the first picture."""
-MOST_MARCHED = 0.9
-"""Share of the pixels that show anything which may be left to march: marched in stages, more of them would
-take longer than all do at once, and lose something for it."""
+MARCH = 70_000
+"""A ray takes about as long as a head of so many weights for a pixel."""
+APART, FEWER = 2.0, 0.8
+"""How many times as long it takes beside rays that lie apart, and with fewer fetches."""
 LONGEST_SIDE = 640
 """Pixels along a side of pictures between views, at most: larger ones are smoother, and lose less."""
 
@@ -74,8 +83,17 @@ def compared_views(model: Model, n_views: int) -> list[View]:
     return found
 
 
-def fitting_agreement(asset: Asset, views: Sequence[View], error: float) -> tuple[float, float]:
-    """The levels for `high` and `fast` pictures with which they lose what is allowed.
+class Qualities(NamedTuple):
+    """What `high` and `fast` pictures leave out."""
+
+    agreement: tuple[float, ...]
+    """By how many 8-bit levels pixels may differ of which another becomes the mean; 0: all are marched."""
+    fetches: tuple[int, ...]
+    """Feature fetches of a ray, at most; 0: as many as in exact pictures."""
+
+
+def fitting_qualities(asset: Asset, views: Sequence[View], error: float) -> Qualities:
+    """What `high` and `fast` pictures may leave out to lose what is allowed.
 
     Args:
         asset: which is played.
@@ -84,10 +102,10 @@ def fitting_agreement(asset: Asset, views: Sequence[View], error: float) -> tupl
     """
     with Renderer(asset) as renderer:
         played = _Played(renderer, views, error)
-        high, fast = (played.levels(quality, usual) for quality, usual in zip(
-            ALLOWED_DB, AGREEMENT[asset.manifest.contracted], strict=True
-        ))  # fmt: skip
-        return high, fast
+        usual = AGREEMENT[asset.manifest.contracted]
+        agreement = tuple(played.levels(*each) for each in zip(ALLOWED_DB, usual, strict=True))
+        fetches = tuple(played.fetches(*each) for each in zip(ALLOWED_DB, agreement, strict=True))
+        return Qualities(agreement, fetches)
 
 
 class _Played:
@@ -97,26 +115,39 @@ class _Played:
         self._renderer, self._asset, self._views, self._error = renderer, renderer.asset, views, error
         self._exact, self._n_exact = self._pictures("exact")
         self._errors = self._off(self._exact)
+        self._head = read_head_file(self._asset.path("head.onnx"), self._manifest.n_channels)[1].n_parameters
+
+    @property
+    def _manifest(self) -> Manifest:
+        return self._asset.manifest
 
     def levels(self, quality: Quality, usual: float) -> float:
         """The most levels with which pictures of the quality lose what is allowed, the fewer, the less; 0
-        where nearly all pixels would be marched all the same."""
-        tried = [round(usual * share, 1) for share in SHARES]
-        found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels))]
-        self._agree_within(found)
+        where so many pixels would be marched all the same that it does not pay."""
+        tried, every = [round(usual * share, 1) for share in SHARES], self._manifest.n_fetches
+        found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels, every))]
+        self._leave_out(found, every)
         _, n_marched = self._pictures(quality)
-        return found if n_marched <= MOST_MARCHED * self._n_exact else 0.0
+        pays = n_marched * (APART * MARCH + self._head) <= self._n_exact * (FEWER * MARCH + self._head)
+        return found if pays else 0.0
 
-    def _agree_within(self, levels: float) -> None:
-        """Have pixels become the mean of others that differ by so many levels."""
-        manifest = replace(self._asset.manifest, agreement=(levels, levels))
+    def fetches(self, quality: Quality, levels: float) -> int:
+        """The fewest fetches of a ray with which pictures of the quality lose what is allowed, but no less
+        than half of them; 0 where all lose more, because rays end earlier."""
+        own = self._manifest.n_fetches
+        tried = sorted({n for n in (*LOOKUPS, own) if own <= 2 * n and 0 < n <= own})
+        return [*tried, 0][bisect_left(tried, True, key=lambda n: self._fits(quality, levels, n))]
+
+    def _leave_out(self, levels: float, n_fetches: int) -> None:
+        """Have pictures of either quality leave out so much."""
+        manifest = replace(self._manifest, agreement=(levels,) * 2, quality_fetches=(n_fetches,) * 2)
         changed = replace(self._asset, manifest=manifest)
         vars(changed)["grid"] = self._asset.grid  # it need not be built again
         self._renderer.show(changed)
 
-    def _fits(self, quality: Quality, levels: float) -> bool:
-        """Whether pictures of a quality lose at most what is allowed, with so many levels."""
-        self._agree_within(levels)
+    def _fits(self, quality: Quality, levels: float, n_fetches: int) -> bool:
+        """Whether pictures of a quality that leave out so much lose at most what is allowed."""
+        self._leave_out(levels, n_fetches)
         errors = self._off(self._pictures(quality)[0])
         lost, allowed = 10 * np.log10(errors / self._errors), ALLOWED_DB[quality]
         most = OF_ONE * lost[0]
