@@ -61,4 +61,4 @@ def _inside(grid: PyramidValues) -> PyramidValues:
     whole = Bricks(coords, live_cells(coords, packed_bits(inside), index))
     kept = Bricks(cells.coords, cells.masks & whole.masks_at(cells.coords)).without_empty()
     pyramid = Pyramid(grid.pyramid.resolution, (kept,))
-    return PyramidValues(pyramid, (values[vertices.rows(pyramid.vertices[0].index)],))
+    return PyramidValues(pyramid, (values[vertices.rows_of(pyramid.vertices[0].bricks)],))

@@ -116,6 +116,17 @@ class Vertices:
         rows[there] = np.arange(self.n, dtype=np.int32)
         return rows
 
+    def rows_of(self, part: Bricks) -> np.ndarray:
+        """[n] int32, ascending: the rows of the vertices of `part`, which are some of these.
+
+        >>> brick = np.zeros((1, 3), np.uint16)
+        >>> whole, part = (Bricks(brick, np.array([[bits] + [0] * 7], np.uint64)) for bits in (14, 10))
+        >>> Vertices(whole, np.zeros((1, 8), np.uint64)).rows_of(part).tolist()
+        [0, 2]
+        """
+        there = stored_bits(part.masks_at(self.bricks.coords))[stored_bits(self.bricks.masks)]
+        return np.flatnonzero(there).astype(np.int32)
+
     def rows(self, index: np.ndarray) -> np.ndarray:
         """[n] int32: the rows of vertices [n, 3]; -1 where there is none."""
         if not len(self.bricks):

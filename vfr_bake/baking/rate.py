@@ -344,7 +344,7 @@ class Prices:
 def _shown_importance(grid: Grid, wanted: Wanted, whole: Pyramid, finest: np.ndarray) -> list[np.ndarray]:
     """The importance of the vertices that are left of the pyramid `whole`."""
     return [
-        of_level[vertices.rows(left.index)]
+        of_level[vertices.rows_of(left.bricks)]
         for of_level, vertices, left in zip(
             importance_of_levels(grid, whole, finest), whole.vertices, wanted.pyramid.vertices, strict=True
         )

@@ -25,7 +25,6 @@ from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
 from player.compiled.samples import sample_rays
 from vfr_bake.baking.cells import Progress
-from vfr_bake.baking.detail.shown import rows_within
 from vfr_bake.baking.grids import Layout, Vertices
 from vfr_bake.kernels.sample_weights import BLOCKS, add_block_weights
 
@@ -95,7 +94,7 @@ class Kept(NamedTuple):
 def corners_within(vertices: Vertices, cells: Bricks) -> Kept:
     """The corners of `cells`, which are some of the cells of which `vertices` are the corners."""
     corners = corners_of(cells)
-    rows = rows_within(Bricks(vertices.coords, vertices.masks), corners)
+    rows = vertices.pyramid.vertices[0].rows_of(corners)
     return Kept(Vertices(corners.coords, corners.masks, vertices.index[rows], vertices.resolution), rows)
 
 

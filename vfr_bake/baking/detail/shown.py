@@ -180,24 +180,12 @@ def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, 
     finer one at its place has the value of that."""
     found: list[np.ndarray] = []
     for level, (whole, left) in enumerate(zip(choice.pyramid.vertices, shown.vertices, strict=True)):
-        of_level = take_rows(values[level], rows_within(whole.bricks, left.bricks))
+        of_level = take_rows(values[level], whole.rows_of(left.bricks))
         if sampled and level:
             finer = shown.vertices[level - 1].rows(left.index * 2)
             of_level[finer >= 0] = found[-1][finer[finer >= 0]]
         found.append(of_level)
     return Wanted(shown, found)
-
-
-def rows_within(whole: Bricks, part: Bricks) -> np.ndarray:
-    """[n] int32, ascending: the rows of the vertices of `part`, which are some of those of `whole`.
-
-    >>> brick = np.zeros((1, 3), np.uint16)
-    >>> whole, part = (Bricks(brick, np.array([[bits] + [0] * 7], np.uint64)) for bits in (0b1110, 0b1010))
-    >>> rows_within(whole, part).tolist()
-    [0, 2]
-    """
-    there = stored_bits(part.masks_at(whole.coords))[stored_bits(whole.masks)]
-    return np.flatnonzero(there).astype(np.int32)
 
 
 def take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
