@@ -18,8 +18,8 @@ from player.errors import ConfigError, DataError
 
 VIEWS = 50
 """Most views that are played for the mesh."""
-OTHERS = 15
-"""Bytes of the other files for a byte of the mesh: it is at most a sixteenth of the asset."""
+OTHERS = 9
+"""Bytes of the other files for a byte of the mesh: it is at most a tenth of the asset."""
 FEWEST_BYTES = 43_000
 """A mesh of about 2,000 faces, which every asset may have."""
 
@@ -71,7 +71,7 @@ def mesh_bytes(others: int, max_mb: float | None) -> int:
         max_mb: megabytes that the whole asset may take; None is any number.
 
     >>> mesh_bytes(9_000_000, None), mesh_bytes(9_000_000, 9.5), mesh_bytes(9_000_000, 8.0)
-    (600000, 500000, 43000)
+    (1000000, 500000, 43000)
     """
     most = others // OTHERS
     if max_mb is not None:
