@@ -326,6 +326,7 @@ class _Bake:
         del grid, stored
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         layout.forget()
+        del matters
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
         kept: dict[float, Spent] = {}
@@ -338,7 +339,9 @@ class _Bake:
                 return kept[price]
             tried.append(price)
             progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
-            return prices.at(price)
+            spent = prices.at(price)
+            give_back()  # what its threads have used, before there is a grid of it
+            return spent
 
         def keep(price: float, spent: Spent) -> None:
             kept.clear()
