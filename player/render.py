@@ -179,11 +179,10 @@ class Renderer:
 
     def _reduced(self, quality: Quality) -> _Reduced:
         """What pictures of a quality leave out, as the asset allows."""
-        levels, n_fetches = 0.0, 0
+        levels, n_fetches, manifest = 0.0, 0, self.asset.manifest
         if quality != "exact":
             number = ("high", "fast").index(quality)
-            levels = self.asset.manifest.agreement[number]
-            n_fetches = (self.asset.manifest.quality_fetches or (0, 0))[number]
+            levels, n_fetches = manifest.agreement[number], (manifest.quality_fetches or (0, 0))[number]
         return _Reduced(levels, n_fetches, OPAQUE_DEPTH[quality if levels or n_fetches else "exact"])
 
     def _blank(

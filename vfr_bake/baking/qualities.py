@@ -124,9 +124,9 @@ class _Played:
     def levels(self, quality: Quality, usual: float) -> float:
         """The most levels with which pictures of the quality lose what is allowed, the fewer, the less; 0
         where so many pixels would be marched all the same that it does not pay."""
-        tried, every = [round(usual * share, 1) for share in SHARES], self._manifest.n_fetches
-        found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels, every))]
-        self._leave_out(found, every)
+        tried = [round(usual * share, 1) for share in SHARES]
+        found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels, 0))]
+        self._leave_out(found, 0)
         _, n_marched = self._pictures(quality)
         pays = n_marched * (APART * MARCH + self._head) <= self._n_exact * (FEWER * MARCH + self._head)
         return found if pays else 0.0
