@@ -74,7 +74,7 @@ def test_the_asset_holds_all_of_space(out: Path) -> None:
 
 def test_training_tells_what_it_knows_of_views_between_the_pictures(out: Path) -> None:
     found = json.loads((out / "train.json").read_text())["witness_psnr"]
-    assert 12 < found["whole"] <= found["single"] + 1 < 40
+    assert 12 < found["whole"] <= found["patches"] + 1 < 40
 
 
 def test_played_training_views_are_the_photographs_nearly_as_well_as_the_model_knows_them(

@@ -119,7 +119,7 @@ def _train(options: Any) -> int:
     figures["blurred"] = blurred
     witnesses = trainer.witness_psnr() if processes.first and not interrupted else None
     if witnesses is not None:
-        figures["witness_psnr"] = {"single": witnesses.single, "whole": witnesses.whole}
+        figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
     if processes.first:
         model = trained_model(trainer, scene, figures)
         save_model(options.model, model)

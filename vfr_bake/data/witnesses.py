@@ -3,14 +3,16 @@
 The test split is there to report on, so nothing may be chosen by it. What a bake loses is therefore measured
 on pixels of the training split that are kept apart before training begins, of two kinds:
 
-- *single pixels*, alike many of every view. They cover the whole scene evenly, but the model has learned the
-  pixels beside them, and is better there than on a view that it does not know.
+- *patches*, squares of pixels, as many of every view. They cover the whole scene. What is inside of a patch
+  the model knows from other views alone, as it knows a test view. Single pixels, with learned ones all around
+  them, it shows far better (docs/notes/2026-11-29-patches-of-witnesses.md).
 - pixels of a few *whole views*, of which training draws none. These views are to the model what test views
   are, but there are only a few of them.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +23,9 @@ from vfr_bake.data.view_pixels import ViewPixels, spread
 N_WITNESSES = 60_000
 """Number of witnesses at most; half of them are of whole views, where there are any."""
 MOST_OF_A_VIEW = 0.02
-"""Largest share of a view's pixels that are kept as single pixels: a small scene needs its pixels itself."""
+"""Largest share of a view's pixels that are kept as patches: a small scene needs its pixels itself."""
+PATCH = 16
+"""Pixels along an edge of a patch, about: those of a view are as many as fit into its share of witnesses."""
 FEWEST_VIEWS, VIEWS_OF_A_WHOLE, MOST_WHOLE = 20, 25, 4
 """Whole views are kept from as many training views on, about one in so many, and at most so many."""
 SEED = 20
@@ -43,15 +47,15 @@ class Witnesses(ViewPixels):
 def choose_witnesses(views: PosedImages) -> Witnesses:
     """Choose the witnesses of training `views`; the same pictures' sizes always give the same choice.
 
-    Single pixels are drawn at random, one from each of as many equally long runs of a view's pixels as it has
-    witnesses, the same number from every view, and at most MOST_OF_A_VIEW of it. Pictures that are too small
-    for that have none.
+    Every view has about the same number of pixels in patches, and at most MOST_OF_A_VIEW of it. Pictures that
+    are too small for that have none. Of whole views, pixels are drawn at random, one from each of as many
+    equally long runs as there are to be.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 20, 1)
     >>> chosen = choose_witnesses(train)
     >>> chosen.whole.tolist(), chosen.counts.tolist()[8:13]
-    ([10], [5, 5, 256, 5, 5])
+    ([10], [4, 4, 256, 4, 4])
     """
     n_views = len(views.cameras)
     n_pixels = np.array([camera.width * camera.height for camera in views.cameras])
@@ -63,9 +67,30 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     most = (MOST_OF_A_VIEW * n_pixels[learned]).astype(int)
     counts[learned] = np.minimum(_shares(N_WITNESSES - n_of_whole, len(learned)), most)
     random = np.random.default_rng(SEED)
-    pixels = [spread(n, of, random) for n, of in zip(counts.tolist(), n_pixels.tolist(), strict=True)]
+    pixels = [
+        spread(n, of, random) if view in whole else patches(n, camera.width, camera.height, random)
+        for view, (n, of, camera) in enumerate(zip(counts, n_pixels, views.cameras, strict=True))
+    ]
+    counts = np.array([len(some) for some in pixels], np.int32)
     rgba = [views.pixels(view, rows) for view, rows in enumerate(pixels)]
     return Witnesses(counts, np.concatenate(pixels).astype(np.int32), np.concatenate(rgba), whole)
+
+
+def patches(n: int, width: int, height: int, random: np.random.Generator) -> np.ndarray:
+    """[n_pixels] int64, ascending: the numbers, row * width + column, of at most `n` pixels of a picture, in
+    squares at random places, one in each of as many equal parts of its longer side.
+
+    >>> patches(18, 10, 4, np.random.default_rng(0)).tolist()
+    [5, 6, 7, 8, 15, 16, 17, 18, 25, 26, 27, 28, 35, 36, 37, 38]
+    """
+    n_patches = max(1, round(n / PATCH**2))
+    longer, shorter = max(width, height), min(width, height)
+    edges = np.arange(n_patches + 1) * longer // n_patches
+    size = min(math.isqrt(n // n_patches), shorter, int(np.diff(edges).min()))
+    along = random.integers(edges[:-1], edges[1:] - size + 1)[:, None] + np.arange(size)
+    across = random.integers(0, shorter - size + 1, n_patches)[:, None] + np.arange(size)
+    rows, columns = (along, across) if height >= width else (across, along)
+    return np.sort((rows[:, :, None] * width + columns[:, None, :]).ravel())
 
 
 def whole_views(n_views: int) -> np.ndarray:

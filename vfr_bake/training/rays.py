@@ -179,7 +179,7 @@ class PixelSampler:
         learned = range(len(views.cameras)) if witnesses is None else witnesses.learned().tolist()
         self._joined = None if isinstance(views.images, StoredImages) else views.joined(learned)
         self._views, self._generator, self._masked = views.some(learned), generator, masked
-        self._singles = _single_pixels(witnesses, len(self._views.cameras))
+        self._patches = _patches(witnesses, len(self._views.cameras))
         images = self._views.images
         self._n_chunks = images.n_chunks if isinstance(images, StoredImages) else 1
         self._by_detail = by_detail and not isinstance(images, StoredImages)
@@ -217,7 +217,7 @@ class PixelSampler:
             lots = np.ones(len(pixels.rgba), np.uint8)
         if self._masked and pixels.rgba.shape[1] == 4:
             lots[pixels.rgba[:, 3] < 255] = 0
-        lots[_indices(pixels, *self._singles)] = 0
+        lots[_indices(pixels, *self._patches)] = 0
         return Lottery(lots)
 
     def _lots_drawn(self, n_rays: int) -> Tensor:
@@ -276,9 +276,9 @@ class DevicePixelSampler(PixelSampler):
         )
 
 
-def _single_pixels(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, np.ndarray]:
-    """[n_single] int64 each: the single witnesses' views, counted among the learned ones, and their numbers
-    in these."""
+def _patches(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, np.ndarray]:
+    """[n] int64 each: the views of the witnesses in patches, counted among the learned ones, and their
+    numbers in these."""
     if witnesses is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     among = np.full(len(witnesses.counts), -1)

@@ -1,18 +1,15 @@
 """What pictures lose against photographs, by their errors at the witnesses (`vfr_bake.data.witnesses`).
 
 Letters: e is the mean square error of a witness over its three channels, between 8-bit pictures as in an
-evaluation; S is the mean of e over the single pixels, and W_v that over the pixels of the whole view v. What
+evaluation; P is the mean of e over the patches, and W_v that over the pixels of the whole view v. What
 `after` loses compared with `before` is
 
-    loss = 1/3 dB(S) + 2/3 mean_v dB(W_v),    dB(E) = 10 log10(E_after / E_before),
+    loss = 1/2 dB(P) + 1/2 mean_v dB(W_v),    dB(E) = 10 log10(E_after / E_before),
 
-differences of PSNRs, as test views are compared: a view with large errors counts for no more than another.
-Where there is one kind only, it has all of the weight.
-
-Single pixels tell a larger loss than there is: the model has learned the pixels beside them, and some of what
-it has learned no other view shows. Whole views are seen as test views are, but four views are few. The
-weights are those that came near to the loss on all test views, over several scenes
-(docs/notes/2026-11-23-witnesses.md).
+differences of PSNRs. Where there is one kind only, it has all of the weight. Patches are of all views, but
+tell a little more than there is, because the model has learned what is around them. Whole views are seen as
+test views are, but four views are few. The weights are those that came near to the loss on all test views,
+over several scenes (docs/notes/2026-11-29-patches-of-witnesses.md).
 """
 
 from __future__ import annotations
@@ -25,8 +22,8 @@ from player.files.images import to_8_bit
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.scores.metrics import over_background
 
-SINGLE_WEIGHT = 1 / 3
-"""Weight of the single pixels, where there are whole views too."""
+PATCH_WEIGHT = 1 / 2
+"""Weight of the patches, where there are whole views too."""
 BLOCKS_OF_A_VIEW = 16
 """Where there is one whole view, its pixels are as many runs of rows, each of which is left out once."""
 
@@ -75,8 +72,8 @@ class WitnessLoss:
         _, self._block = np.unique(views, return_inverse=True)
         self._n_blocks = int(self._block.max()) + 1
         self._kinds = [np.unique(self._block[kind]) for kind in (~is_whole, is_whole) if kind.any()]
-        """The blocks of the single pixels, and those of whole views."""
-        self._weights = (SINGLE_WEIGHT, 1 - SINGLE_WEIGHT) if len(self._kinds) == 2 else (1.0,)
+        """The blocks of the patches, one for each view, and those of whole views."""
+        self._weights = (PATCH_WEIGHT, 1 - PATCH_WEIGHT) if len(self._kinds) == 2 else (1.0,)
         several = len(witnesses.whole) > 1
         self._by_view = [several and blocks is self._kinds[-1] for blocks in self._kinds]
         """Whether the blocks of a kind are whole views, each of which has a loss of its own."""

@@ -22,8 +22,8 @@ class WitnessPsnr(NamedTuple):
     """PSNR in dB at the witnesses; None where there are none of a kind."""
 
     every: float
-    single: float | None
-    """At single pixels of the pictures that are learned from."""
+    patches: float | None
+    """In patches of the pictures that are learned from."""
     whole: float | None
     """At pixels of whole pictures that are not."""
 
@@ -35,13 +35,13 @@ class WitnessPsnr(NamedTuple):
         >>> WitnessPsnr(29.0, 33.0, 27.0).lines()[1]  # doctest: +ELLIPSIS
         'warning: views between the pictures are shown much worse than the pictures: fog or holes ...'
         """
-        if self.single is None or self.whole is None:
+        if self.patches is None or self.whole is None:
             return []
         lines = [
-            f"pixels kept apart: {self.single:.1f} dB in pictures that are learned from, "
+            f"pixels kept apart: {self.patches:.1f} dB in pictures that are learned from, "
             f"{self.whole:.1f} dB in whole ones that are not"
         ]
-        if self.single - self.whole > MOST_APART:
+        if self.patches - self.whole > MOST_APART:
             lines.append(
                 "warning: views between the pictures are shown much worse than the pictures: fog or holes "
                 "that none of them shows: take more pictures, with smaller steps in between"
@@ -54,8 +54,8 @@ def witness_psnr(errors: np.ndarray, is_whole: np.ndarray) -> WitnessPsnr:
     pictures; no error counts as one of 1e-12.
 
     >>> witness_psnr(np.array([0.001, 0.01, 0.01, 0.019]), np.array([False, True, True, False]))
-    WitnessPsnr(every=20.0, single=20.0, whole=20.0)
+    WitnessPsnr(every=20.0, patches=20.0, whole=20.0)
     """
     errors = np.maximum(errors, 1e-12)
-    single, whole = (decibels(errors[kind].mean()) if kind.any() else None for kind in (~is_whole, is_whole))
-    return WitnessPsnr(decibels(errors.mean()), single, whole)
+    patches, whole = (decibels(errors[kind].mean()) if kind.any() else None for kind in (~is_whole, is_whole))
+    return WitnessPsnr(decibels(errors.mean()), patches, whole)

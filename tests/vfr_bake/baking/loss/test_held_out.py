@@ -18,7 +18,7 @@ from vfr_bake.baking.bake import BakeResult, bake
 from vfr_bake.baking.held_out import HeldOut, Shown, expected_loss
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
-from vfr_bake.training.length.witness_loss import SINGLE_WEIGHT, Loss
+from vfr_bake.training.length.witness_loss import PATCH_WEIGHT, Loss
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import over_background
 
@@ -74,7 +74,7 @@ def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
         for name, kinds in means.items()
     }
     lost = 10 * np.log10(np.divide(errors["asset"], errors["model"]))
-    loss = lost @ [SINGLE_WEIGHT, 1 - SINGLE_WEIGHT]
+    loss = lost @ [PATCH_WEIGHT, 1 - PATCH_WEIGHT]
     assert abs(loss) > 0.05, "so few channels change the pictures"
     # A frame's rays are rounded otherwise, which moves single samples.
     assert result.loss.db == pytest.approx(loss, abs=0.01)

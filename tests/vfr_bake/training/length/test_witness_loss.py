@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, SINGLE_WEIGHT, Loss, WitnessLoss
+from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, PATCH_WEIGHT, Loss, WitnessLoss
 
 WHITE = np.ones(3, np.float32)
 
@@ -26,7 +26,7 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
     views = witnesses.views()
     for i, view in enumerate(views):
         if view not in witnesses.whole:
-            blocks.setdefault(("single", view), []).append(i)
+            blocks.setdefault(("patches", view), []).append(i)
         elif len(witnesses.whole) > 1:
             blocks.setdefault(("whole", view), []).append(i)
         else:
@@ -40,18 +40,18 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
 
     def loss(left_out: tuple | None) -> float:
         of_kind = {}
-        for kind in ("single", "whole"):
+        for kind in ("patches", "whole"):
             kept = [rows for key, rows in blocks.items() if key[0] == kind and key != left_out]
             if kind == "whole" and len(witnesses.whole) > 1:
                 of_kind[kind] = math.fsum(map(lost, kept)) / len(kept)
             elif kept:
                 of_kind[kind] = lost([i for rows in kept for i in rows])
         if len(of_kind) == 2:
-            return SINGLE_WEIGHT * of_kind["single"] + (1 - SINGLE_WEIGHT) * of_kind["whole"]
+            return PATCH_WEIGHT * of_kind["patches"] + (1 - PATCH_WEIGHT) * of_kind["whole"]
         return next(iter(of_kind.values()))
 
     variance = 0.0
-    for kind in ("single", "whole"):
+    for kind in ("patches", "whole"):
         keys = [key for key in blocks if key[0] == kind]
         if len(keys) > 1:
             without = [loss(key) for key in keys]
@@ -132,15 +132,15 @@ def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> Non
 
 
 @pytest.mark.parametrize(
-    ("of_single", "of_whole", "shown"), [(1.0, 1.0, True), (1.0, 0.1, False), (0.1, 0.1, False)]
+    ("of_patches", "of_whole", "shown"), [(1.0, 1.0, True), (1.0, 0.1, False), (0.1, 0.1, False)]
 )
 def test_a_loss_is_shown_where_whole_views_show_it_too(
-    of_single: float, of_whole: float, shown: bool
+    of_patches: float, of_whole: float, shown: bool
 ) -> None:
     witnesses = some_witnesses([30] * 20 + [400, 300], [20, 21])
     measured = WitnessLoss(witnesses, WHITE)
     before = np.random.default_rng(5).exponential(0.01, len(witnesses.pixels))
-    lost = np.where(witnesses.views() < 20, of_single, of_whole)
+    lost = np.where(witnesses.views() < 20, of_patches, of_whole)
     assert measured.shows(before, before * 10 ** (lost / 10), 0.5) is shown
     alone = WitnessLoss(some_witnesses([30] * 20, []), WHITE)
     assert alone.shows(before[:600], 1.2 * before[:600], 0.5)

@@ -22,8 +22,8 @@ def test_whole_pictures_are_told_apart_from_pixels_of_learned_ones(monkeypatch: 
 
     monkeypatch.setattr(WitnessErrors, "errors", errors)
     found = trainer.witness_psnr()
-    assert found is not None and found.single is not None
-    assert (round(found.single, 6), found.whole) == (30.0, 20.0) and 20 < found.every < 30
+    assert found is not None and found.patches is not None
+    assert (round(found.patches, 6), found.whole) == (30.0, 20.0) and 20 < found.every < 30
     counts = trainer.witnesses.counts
     assert probes[0].loss.is_whole.mean() == pytest.approx(counts[10] / counts.sum(), abs=0.01)
     assert len(found.lines()) == 2 and found.lines()[1].startswith("warning: views between")
