@@ -1,4 +1,5 @@
-"""Plays a baked Volume Feature Rendering asset on a CPU: numpy, onnxruntime and Pillow, nothing heavier.
+"""Player for baked Volume Feature Rendering assets on a CPU: it needs numpy, onnxruntime and Pillow, nothing
+heavier.
 
 >>> from player import Asset
 >>> from player.render import render
@@ -28,11 +29,11 @@ if TYPE_CHECKING:
 
 try:
     __version__ = version("vfr-bake")
-except PackageNotFoundError:  # the folder alone, copied somewhere: it works there too
+except PackageNotFoundError:  # not installed: the folder also works when it is just copied
     __version__ = "0"
 
-# onnxruntime from 1.31 on looks up and calls its maker's server, also on Linux, unless this is set before its
-# first session; its own function that says so comes too late.
+# onnxruntime from 1.31 on contacts its maker's server, also on Linux, unless this is set before its first
+# session; its own function for switching that off comes too late.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = [
@@ -52,7 +53,7 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, so that `import player` costs nothing."""
+    """Import a name when it is first asked for, so that `import player` costs nothing."""
     if name not in _PLACES:
         raise AttributeError(f"module 'player' has no attribute {name!r}")
     return getattr(import_module(_PLACES[name]), name)

@@ -1,7 +1,8 @@
-"""Starting another Python process so that it takes no code from the current folder.
+"""Commands for other Python processes that take no code from the current folder.
 
 An interpreter that is started with `-c` or `-m` looks for every module in the current folder first: a
-`json.py` there, in an asset that was downloaded, would be executed. Every process is started with this.
+`json.py` there, in an asset that was downloaded, would be executed. Every process is therefore started with
+`python_command`.
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ _PROGRAM = (
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module as a program of its own, on the modules that this process has.
+    """Return the command that runs a module as a program of its own, with the same modules as this process.
 
-    With `-I` the interpreter looks neither at the current folder nor at PYTHONPATH nor at the user's own
-    packages while it starts (`-P` heeds PYTHONPATH, and is not in Python 3.10). What this process looks at is
-    handed on before anything else is imported, so that a source checkout, an installation for one user and
-    what the caller added are found all the same: the absolute entries of its path, never "" or another
-    relative one. The folder that holds these packages comes last, in case it was found by such an entry.
-    Other PYTHON* variables do not reach the child.
+    With `-I`, the interpreter ignores the current folder, PYTHONPATH and the user's own packages while it
+    starts (`-P` respects PYTHONPATH, and is not in Python 3.10). The child's path is set before it imports
+    anything else: it gets the absolute entries of this process's path, never "" or another relative entry. So
+    a source checkout, an installation for one user and what the caller added are still found. The folder that
+    holds these packages is added last, in case it was found by a relative entry. Other PYTHON* variables do
+    not reach the child.
 
     Args:
-        module: its full name; it runs as `__main__`.
-        arguments: its `sys.argv[1:]`.
+        module: the full name of the module; it runs as `__main__`.
+        arguments: the module's `sys.argv[1:]`.
 
     >>> python_command("exporters.mesh.unwrap", "folder")[1:3]
     ['-I', '-c']

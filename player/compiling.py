@@ -1,4 +1,4 @@
-"""numba, where it is installed: the player runs without it, slower."""
+"""Compilation by numba where it is installed; without it the player runs more slowly."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from typing import Any
 
 try:
     import numba
-except ImportError:  # an extra: without it the numpy twin of whatever is compiled runs
+except ImportError:  # numba is an extra: without it, the numpy twins of compiled code run
     numba = None
 else:
     from player.kept_code import is_kept, keep, place
 
 SOURCES = Path(__file__).parent
-"""The sources of all compiled code of the player: whatever lies in this folder and below."""
+"""The folder of the sources of all compiled code of the player: everything in it and below counts."""
 
 
 def available() -> bool:
-    """Whether numba is installed."""
+    """Return whether numba is installed."""
     return numba is not None
 
 
 def first_use() -> bool:
-    """Whether numba is there and has kept no march yet: the first picture waits until it is compiled."""
+    """Return whether numba is installed, but no compiled march is kept yet: the first picture then waits for
+    compilation."""
     return numba is not None and not is_kept("_march_rays", SOURCES)
 
 
 def not_kept() -> str | None:
-    """Why compiled code is not kept, in a line for people; None where it is."""
+    """Explain in a line why compiled code is not kept; None if it is."""
     if numba is None or (refused := place(SOURCES).refused) is None:
         return None
     return (
@@ -38,11 +39,11 @@ def not_kept() -> str | None:
 
 
 def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[..., Any]:
-    """A function compiled by numba where that is installed; it runs without the interpreter's lock and may
-    not allocate.
+    """Compile a function by numba, if numba is installed. The function releases the interpreter's lock and
+    may not allocate.
 
-    Without counted references: the threads would count the grid's arrays in turns, millions of times a
-    picture.
+    References are not counted: the threads would take turns to count those to the grid's arrays, millions of
+    times per picture.
     """
     if numba is None:
         return function
@@ -51,5 +52,5 @@ def compiled(function: Callable[..., Any], inline: bool = False) -> Callable[...
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A part of a compiled function, inlined: a call would pass 60 words."""
+    """Compile a part of another compiled function, to be inlined: a call would pass 60 words."""
     return compiled(function, inline=True)

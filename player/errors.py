@@ -1,7 +1,7 @@
-"""Every error that this project raises on purpose. A leaf: it imports nothing.
+"""All errors that this project raises on purpose. This module imports nothing.
 
-A message reads *where: what: expected, got*, with a hint where there is a fix. The command lines print it
-without a traceback and leave with exit code 1; anything else that is raised is a bug and keeps its traceback.
+A message has the form *where: what: expected, got*, with a hint if there is a fix. The command lines print it
+without a traceback and exit with code 1. Anything else that is raised is a bug and keeps its traceback.
 """
 
 

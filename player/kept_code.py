@@ -1,14 +1,16 @@
-"""Where compiled code is kept, so that it is compiled once, and when it is run again.
+"""The folders in which compiled code is kept, so that it is compiled only once, and the check that it is
+still valid.
 
-numba keeps what it has compiled and looks, before it runs that again, at the file of the function alone: what
-the function took from other files stays as it was. Here the folder's name and the index have a digest of
-every source that compiled code is made from, and of the versions of what compiles it. What was kept of
-another source is not found, wherever it lies and whatever its times are.
+numba keeps what it has compiled. Before it loads that again, it checks only the file of the function itself:
+code that the function took from other files stays as it was. Here the name of the folder and the index
+contain a digest of all sources that compiled code is made from, and of the versions of what compiles it. So
+what was compiled from other sources is not found, wherever it is and whatever its file times are.
 
-What is kept is loaded with pickle, that is, run: whoever may write there may run programs as whoever plays.
-So a folder of ours is made for its owner alone, and one that others may write to is not used.
+Kept code is loaded with pickle, which means that it is executed: whoever may write to the folder may run
+programs as the user who plays. So these folders are created for their owner alone, and a folder that others
+may write to is not used.
 
-A folder is looked for where numba looks: in NUMBA_CACHE_DIR, beside the sources, and in the user's caches.
+The places of these folders are those of numba: NUMBA_CACHE_DIR, beside the sources, and the user's caches.
 """
 
 from __future__ import annotations
@@ -33,19 +35,19 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 from numba.misc.appdirs import AppDirs
 
 # numba reads settings from a file in the current folder. One of them is the folder of compiled code, which is
-# unpickled: whoever writes that file runs code. Without a name there is no such file.
+# unpickled: whoever writes that file could run code. With an empty name, no such file is read.
 config._config_fname = ""  # pyright: ignore[reportAttributeAccessIssue]
 config.reload_config()
 
 N_KEPT = 4
-"""Folders of other sources that stay, those used last: versions that are used in turns keep their code."""
+"""Folders for other sources that stay, those used last: versions that are used in turns keep their code."""
 
 
 class Place(NamedTuple):
-    """Where code that is compiled from some sources is kept."""
+    """The folder in which code that is compiled from some sources is kept."""
 
     folder: Path | None
-    """None where it cannot be kept."""
+    """The folder; None if code cannot be kept."""
     digest: str
     """Digest of the sources and of what compiles them."""
     refused: Path | None
@@ -53,15 +55,16 @@ class Place(NamedTuple):
 
 
 def keep(dispatcher: Any, *packages: Path) -> Any:
-    """Let a function of numba's be loaded where it was kept, and kept where it was not.
+    """Make numba load a compiled function from the folder of `place` if it is kept there, and keep it there
+    otherwise.
 
     Args:
-        dispatcher: as `numba.njit` gives it.
-        packages: folders of all sources that the function is made from, its own first. A function of another
-            file is not kept, because nobody would know when that has changed.
+        dispatcher: the result of `numba.njit`.
+        packages: folders of all sources that the function is made from, the function's own first. A function
+            of another file is not kept, because a change of that file would not be noticed.
     """
     function = getattr(dispatcher, "py_func", None)
-    if function is None:  # with NUMBA_DISABLE_JIT it is the function itself
+    if function is None:  # with NUMBA_DISABLE_JIT, `dispatcher` is the function itself
         return dispatcher
     where = place(*packages)
     if where.folder is not None and Path(function.__code__.co_filename).is_relative_to(packages[0]):
@@ -70,21 +73,21 @@ def keep(dispatcher: Any, *packages: Path) -> Any:
 
 
 def is_kept(name: str, *packages: Path) -> bool:
-    """Whether the function `name` was compiled from the sources in `packages` and kept, by any run."""
+    """Return whether any run has compiled the function `name` from the sources in `packages`, and kept it."""
     folder = place(*packages).folder
     return folder is not None and any(folder.glob(f"*.{name}-*.nbi"))
 
 
 def user_folder() -> Path:
-    """The user's folder of what is kept between runs: `$XDG_CACHE_HOME/vfr-bake`, on every system; where that
-    is not set, where the system has such folders."""
+    """Return the user's folder for files that are kept between runs: `$XDG_CACHE_HOME/vfr-bake` on every
+    system; if that variable is not set, the system's own place for such folders."""
     root = os.environ.get("XDG_CACHE_HOME")
     return Path(root) / "vfr-bake" if root else Path(AppDirs("vfr-bake", appauthor=False).user_cache_dir)
 
 
 @lru_cache(maxsize=8)
 def place(*packages: Path) -> Place:
-    """Where code of the sources in `packages` is kept; its folder is made if it is not there."""
+    """Find where code of the sources in `packages` is kept; the folder is made if it does not exist."""
     digest = sources_digest(*packages)
     if digest is None:
         return Place(None, "", None)
@@ -95,10 +98,10 @@ def place(*packages: Path) -> Place:
         try:
             _make(root)
             new = _make(folder)
-            # Who may write beside the sources may as well change the sources.
+            # Whoever may write beside the sources may change the sources themselves.
             if _is_ours(folder) and (root == beside or _is_ours(root)):
                 tempfile.TemporaryFile(dir=folder).close()
-                os.utime(folder)  # used now
+                os.utime(folder)  # marks it as used now
                 if new:
                     _remove_old(root, folder)
                 return Place(folder, digest, None)
@@ -106,13 +109,14 @@ def place(*packages: Path) -> Place:
             continue
         refused = root
         if told:
-            break  # somebody has said where, and should know
+            break  # the user has chosen this place, and is told of the refusal
     return Place(None, digest, refused)
 
 
 @lru_cache(maxsize=8)
 def sources_digest(*packages: Path) -> str | None:
-    """Digest of all sources below the folders `packages` and of what compiles them; None without sources."""
+    """Return a digest of all sources below the folders `packages` and of the versions of what compiles them;
+    None without sources."""
     versions = sys.version, numba.__version__, llvmlite.__version__, np.__version__
     total, n_files = hashlib.sha256("\n".join(versions).encode()), 0
     for package in packages:
@@ -125,7 +129,7 @@ def sources_digest(*packages: Path) -> str | None:
 
 
 def _make(folder: Path) -> bool:
-    """Make a folder for its owner alone; whether it was not there."""
+    """Make a folder for its owner alone, if it does not exist; returns whether it was made."""
     if folder.is_dir():
         return False
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +138,7 @@ def _make(folder: Path) -> bool:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether nobody but us and the system's administrator may write to a folder."""
+    """Return whether only this user and the system's administrator may write to a folder."""
     if os.name != "posix":
         return True  # a user's folders are that user's alone
     found = folder.stat()
@@ -142,8 +146,8 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _remove_old(root: Path, used: Path) -> None:
-    """Remove what was kept of other sources, but for the folders used last."""
-    with suppress(OSError):  # somebody else removes it, too
+    """Remove the folders for other sources, except those used last."""
+    with suppress(OSError):  # another process may remove them, too
         others = [path for path in root.glob("compiled-*") if path != used and path.is_dir()]
         for path in sorted(others, key=lambda path: path.stat().st_mtime)[:-N_KEPT]:
             shutil.rmtree(path, ignore_errors=True)
@@ -180,7 +184,7 @@ class _KeptCode(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # a file cut short or broken raises anything; it is written again
+        except Exception:  # a truncated or broken file may raise anything; it is written again
             with suppress(OSError):
                 self.flush()
             return None

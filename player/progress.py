@@ -1,4 +1,4 @@
-"""How far work has come, on stderr: a bar where that is a terminal, elsewhere a line now and then."""
+"""Progress of work on stderr: a bar if that is a terminal, else a line now and then."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import sys
 import time
 
 SECONDS_BETWEEN_LINES = 30.0
-"""Where stderr is no terminal, progress is a line this often instead of a bar."""
+"""Seconds between two lines of progress, which are written instead of a bar where stderr is no terminal."""
 SECONDS_BETWEEN_BARS = 0.1
-"""A bar is not drawn anew sooner, but for the last time."""
+"""Least time in seconds until a bar is drawn again, except for the last time."""
 CELLS = 24
-"""Length of a bar, characters."""
+"""Length of a bar in characters."""
 
 
 class Bar:
-    """One piece of work. A context manager; outside of `with`, `close` ends the bar.
+    """The progress of one piece of work. A context manager; without `with`, `close` ends the bar.
 
     >>> with Bar("reading pictures") as bar:
     ...     bar.count(1, 2)
@@ -37,11 +37,11 @@ class Bar:
         self.close()
 
     def count(self, done: int, of: int) -> None:
-        """So many things are done."""
+        """Report that `done` of `of` things are done."""
         self.share(done / of if of else 1.0, f"{done}/{of}")
 
     def share(self, share: float, text: str) -> None:
-        """A share 0..1 of the work is done; `text` is written beside it."""
+        """Report that a share 0..1 of the work is done; `text` is written beside it."""
         if not self._shown:
             return
         now = time.monotonic()
@@ -56,7 +56,7 @@ class Bar:
             filled = "#" * int(CELLS * share)
             line = f"{self._title} {share:4.0%} |{filled:{CELLS}}| {duration(elapsed)} < {left}  {text}"
             line = line.removeprefix(" ")[: shutil.get_terminal_size().columns - 1]
-            self._write("\r" + line.ljust(self._length))  # spaces over what a longer line has left
+            self._write("\r" + line.ljust(self._length))  # overwrite the rest of a longer line with spaces
             self._length = len(line)
 
     def close(self) -> None:
@@ -71,7 +71,7 @@ class Bar:
 
 
 class Bars:
-    """One bar after the other, each for one kind of work. A context manager."""
+    """Bars for several kinds of work, one after the other. A context manager."""
 
     def __init__(self) -> None:
         self._bars: dict[str, Bar] = {}
@@ -84,7 +84,7 @@ class Bars:
             bar.close()
 
     def count(self, what: str, done: int, of: int) -> None:
-        """So many of `of` things of the work called `what` are done."""
+        """Report that `done` of `of` things of the work called `what` are done."""
         if what not in self._bars:
             self._bars[what] = Bar(what)
         self._bars[what].count(done, of)
@@ -93,7 +93,7 @@ class Bars:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words that a person reads at a glance.
+    """Format seconds for people to read at a glance.
 
     >>> duration(7.4), duration(125), duration(7260)
     ('7 s', '2 min 05 s', '2 h 01 min')

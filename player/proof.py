@@ -1,12 +1,11 @@
-"""Whether compiled code runs on this processor and computes what it states, found out before work that takes
-long.
+"""Check, before work that takes long, that compiled code runs on this processor and computes what it should.
 
-LLVM ends the process that asks it for an instruction which the processor does not have, and the processor
-ends one that runs such an instruction: nothing can be caught. So a process of its own compiles every vector
-that is written down for a processor, and compares what it computes with numpy. What it has compiled is kept
-for whoever asked, and so is its verdict, beside it: for these sources, these versions and this processor it
-is asked once. Where compiled code is wrong, marches run in numpy and heads in onnxruntime, which give the
-same pictures, slower.
+LLVM ends a process that asks it for an instruction which the processor does not have, and the processor ends
+a process that runs such an instruction: neither can be caught. So a separate process compiles everything that
+is written with explicit vectors, and compares its results with numpy. The compiled code is kept for later
+use, and the verdict is kept beside it: the check runs once for these sources, these versions and this
+processor. Where compiled code is wrong, marches run in numpy and heads in onnxruntime, which give the same
+pictures, more slowly.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from player.compiling import SOURCES, available, first_use, not_kept
 
 RIGHT, WRONG = "right", "wrong: "
 DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
-"""What ends a process that runs wrong code; anything else says nothing about the code."""
+"""Signals that end a process which runs wrong code. Any other end says nothing about the code."""
 _verdicts: dict[Path | None, str] = {}
 
 
 def prove(say: Any) -> None:
-    """Have compiled code proven, if that was not done before; at most a minute.
+    """Check compiled code, if that was not done before; takes at most a minute.
 
     Args:
-        say: called with a line for people, before it takes long, and where something is wrong.
+        say: called with a line for people before the check takes long, and if something is wrong.
     """
     if not available():
         return
@@ -51,7 +50,7 @@ def prove(say: Any) -> None:
 
 
 def refuted() -> bool:
-    """Whether compiled code was found to be wrong on this processor."""
+    """Return whether compiled code was found to be wrong on this processor."""
     known = _known()
     return known is not None and known.startswith(WRONG)
 
@@ -65,7 +64,7 @@ def _known() -> str | None:
 
 
 def _record() -> Path | None:
-    """The file of the verdict; None where nothing can be kept."""
+    """Return the file of the verdict; None if nothing can be kept."""
     from player.compiled.processor import target
     from player.kept_code import place
 
@@ -75,8 +74,8 @@ def _record() -> Path | None:
 
 
 def _asked(say: Any) -> str | None:
-    """The verdict of a process of its own; None if it could not say."""
-    if getattr(sys, "frozen", False):  # that is no Python that could be asked
+    """Ask a separate process for the verdict; None if it has not given one."""
+    if getattr(sys, "frozen", False):  # in a frozen program, sys.executable is no Python
         return None
     if first_use() and sys.stderr.isatty():
         say("compiling for this processor: up to a minute, once")
@@ -101,14 +100,14 @@ def _asked(say: Any) -> str | None:
 
 
 def _deadly(code: int) -> str | None:
-    """What ended a process, if that is what wrong code does."""
+    """Return the name of what ended a process, if wrong code ends processes in that way; else None."""
     if sys.platform == "win32":
         return f"exit code {code:#x}" if code == 3 or code >= 0xC0000000 else None
     return next((name for name in DEADLY if getattr(signal, name, None) == -code), None)
 
 
 def verdict() -> str:
-    """RIGHT, or WRONG and what; the process ends where LLVM or the processor end it."""
+    """Return RIGHT, or WRONG and what is wrong. LLVM or the processor may end this process."""
     from player.compiled import march as march_compiled
     from player.head import proof as proof_head
     from player.march import march
@@ -128,7 +127,8 @@ def verdict() -> str:
 
 
 def _grid(contracted: bool) -> Any:
-    """Two levels, one beside the other, of codes and features that vary; some cells are not live."""
+    """Make a grid of two levels, one beside the other, with codes and features that vary; some cells are not
+    live."""
     from player.asset.bricks import pack_vertices
     from player.asset.grid import build_grid
     from player.asset.pyramid import Bricks, PyramidValues, whole_pyramid

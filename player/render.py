@@ -1,8 +1,8 @@
-"""Asset and camera to picture: blocks of pixels marched and shaded by a few threads.
+"""Rendering of pictures from an asset and a camera: blocks of pixels are marched and shaded by a few threads.
 
-Each task takes some hundred 8 x 8 blocks of pixels, marches their rays and runs the head on those that hit,
-so that march and head of different tasks overlap. The result depends neither on the number of threads nor
-on the size of a task.
+Each task takes about a hundred 8 x 8 blocks of pixels, marches their rays, and runs the head on the rays that
+hit something. So the march of one task and the head of another run at the same time. The result depends
+neither on the number of threads nor on the size of a task.
 """
 
 from __future__ import annotations
@@ -36,18 +36,19 @@ Background = Literal["transparent"] | tuple[float, float, float]
 March = Literal["auto", "numpy", "numba"]
 
 MAX_PIXELS = 1 << 26
-"""Largest picture, 8192 x 8192."""
+"""Most pixels of a picture: 8192 x 8192."""
 
 FRAME_BYTES = 30
-"""Memory of a frame, bytes a pixel: colour 12, opacity, depth and samples 4 each, and its 8-bit picture
-with what rounds it 6."""
+"""Memory of a frame in bytes per pixel: 12 for colour, 4 each for opacity, depth and samples, and 6 for its
+8-bit picture and the arrays that round to it."""
 
 TASK_BLOCKS = {"numba": 256, "numpy": 128}
-"""Blocks a task, at most: what Python does for a task takes as long as the compiled march of ten blocks;
-numpy arrays of more blocks do not stay in cache."""
+"""Most blocks of a task. What Python does for a task takes as long as the compiled march of ten blocks; numpy
+arrays of more blocks do not stay in cache."""
 TASKS_A_THREAD = {"numba": 8, "numpy": 1}
-"""Tasks at least, where there are blocks enough: shared out evenly. A call of numpy takes as long for ten
-rays as for a hundred, and threads wait for one another between calls."""
+"""Least number of tasks per thread, if there are enough blocks, so that the work is shared out evenly. For
+numpy it is 1: a call of numpy takes as long for ten rays as for a hundred, and threads wait for one another
+between calls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Frame:
     """One rendered picture."""
 
     rgb: np.ndarray
-    """[h, w, 3] float32, over the background; straight (not multiplied by opacity) if there is none."""
+    """[h, w, 3] float32, over the background; straight (not multiplied by opacity) if it is transparent."""
     opacity: np.ndarray
     """[h, w] float32, 0..1."""
     depth: np.ndarray
@@ -63,39 +64,40 @@ class Frame:
     n_density_samples: np.ndarray
     """[h, w] int32, density samples taken; 0 where the pixel was interpolated."""
     background: Background
-    """What is behind, or "transparent"."""
+    """Colour of the background, or "transparent"."""
     features: np.ndarray | None = None
-    """[h, w, n_channels] float32, what the head was given (in units of the codes), 0 where it was not run;
-    None unless asked for with `layers`."""
+    """[h, w, n_channels] float32, the input of the head (in units of the codes), 0 where it was not run; None
+    unless asked for with `layers`."""
     find_normals: Callable[[], np.ndarray] | None = None
-    """What `normals` asks."""
+    """Function that computes `normals`."""
 
     @cached_property
     def normals(self) -> np.ndarray:
         """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.march.normals`).
 
-        Found when first asked for, at the cost of a second march, unless the frame was rendered with
-        `layers`. Raises ConfigError for a frame that no renderer has made.
+        They are computed when they are first asked for, at the cost of a second march, unless the frame was
+        rendered with `layers`. Raises ConfigError for a frame that was not made by a renderer.
         """
         if self.find_normals is None:
             raise ConfigError("normals: expected the frame of a renderer, got one that was put together")
         return self.find_normals()
 
     def to_uint8(self) -> np.ndarray:
-        """[h, w, 3], or [h, w, 4] with straight alpha if transparent; values rounded to the nearest level."""
+        """Return 8-bit values [h, w, 3], or [h, w, 4] with straight alpha if transparent; rounded to the
+        nearest level."""
         if self.background == "transparent":
             return to_8_bit(np.concatenate([self.rgb, self.opacity[..., None]], axis=-1))
         return to_8_bit(self.rgb)
 
 
 class Renderer:
-    """An asset ready to render: grid in memory, head open, threads waiting. A context manager; `close` ends
-    the threads."""
+    """An asset that is ready to render: its grid is in memory, its head is open, and threads are waiting. A
+    context manager; `close` ends the threads."""
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
         """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here."""
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
-        self._grid = asset.grid  # before numba is waited for, which may still be imported (`import_ahead`)
+        self._grid = asset.grid  # built first: numba may still be importing (`import_ahead`)
         self.march, self._module = choose_march(march)
         self._write_pixels, self._interpolate, self._directions = write_pixels, interpolate, None
         self._block_bounds = block_bounds
@@ -124,8 +126,8 @@ class Renderer:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def show(self, asset: Asset) -> None:
-        """Go on with `asset`, the same one with more of its parts. Pictures that have begun keep to what they
-        began with, in whichever thread."""
+        """Continue with `asset`, the same asset with more of its parts. Pictures that have begun, in
+        whichever thread, are finished with the parts that they began with."""
         self._grid, self.asset = asset.grid, asset
 
     def render(
@@ -136,17 +138,17 @@ class Renderer:
         layers: bool = False,
         quality: Quality = "exact",
     ) -> Frame:
-        """One picture.
+        """Render one picture.
 
         Args:
             camera: in the WORLD frame.
-            n_fetches: feature fetches a ray; the asset's own if None; every sample if 0, or more than a ray
-                can have. There are no more than the quality has.
+            n_fetches: feature lookups per ray; the asset's own number if None; one at every sample if 0, or
+                if more than a ray can have. A quality may lower the number.
             background: colour 0..1 or "transparent"; the asset's own if None.
-            quality: "exact" marches every pixel; "high" and "fast" interpolate those between neighbours that
-                agree (`player.march.interpolation`), fetch features at fewer places and end rays earlier, as
-                far as the asset's `agreement` and `quality_fetches` allow.
-            layers: fill in the frame's `features` and `normals` at once, at the cost of a second march; the
+            quality: "exact" marches every pixel; "high" and "fast" interpolate pixels between neighbours that
+                agree (`player.march.interpolation`), fetch features at fewer positions and end rays earlier,
+                as far as the asset's `agreement` and `quality_fetches` allow.
+            layers: compute the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
         Raises:
@@ -178,7 +180,7 @@ class Renderer:
         )
 
     def _reduced(self, quality: Quality) -> _Reduced:
-        """What pictures of a quality leave out, as the asset allows."""
+        """Return the reductions of a quality, as far as the asset allows them."""
         levels, n_fetches, manifest = 0.0, 0, self.asset.manifest
         if quality != "exact":
             number = ("high", "fast").index(quality)
@@ -193,7 +195,7 @@ class Renderer:
         opaque_depth: np.float32,
         layers: bool,
     ) -> _Picture:
-        """A picture that shows what is behind."""
+        """Make a picture that shows the background alone."""
         n_pixels = camera.width * camera.height
         behind = None if background == "transparent" else background
         rgb = np.empty((camera.height, 3 * camera.width), np.float32)
@@ -209,7 +211,7 @@ class Renderer:
         )
 
     def _in_tasks(self, picture: _Picture, stage: Stage) -> None:
-        """Find the pixels of a stage, in all blocks, on all threads."""
+        """Compute the pixels of a stage in all blocks, on all threads."""
         tasks = self._tasks(picture.view.blocks, len(stage.within))
         futures = [self._pool.submit(self._task, picture, stage, blocks) for blocks in tasks]
         try:
@@ -220,7 +222,7 @@ class Renderer:
                 future.cancel()
 
     def _tasks(self, blocks: np.ndarray, n_pixels: int) -> list[np.ndarray]:
-        """Blocks shared out to tasks, where `n_pixels` of each are found at a time."""
+        """Divide blocks into tasks; `n_pixels` pixels of each block are computed at a time."""
         size = min(
             TASK_BLOCKS[self.march] * len(EVERY) // n_pixels,
             max(len(blocks) // (TASKS_A_THREAD[self.march] * self.n_threads), 16),
@@ -228,7 +230,8 @@ class Renderer:
         return [blocks[i : i + size] for i in range(0, len(blocks), size)]
 
     def _task(self, picture: _Picture, stage: Stage, blocks: np.ndarray) -> None:
-        """Find the pixels of a stage in some blocks: what neighbours do not tell is marched and shaded."""
+        """Compute the pixels of a stage in some blocks: pixels that cannot be interpolated are marched and
+        shaded."""
         view, planes, camera = picture.view, picture.planes, picture.view.camera
         pixels = view.pixels(blocks, stage.within)
         if len(stage.neighbours):
@@ -247,8 +250,8 @@ class Renderer:
         self._write_pixels(planes, index, result, rgb, picture.behind, view.start, self.asset.scale)
 
     def _all_normals(self, view: View, each: Callable[..., Iterable[None]] = map) -> np.ndarray:
-        """[h, w, 3] normals; `each` is the threads' map, or that of the caller's own: the renderer may have
-        been closed."""
+        """Compute normals [h, w, 3]. `each` is the map function of the threads, or the builtin, which runs on
+        the caller's thread: the renderer may have been closed."""
         normals = np.zeros((view.camera.height * view.camera.width, 3), np.float32)
         rotation = self.asset.world_from_model[:3, :3] / self.asset.scale
 
@@ -263,32 +266,33 @@ class Renderer:
 
 
 class _Reduced(NamedTuple):
-    """What pictures of a quality leave out."""
+    """The reductions of a quality, compared with exact pictures."""
 
     levels: float
-    """By how many 8-bit levels pixels may differ of which another becomes the mean; 0: all are marched."""
+    """8-bit levels by which pixels may differ for another to become their mean; with 0, all pixels are
+    marched."""
     n_fetches: int
-    """Feature fetches of a ray, at most; 0: any number."""
+    """Most feature lookups of a ray; 0: any number."""
     opaque_depth: np.float32
     """The optical depth at which rays stop."""
 
 
 class _Picture(NamedTuple):
-    """A picture while it is made."""
+    """A picture while it is being rendered."""
 
     view: View
     planes: Planes
     behind: tuple[float, float, float] | None
-    """The background's colour, None for none."""
+    """The background's colour; None if transparent."""
     n_fetches: int
     opaque_depth: np.float32
     """The optical depth at which rays stop."""
     features: np.ndarray | None
-    """[n, n_channels] float32 what the head was given for each pixel, if anybody asked."""
+    """[n, n_channels] float32, the input of the head for each pixel; None if it is not wanted."""
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise ConfigError for a picture over MAX_PIXELS; says what it would take."""
+    """Raise ConfigError for a picture over MAX_PIXELS; the message says how much memory it would take."""
     if width * height > MAX_PIXELS:
         raise ConfigError(
             f"size: expected at most {MAX_PIXELS} pixels (8192x8192), got {width}x{height}, "
@@ -297,7 +301,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def choose_march(name: March) -> tuple[str, ModuleType]:
-    """The name of the march that runs, and the module that has it. With "auto" it is the compiled one, where
+    """Choose a march; returns its name and the module that has it. With "auto" it is the compiled one, if
     that is installed and was not found to be wrong.
 
     Raises MissingExtraError: `name` is "numba", which is not installed or does not run here.
@@ -321,20 +325,20 @@ def choose_march(name: March) -> tuple[str, ModuleType]:
 
 
 def import_ahead(scipy: bool = True) -> None:
-    """Begin to import what rendering needs, on a thread of its own, while the caller opens the asset: both
-    take half a second.
+    """Begin to import what rendering needs, on a thread of its own, while the caller opens the asset: each
+    takes half a second.
 
-    `scipy`: whether anything else in this process may ask for it meanwhile. If not, numba does not find its
-    linear algebra either, which nothing here uses, and which takes 0.3 s to import.
+    `scipy`: whether other code in this process may import it in the meantime. If not, it is hidden from
+    numba, which then does without its linear algebra; nothing here uses that, and it takes 0.3 s to import.
     """
 
     def imports() -> None:
-        modules: dict[str, Any] = sys.modules  # None in it is a module that is not to be found
+        modules: dict[str, Any] = sys.modules  # an entry of None hides a module
         hidden = not scipy and not {"scipy.linalg", "numba.np.arraymath"} & set(modules)
         if hidden:
             modules["scipy.linalg"] = None
         try:
-            with suppress(ImportError):  # told by whoever needs it
+            with suppress(ImportError):  # reported where the module is needed
                 if choose_march("auto")[0] == "numpy":
                     import onnxruntime  # noqa: F401
                 else:
@@ -342,7 +346,7 @@ def import_ahead(scipy: bool = True) -> None:
                     from player.head import compiled as head_compiled  # noqa: F401
 
                     camera = Camera("", np.eye(4), 1, 1, 1.0, 1.0, 0.5, 0.5)
-                    pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # numba gathers itself
+                    pixels_compiled.directions(camera, np.zeros(1), np.zeros(1))  # makes numba load its parts
         finally:
             if hidden:
                 del modules["scipy.linalg"]
@@ -363,14 +367,14 @@ def render(
     n_threads: int | None = None,
     march: March = "auto",
 ) -> Frame:
-    """One picture of an asset; its threads and head are kept for the next call.
+    """Render one picture of an asset; the threads and the open head are kept for the next call.
 
     Args:
         asset: an open asset.
         camera: in the WORLD frame, the photographs' own.
-        n_fetches: feature fetches a ray; the asset's own if None, every sample if 0.
+        n_fetches: feature lookups per ray; the asset's own number if None, one at every sample if 0.
         background: colour, 3 numbers 0..1, or "transparent"; the asset's own if None.
-        n_threads: one for each core if None.
+        n_threads: number of threads; one for each core if None.
         march: "numba", "numpy", or "auto": numba where it is installed and was not found to be wrong
             (`player.proof`).
 
@@ -379,7 +383,7 @@ def render(
 
     Raises:
         ConfigError: a picture over MAX_PIXELS, or a setting out of range.
-        FormatError: the asset's head is not one.
+        FormatError: the file of the asset's head holds no valid head.
         MissingExtraError: `march` is "numba", which is not installed or does not run here.
 
     >>> from player.cameras.transforms import read_cameras

@@ -1,9 +1,9 @@
-"""Arrays that compiled code works in, and a way to see that it keeps to them.
+"""Work arrays for compiled code, and a check that it does not write outside of them.
 
-Compiled code does not look where it writes: a size that was computed wrongly overwrites whatever lies behind
-an array, and shows much later, elsewhere or never. With `VFR_CANARIES=1` in the environment, as in the tests
-and in the fuzzer, every such array has known bytes before and behind it, and whoever has called compiled code
-looks whether they are still there.
+Compiled code does not check where it writes: with a wrongly computed size, it overwrites whatever lies behind
+an array, which shows much later, elsewhere or never. With `VFR_CANARIES=1` in the environment, as in the
+tests and in the fuzzer, every such array has known bytes before and behind it. Callers of compiled code then
+check that these bytes are unchanged.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ CANARIES = os.environ.get("VFR_CANARIES") == "1"
 """Whether arrays have canaries; the environment is read once, when this is imported."""
 
 ROOM = 4096
-"""Bytes of a canary, of which there is one before and one behind an array; a multiple of every alignment."""
+"""Bytes of a canary. There is one before and one behind each array; the size is a multiple of every
+alignment."""
 CANARY = 0xA5
-"""What a canary is made of: no number that a march writes by itself."""
+"""The byte that canaries consist of, which a march does not write by itself."""
 NOTHING = 0xFF
-"""What an array without a value is made of while there are canaries: NaN, or -1."""
+"""The byte that fills arrays without a value while there are canaries: it gives NaN, or -1."""
 
 
 def scratch(shape: int | tuple[int, ...], dtype: DTypeLike, fill: Any = None) -> np.ndarray:
-    """An array for compiled code to work in.
+    """Make an array for compiled code to work in.
 
     Args:
-        shape: as numpy takes it.
-        dtype: of the numbers.
-        fill: what every number is at first; None leaves them as they come.
+        shape: the shape, as for numpy.
+        dtype: the type of the numbers.
+        fill: the initial value of every number; None leaves them uninitialised.
 
     >>> scratch((2, 3), np.float32, 0).tolist()
     [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
@@ -51,13 +52,14 @@ def scratch(shape: int | tuple[int, ...], dtype: DTypeLike, fill: Any = None) ->
 
 
 def check_scratch(*arrays: Any) -> None:
-    """Look whether the canaries of arrays of `scratch` are as they were, if there are any.
+    """Check that the canaries of arrays of `scratch` are unchanged, if there are any.
 
     Args:
-        arrays: each an array, or a tuple of such.
+        arrays: arrays, or tuples of arrays.
 
     Raises:
-        AssertionError: compiled code has written beside an array; that is a bug of ours, whatever the asset.
+        AssertionError: compiled code has written beside an array. That is a bug of this project, whatever the
+            asset.
     """
     if not CANARIES:
         return

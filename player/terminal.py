@@ -1,12 +1,12 @@
-"""Showing in a terminal: text from files without its control characters, and an asset's picture of two pixels
-a character (upper half blocks) where the terminal has 16 million colours."""
+"""Output for a terminal: text from files without control characters, and an asset's picture, two pixels per
+character (upper half blocks), if the terminal has 16 million colours."""
 
 from __future__ import annotations
 
 import os
 from typing import TYPE_CHECKING, TextIO
 
-if TYPE_CHECKING:  # commands import this before they answer `--help`, which needs no numpy
+if TYPE_CHECKING:  # imported before `--help` is answered, which needs no numpy
     import numpy as np
 
     from player.asset.asset import Asset
@@ -16,8 +16,9 @@ ROWS = 16
 
 
 def printable(text: str) -> str:
-    r"""The text in one line, with escapes in place of what a terminal or a browser obeys instead of showing:
-    control characters, ends of lines, changes of the writing direction, halves of characters.
+    r"""Return the text in one line, with escapes for characters that a terminal or a browser would obey
+    instead of showing: control characters, line ends, changes of the writing direction, halves of surrogate
+    pairs.
 
     >>> printable("a\x1b[2Jb\u202ec\n\u00fc \u732b")
     'a\\x1b[2Jb\\u202ec\\nü 猫'
@@ -28,7 +29,8 @@ def printable(text: str) -> str:
 
 
 def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
-    """The asset from its first training view, as lines for `stream`; none where it cannot show colours."""
+    """Render the asset from its first training view as lines for `stream`; no lines if it cannot show
+    colours."""
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
     if not (stream.isatty() and encoding == "utf8" and os.environ.get("COLORTERM") in ("truecolor", "24bit")):
         return []
@@ -41,13 +43,13 @@ def picture_lines(asset: Asset, stream: TextIO) -> list[str]:
     width = os.get_terminal_size(stream.fileno()).columns or 80  # 0 where the terminal does not tell
     columns = max(min(round(2 * ROWS * camera.width / camera.height), width), 1)
     small = camera.resized(2 * columns, 4 * ROWS)
-    frame = render(asset, small, march="numpy")  # nothing to compile: 64 rows take a moment
+    frame = render(asset, small, march="numpy")  # numpy: nothing to compile, and 64 rows take only a moment
     halves = frame.to_uint8().reshape(2 * ROWS, 2, columns, 2, 3).mean(axis=(1, 3))
     return [*half_blocks((halves + 0.5).astype(np.uint8)), ""]
 
 
 def half_blocks(pixels: np.ndarray) -> list[str]:
-    """Lines of upper half blocks: [2 n, columns, 3] uint8 to n lines.
+    """Turn pixels [2 n, columns, 3] uint8 into n lines of upper half blocks.
 
     >>> import numpy as np
     >>> half_blocks(np.uint8([[[1, 2, 3]], [[4, 5, 6]]]))

@@ -1,1 +1,1 @@
-"""vfr-play: its command line, and how frames are rendered into files."""
+"""The command line of vfr-play, and the rendering of frames into files."""

@@ -1,4 +1,4 @@
-"""The command `vfr-play`: it shows an asset in a browser, renders it to files, or says what is in it."""
+"""The command `vfr-play`, which shows an asset in a browser, renders it to files, or prints what is in it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # `--help` answers without numpy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `vfr-play`; returns the exit code, those of `player.app.commands.run` and 2 for wrong usage."""
+    """Run `vfr-play`; returns the exit code: one of `player.app.commands.run`, or 2 for wrong usage."""
     try:
         return run("vfr-play", lambda: _run(parse(argv)))
     except SystemExit as leave:  # argparse has printed why
@@ -39,7 +39,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.info:
         return _info(arguments)
     if arguments.output is None:
-        # The first look at what this is wants no extra.
+        # The demo must work without any extra installed.
         no_viewer = arguments.asset == DEMO and find_spec("viser") is None
         return _open_page(arguments) if no_viewer else _view(arguments)
     return _play(arguments)
@@ -58,7 +58,7 @@ def _view(arguments: argparse.Namespace) -> int:
         print(f"{arguments.asset}: look at it at {address}", flush=True)
         _advise(arguments.asset, address)
         forever = threading.Event()
-        while not forever.wait(1):  # a wait without end hears no Ctrl-C on Windows
+        while not forever.wait(1):  # on Windows, Ctrl-C does not interrupt a wait without a timeout
             pass
     return 0
 
@@ -81,7 +81,7 @@ def _open_page(arguments: argparse.Namespace) -> int:
 
 
 def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
-    """The asset, of which as much as there is plays: a line says what is missing."""
+    """Open an asset, or as much of it as there is; a line then says what is missing."""
     from player.asset.asset import Asset
 
     asset = Asset.open(folder, max_memory=arguments.max_memory)
@@ -91,7 +91,7 @@ def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
 
 
 def _advise(asset: Path, address: str) -> None:
-    """Say how the viewer is left, and what to do where no browser can open here."""
+    """Say how to end the viewer, and what to do if no browser can open on this machine."""
     _say(f"for many visitors, each with the GPU of their own device: {address}/page")
     _say("the viewer runs until Ctrl-C")
     if not _has_display():
@@ -101,7 +101,7 @@ def _advise(asset: Path, address: str) -> None:
 
 
 def _has_display() -> bool:
-    """Whether a browser can open a window here, as far as the system tells."""
+    """Return whether a browser can open a window here, as far as the system tells."""
     windows = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     return not sys.platform.startswith("linux") or bool(windows)
 
@@ -126,7 +126,7 @@ def _play_on_a_bar(arguments: argparse.Namespace, target: Target) -> Played:
     from player.render import import_ahead
 
     settings = settings_of(PlaySettings, arguments)
-    target.check(settings)  # so that nobody waits for a refusal until an asset is open
+    target.check(settings)  # so that a refusal comes before the asset is opened
     import_ahead(scipy=False)
     asset = _open(arguments.asset, arguments)
     cameras = _views(asset, arguments)
@@ -141,7 +141,7 @@ def _play_on_a_bar(arguments: argparse.Namespace, target: Target) -> Played:
 
 
 def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
-    """The cameras that --cameras, --orbit or --view ask for, of the size that --size asks for."""
+    """Return the cameras that --cameras, --orbit or --view ask for, in the size that --size asks for."""
     from player.cameras.camera import orbit
     from player.cameras.views import asset_cameras, read_views
 

@@ -1,7 +1,9 @@
-"""Frames on the workers of a Dask cluster that exists: each frame is a task, its file's bytes come back.
+"""Rendering of frames on the workers of an existing Dask cluster: each frame is a task, which returns the
+bytes of the frame's file.
 
-Workers open the asset at the path that the client was given, made absolute: a shared disk, or a copy at the
-same place. That it is the same asset is checked on the worker, so that no frame of another one slips in.
+Workers open the asset at the path that the client was given, made absolute: it must be on a shared disk, or a
+copy must be at the same place. Each worker checks that it has the same asset, so that no frame of another
+asset slips in.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from player.render import March, Renderer
 CONNECT_SECONDS = 10
 POLL_SECONDS = 5
 PATIENCE = 12
-"""Polls without any worker after which the cluster counts as gone: a minute, in which one may restart."""
+"""Polls without any worker after which the cluster counts as gone: they take a minute, within which a worker
+may restart."""
 
 
 def render_on_cluster(
@@ -32,13 +35,13 @@ def render_on_cluster(
 ) -> Iterator[Done]:
     """Yield every job once, in the order in which they are finished.
 
-    A job whose worker dies is done again by another one.
+    If a worker dies, another worker does its job again.
 
     Args:
-        address: the scheduler's, for example tcp://10.0.0.1:8786.
+        address: the address of the scheduler, for example tcp://10.0.0.1:8786.
         folder: the asset's folder, which the workers see at the same path.
         jobs: the frames to render.
-        settings: how they are rendered; `threads` and `max_memory` are those of one worker.
+        settings: how the frames are rendered; `threads` and `max_memory` are those of one worker.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.
@@ -80,13 +83,13 @@ def _result(future: Any, address: str, job: Job) -> Done:
         return future.result()
     except VfrError:
         raise
-    except Exception as error:  # a worker's of any kind, or Dask's own for one that died again and again
+    except Exception as error:  # any error of a worker, or Dask's own for a worker that kept dying
         raise VfrError(f"--dask: {address}: {job.camera.name}: {type(error).__name__}: {error}") from error
 
 
 def _task(folder: str, digest: str, job: Job, *how: Any) -> Done:
-    """Render a frame on a worker; `how` are the last arguments of `_renderer`. A path in the settings would
-    not reach a worker of another system."""
+    """Render a frame on a worker; `how` are the last arguments of `_renderer`. The settings are not passed as
+    a whole, because a path in them would not reach a worker of another system."""
     if _digest(Path(folder)) != digest:
         raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
     return render_job(_renderer(folder, digest, *how), job)
@@ -96,9 +99,10 @@ def _task(folder: str, digest: str, job: Job, *how: Any) -> Done:
 def _renderer(
     folder: str, digest: str, threads: int | None, march: March, max_memory: float | None
 ) -> Renderer:
-    """The worker's renderer, kept for its next frames; the digest tells a new asset from an old one.
+    """Return the worker's renderer, which is kept for the next frames; the digest tells a new asset from an
+    old one.
 
-    Compiled code that would end the worker's process is found out before it runs.
+    Compiled code is proven first, because wrong code would end the worker's process.
     """
     if march != "numpy":
         from player.proof import prove

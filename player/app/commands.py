@@ -1,4 +1,4 @@
-"""How every command ends: what it prints of an error, and its exit code."""
+"""The end of every command: the message that it prints for an error, and its exit code."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from player.files.files import write_bytes
 from player.terminal import printable
 
 READER_GONE = 141
-"""Exit code where nobody reads the output any more (`| head`): what a shell reports of other programs."""
+"""Exit code if nobody reads the output any more (`| head`): the one that shells report for other programs."""
 
 
 def run(name: str, command: Callable[[], int]) -> int:
     """Run a command and return its exit code: 0 done, 1 an error in one line, 130 Ctrl-C, 141 for output that
     nobody reads.
 
-    Errors on purpose (VfrError) and those that the system reports (a full disk, a name that is too long, a
-    file that may not be read) are one line on stderr; anything else is a bug and keeps its traceback. An exit
-    that the command line asks for (--help, wrong usage) goes on as SystemExit.
+    Errors raised on purpose (VfrError) and those that the system reports (a full disk, a name that is too
+    long, a file that may not be read) are printed as one line on stderr. Anything else is a bug and keeps its
+    traceback. An exit that the command line asks for (--help, wrong usage) goes on as SystemExit.
 
-    A KeyboardInterrupt may carry what became of the work.
+    The argument of a KeyboardInterrupt, if any, is printed, too: it may say what became of the work.
 
     >>> run("vfr-play", lambda: 0)
     0
@@ -47,7 +47,7 @@ def run(name: str, command: Callable[[], int]) -> int:
         _give_up_broken_streams()
         if unread:
             return READER_GONE
-        if error.errno is None:  # no disk's: a library's, or ours
+        if error.errno is None:  # not from the system, but raised by a library or by this project
             raise
         _say(f"{name}: error: {printable(_described(error))}")
         return 1
@@ -57,12 +57,13 @@ def run(name: str, command: Callable[[], int]) -> int:
 
 
 def write_result(target: str | Path | None, figures: dict[str, Any], sentence: str | None) -> None:
-    """Write what a command has done.
+    """Write the result of a command.
 
     Args:
         target: a file for the figures as JSON, or "-" for standard output; None for no JSON.
-        figures: what JSON can hold.
-        sentence: lines for people, on standard output unless the JSON is there; None for no lines.
+        figures: the results, in types that JSON can hold.
+        sentence: lines for people, written to standard output unless the JSON is written there; None for no
+            lines.
 
     Raises OutputError: the file cannot be written.
 
@@ -80,7 +81,7 @@ def write_result(target: str | Path | None, figures: dict[str, Any], sentence: s
 
 
 def _described(error: OSError) -> str:
-    """What the system says of an error, with the file that it is about if there is one.
+    """Return the system's message for an error, with the file that it is about, if there is one.
 
     >>> _described(OSError(errno.ENAMETOOLONG, "File name too long", "a" * 3))
     'aaa: File name too long'
@@ -95,7 +96,8 @@ def _streams() -> list[tuple[str, TextIO]]:
 
 
 def _flush() -> None:
-    """Write out what is buffered. The interpreter would do so at its end, with its own words for an error."""
+    """Write out what is buffered. Otherwise the interpreter would do so at its end, with its own message for
+    an error."""
     for name, stream in _streams():
         try:
             stream.flush()
@@ -105,21 +107,23 @@ def _flush() -> None:
 
 
 def _nobody_reads() -> bool:
-    """Whether one of our streams is a pipe with nobody at its other end.
+    """Return whether standard output or standard error is a pipe with nobody at its other end.
 
-    Called where a stream is broken: where the system does not tell, it is taken for such a pipe.
+    This is asked only when a stream is broken. If the system does not tell, the stream is taken for such a
+    pipe.
     """
     if not hasattr(select, "poll"):
         return True
     asked = select.poll()
     for _, stream in _streams():
-        with suppress(OSError):  # a stream that is no file, as in tests
-            asked.register(stream.fileno(), 0)  # errors alone
+        with suppress(OSError):  # the stream is no file, as in tests
+            asked.register(stream.fileno(), 0)  # report errors only
     return any(events & (select.POLLERR | select.POLLHUP) for _, events in asked.poll(0))
 
 
 def _give_up_broken_streams() -> None:
-    """Drop what a broken stream still holds: the interpreter would try to write it again at its end."""
+    """Drop what a broken stream still holds: otherwise the interpreter would try to write it again at its
+    end."""
     for _, stream in _streams():
         try:
             stream.flush()

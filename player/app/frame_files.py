@@ -1,8 +1,9 @@
-"""Where frames go: a folder of pictures, one picture, or a video; and which of them are there already.
+"""The files that frames are written to (a folder of pictures, one picture, or a video), and which of them
+exist already.
 
-A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. A run
-that is resumed leaves out the frames that are there with the right key, so that frames of two different runs
-are never mixed.
+A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. A
+resumed run skips the frames that exist with the right key, so that frames of two different runs are never
+mixed.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Target:
     path: Path
     """The folder, the picture or the video that was asked for."""
     folder: Path
-    """Folder of the single pictures; a video's are beside it until the video is complete."""
+    """Folder of the single pictures; those of a video are in a folder beside it until the video is
+    complete."""
     suffix: str
     """File name ending of the pictures, with its dot."""
 
@@ -48,7 +50,8 @@ class Target:
 
     @classmethod
     def of(cls, settings: PlaySettings) -> Target:
-        """The files of `settings.output`, whose suffix says picture or video; any other is a folder.
+        """Find the files for `settings.output`. A suffix of a picture or a video means one file; anything
+        else is a folder.
 
         >>> Target.of(PlaySettings(Path("turn.mp4"))).folder.as_posix()
         'turn.mp4.frames'
@@ -64,7 +67,7 @@ class Target:
         return cls(path, path, f".{settings.format or 'png'}")
 
     def paths(self, views: Sequence[Camera], part: slice) -> list[Path]:
-        """The file of each view in the slice `part`; a file has the same name whatever the slice.
+        """Return the file of each view in the slice `part`; the name of a file does not depend on the slice.
 
         Raises ConfigError: one picture is to hold several views.
         """
@@ -78,7 +81,7 @@ class Target:
         return [self.folder / f"{name}{self.suffix}" for name in frame_names(views)[part]]
 
     def check(self, settings: PlaySettings) -> None:
-        """Raise OutputError for what would be overwritten, or cannot be written; MissingExtraError for a
+        """Raise OutputError if a file would be overwritten or cannot be written; MissingExtraError for a
         video without PyAV."""
         allowed = settings.force or settings.resume
         if self.is_picture or self.is_video:
@@ -104,7 +107,7 @@ class Target:
             )
 
     def finish(self, paths: Sequence[Path], fps: float) -> None:
-        """Make a video of its pictures, which are then removed; where pictures were asked for, do nothing."""
+        """For a video, join its pictures and then remove them; for pictures, do nothing."""
         if not self.is_video:
             return
         write_video(self.path, (_pixels(path) for path in paths), fps)
@@ -115,7 +118,7 @@ class Target:
 
 
 def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
-    """A digest of everything that the picture depends on."""
+    """Return a digest of everything that the picture depends on."""
     k = asset.manifest.n_fetches if settings.samples is None else settings.samples
     behind = asset.manifest.background if settings.background is None else settings.background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -125,7 +128,8 @@ def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
 
 
 def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Camera]) -> list[int]:
-    """Indices of the frames that are not there yet. Raises ConfigError for one that shows something else."""
+    """Return the indices of the frames that do not exist yet. Raises ConfigError for one that shows something
+    else."""
     missing = []
     for index, (path, key, camera) in enumerate(zip(paths, keys, cameras, strict=True)):
         if not path.exists():

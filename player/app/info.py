@@ -1,4 +1,4 @@
-"""What is in an asset, in words and as numbers, for `vfr-play --info`."""
+"""The content of an asset in words and as numbers, for `vfr-play --info`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CONTENT = {
 
 
 def facts(asset: Asset) -> dict[str, Any]:
-    """What `vfr-play --info --json` writes."""
+    """Return the facts that `vfr-play --info --json` writes."""
     m = asset.manifest
     _, head = read_head_file(asset.path("head.onnx"), m.n_channels)
     return {
@@ -61,9 +61,9 @@ def facts(asset: Asset) -> dict[str, Any]:
 
 
 def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
-    """The lines of a page for people, without control characters, whatever the manifest holds.
+    """Return the lines of a page for people. They have no control characters, whatever the manifest holds.
 
-    `known`: what `facts` has returned.
+    `known`: the result of `facts`.
     """
     low, high = known["world_box"]
     scale = known["world_units_per_model_unit"]
@@ -117,7 +117,8 @@ def _section(title: str, rows: list[tuple[str, str]]) -> list[str]:
 
 
 def _flat(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values of nested objects, one row each; the names of inner ones are joined by dots."""
+    """Yield names and values of nested objects, a pair for each value; the names of inner objects are joined
+    by dots."""
     for key, value in sorted(values.items()):
         name = f"{above}{key}"
         if isinstance(value, dict) and value:
@@ -148,7 +149,7 @@ def _step(m: Manifest, scale: float) -> str:
 
 
 def _levels(stored: PyramidValues) -> list[dict[str, int]]:
-    """What has been read of each level, the finest first."""
+    """Count what has been read of each level, the finest first."""
     levels = zip(stored.pyramid.levels, stored.values, strict=True)
     return [{"n_bricks": len(bricks), "n_vertices": len(values)} for bricks, values in levels]
 
@@ -162,9 +163,9 @@ def _level_sentence(levels: dict[str, list[dict[str, int]]]) -> str:
 
 
 def _world_box(asset: Asset) -> list[list[float]]:
-    """Least and greatest world coordinates of the box's corners.
+    """Return the least and the greatest world coordinates of the box's corners.
 
-    In contracted space the box is the cube around what is not contracted.
+    In contracted space, this is the box of the cube around the unit ball, the region that is not contracted.
     """
     box = np.array(asset.manifest.aabb) / (2 if asset.manifest.contracted else 1)
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2], 1] for i, j, k in np.ndindex(2, 2, 2)])

@@ -1,5 +1,5 @@
-"""One frame to render and one frame rendered: what goes to this machine's renderer or to a cluster's worker,
-and what comes back."""
+"""One frame to render, as it goes to this machine's renderer or to a cluster's worker, and the rendered frame
+that comes back."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ class Job:
     """One frame to render."""
 
     index: int
-    """Its place among all jobs."""
+    """Its index among all jobs."""
     camera: Camera
     samples: int | None
-    """Feature fetches a ray, as in `PlaySettings`."""
+    """Feature lookups per ray, as in `PlaySettings`."""
     background: Background | None
-    """What is behind, as in `PlaySettings`."""
+    """The background, as in `PlaySettings`."""
     quality: Quality
-    """As in `PlaySettings`."""
+    """The quality of the picture, as in `PlaySettings`."""
     key: str
     """Digest of what the picture depends on; its file carries it."""
     suffix: str
@@ -35,11 +35,11 @@ class Done:
     """One rendered frame."""
 
     index: int
-    """The place of its job among all jobs."""
+    """The index of its job among all jobs."""
     data: bytes
     """The picture's file."""
     milliseconds: float
-    """Time that rendering took; the file's encoding comes on top."""
+    """Time that rendering took, without the encoding of the file."""
     march: str
     threads: int
 

@@ -1,4 +1,4 @@
-"""Readers of options for argparse; their errors say what is expected, with an example."""
+"""Readers of option values for argparse; their errors say what is expected, with an example."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
 def wrong(expected: str, example: str, text: str) -> argparse.ArgumentTypeError:
-    """The error that a reader raises for a wrong `text`.
+    """Make the error that a reader raises for a wrong `text`.
 
     >>> str(wrong("a whole number", "3", "x"))
     "expected a whole number, such as 3, got 'x'"
@@ -22,7 +22,7 @@ def wrong(expected: str, example: str, text: str) -> argparse.ArgumentTypeError:
 
 
 def asset_folder(text: str) -> Path:
-    """The folder of an asset; the word `demo` is that of the built-in scene.
+    """Return the folder of an asset; the word `demo` stands for that of the built-in scene.
 
     >>> asset_folder("out/").name, asset_folder("demo") == DEMO, asset_folder("./demo").is_absolute()
     ('out', True, False)
@@ -31,8 +31,8 @@ def asset_folder(text: str) -> Path:
 
 
 def joined_negatives(argv: Sequence[str], *options: str) -> list[str]:
-    """`--crop -1,0,...` as one word, for these `options`: argparse takes what begins with a minus for an
-    option of its own.
+    """Join `--crop -1,0,...` to one word, for these `options`: otherwise argparse takes a value that begins
+    with a minus for an option.
 
     >>> joined_negatives(["out", "--crop", "-.5,0,0,1,1,1", "a.ply", "--views", "-3:"], "--crop", "--views")
     ['out', '--crop=-.5,0,0,1,1,1', 'a.ply', '--views=-3:']
@@ -46,7 +46,7 @@ def joined_negatives(argv: Sequence[str], *options: str) -> list[str]:
 
 
 def whole(least: int | None = None, most: int | None = None, example: int = 10) -> Callable[[str], int]:
-    """A reader of whole numbers from `least` to `most`.
+    """Make a reader of whole numbers from `least` to `most`.
 
     >>> whole(1)("12"), whole()("-3")
     (12, -3)
@@ -70,7 +70,7 @@ def whole(least: int | None = None, most: int | None = None, example: int = 10) 
 def number(
     what: str, example: str, above: float = -math.inf, most: float = math.inf
 ) -> Callable[[str], float]:
-    """A reader of finite numbers over `above`, up to `most`.
+    """Make a reader of finite numbers over `above`, up to `most`.
 
     >>> number("seconds", "300", above=0)("0.5")
     0.5
@@ -96,7 +96,7 @@ gigabytes = number("gigabytes", "4", above=0, most=1e9)
 
 
 def size(text: str) -> tuple[int, int]:
-    """Width and height.
+    """Read a width and a height.
 
     >>> size("800x600")
     (800, 600)
@@ -111,7 +111,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def background(text: str) -> str | tuple[float, float, float]:
-    """A colour 0..1 or "transparent".
+    """Read a colour, returned as 0..1, or "transparent".
 
     >>> background("255,0,51"), background("white")
     ((1.0, 0.0, 0.2), (1.0, 1.0, 1.0))
@@ -130,7 +130,7 @@ def background(text: str) -> str | tuple[float, float, float]:
 
 
 def part(text: str) -> slice:
-    """A slice as Python writes it; one number is one view.
+    """Read a slice as Python writes it; a single number is a slice of one view.
 
     >>> part("0:40"), part("::2"), part("3"), part("-1")
     (slice(0, 40, None), slice(None, None, 2), slice(3, 4, None), slice(-1, None, None))

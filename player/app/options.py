@@ -1,4 +1,5 @@
-"""The options of `vfr-play`: the settings of `play`, the command line, and which options go together."""
+"""The options of `vfr-play`: the settings of `play`, the command line, and the rules for which options go
+together."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ Settings = TypeVar("Settings")
 MAX_MEMORY = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
 
 MOST_VIEWS = 100_000
-"""Pictures of an orbit: an hour of a video at 30 frames a second has 108,000."""
+"""Most pictures of an orbit: an hour of video at 30 frames per second has 108,000."""
 
 QUALITY = (
     "exact renders every pixel (files); high interpolates pixels between neighbours that agree, or looks up "
@@ -59,7 +60,8 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 
 
 @dataclass(frozen=True)
 class PlaySettings:
-    """What `player.play` renders, besides the asset and the cameras, and where it writes the pictures.
+    """Settings of `player.play`: what it renders, besides the asset and the cameras, and where it writes
+    pictures.
 
     Raises ConfigError for settings that contradict each other.
 
@@ -111,7 +113,7 @@ MODES = {
     "info": "--info",
     "check": "--check",
 }
-"""What `vfr-play` does, in words."""
+"""The modes of `vfr-play`, in words."""
 
 _FILES = ("files",)
 _RENDERS = ("viewer", "files")
@@ -140,11 +142,11 @@ USED_BY = {
     "host": ("viewer",),
     "port": ("viewer",),
 }
-"""The modes in which each option does something."""
+"""The modes in which each option has an effect."""
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    """Read the command line. Wrong usage ends in SystemExit, as argparse has it."""
+    """Read the command line. Wrong usage raises SystemExit, as argparse does."""
     parser = make_parser()
     arguments = parser.parse_args(joined_negatives(sys.argv[1:] if argv is None else argv, "--frames"))
     _check_together(parser, arguments)
@@ -152,7 +154,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def settings_of(kind: type[Settings], arguments: argparse.Namespace) -> Settings:
-    """Settings of a kind, a dataclass, from the options of the same names; those not given keep its defaults.
+    """Make settings of a `kind`, a dataclass, from the options of the same names; fields that were not given
+    keep their defaults.
 
     >>> settings_of(PlaySettings, make_parser().parse_args(["out/", "--output", "turn"])).samples is None
     True
@@ -163,7 +166,8 @@ def settings_of(kind: type[Settings], arguments: argparse.Namespace) -> Settings
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of the command line; an option that is not given is None, False or an empty list."""
+    """Make the parser of the command line; the value of an option that is not given is None, False or an
+    empty list."""
     parser = argparse.ArgumentParser(
         prog="vfr-play",
         description="Look at a baked asset in a browser, or render it to files, on the CPU.",
@@ -244,7 +248,7 @@ def _add_files(group: argparse._ArgumentGroup) -> None:
 
 
 def given(arguments: argparse.Namespace) -> list[str]:
-    """The names of the options that are on the command line, in the order of USED_BY."""
+    """Return the names of the options that are on the command line, in the order of USED_BY."""
     values = vars(arguments)
     return [name for name in USED_BY if values[name] not in (None, []) and values[name] is not False]
 

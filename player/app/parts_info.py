@@ -1,4 +1,4 @@
-"""What each part of an asset adds, in words, for `vfr-play --info`."""
+"""Descriptions of what each part of an asset adds, for `vfr-play --info`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from player.asset.sections import Part, Section
 
 
 def what_it_adds(part: Part) -> str:
-    """The levels and channels that a part brings, the coarsest first.
+    """Describe the levels and channels that a part adds, the coarsest first.
 
     >>> of = {"grid": "features", "bytes": 9}
     >>> shapes = [Section(level=n, kind="structure", n_bricks=1, **of) for n in (2, 1, 0)]
@@ -36,7 +36,7 @@ def _of_densities(symbols: Sequence[Section]) -> list[str]:
 
 
 def _of_features(symbols: Sequence[Section]) -> list[str]:
-    """Levels that get the same channels are told together."""
+    """Describe levels and their channels; levels that get the same channels are joined."""
     channels: dict[int, tuple[int, int]] = {}
     for section in symbols:
         first, _ = channels.get(section.level, (section.first_channel, 0))

@@ -1,4 +1,4 @@
-"""Cameras to picture files or a video, one frame after another or on many machines."""
+"""Rendering of views into picture files or a video, one frame after another or on many machines."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ from player.files.files import write_bytes
 from player.render import FRAME_BYTES, Renderer, check_size
 
 LARGE_BYTES = 1e9
-"""A picture that takes as many bytes of memory, or more, is told of before it is rendered."""
+"""A line warns before a picture is rendered that takes this many bytes of memory or more."""
 
 Say = Callable[[str], object]
 Advance = Callable[[int, int, float], object]
 
 
 class Played(NamedTuple):
-    """What came of `play`."""
+    """The result of `play`."""
 
     figures: dict[str, Any]
-    """What `vfr-play --json` writes: `ms_median` and `ms_p95` of a frame, `frames` that were rendered, their
-    `width` and `height`, `threads`, `march`, `peak_rss_mb`, `n_fetches` and `quality`."""
+    """The figures that `vfr-play --json` writes: `ms_median` and `ms_p95` of a frame, the number of `frames`
+    that were rendered, their `width` and `height`, `threads`, `march`, `peak_rss_mb`, `n_fetches` and
+    `quality`."""
     n_kept: int
-    """Frames that were there already."""
+    """Frames that existed already."""
     seconds: float
     """Time that rendering and writing took."""
 
@@ -48,8 +49,8 @@ def play(
 ) -> Played:
     """Render an asset from `cameras` into picture files or a video.
 
-    A frame's file appears when it is complete. After KeyboardInterrupt the finished ones are there, and the
-    setting `resume` goes on with the others.
+    The file of a frame appears when it is complete. After a KeyboardInterrupt, the finished files remain, and
+    the setting `resume` goes on with the others.
 
     Args:
         asset: an open asset.
@@ -63,7 +64,7 @@ def play(
         ConfigError: no camera is chosen, a picture is too large, or sizes differ in a video.
         MissingExtraError: a video without PyAV, a cluster without dask.distributed, or numba where it is
             asked for and does not run.
-        OutputError: there is something already, or it cannot be written.
+        OutputError: a file exists already, or cannot be written.
         VfrError: the cluster fails.
 
     >>> from pathlib import Path
@@ -126,7 +127,7 @@ def _rendered(asset: Asset, jobs: Sequence[Job], settings: PlaySettings) -> Iter
         yield from render_on_cluster(settings.dask, asset.folder, jobs, settings)
     elif jobs:
         with Renderer(asset, settings.threads, settings.march) as renderer:
-            # compiles, or reads what was compiled before
+            # a first frame, which compiles, or loads what was compiled before
             small = jobs[0].camera.resized(64, 64)
             renderer.render(small, settings.samples, settings.background, quality=settings.quality)
             for job in jobs:
@@ -162,8 +163,9 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
 
 
 def peak_rss_mb() -> float | None:
-    """Most memory that this process has had, in MB; None where the system does not tell. `ru_maxrss` is
-    inherited from the process that started this one; on Linux there is a figure that is not."""
+    """Return the most memory that this process has had, in MB; None if the system does not tell. `ru_maxrss`
+    is inherited from the process that started this one, so that on Linux another figure is used, which is
+    not."""
     with suppress(OSError, ValueError, IndexError, StopIteration):
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:"))

@@ -1,4 +1,4 @@
-"""Pictures to a video: H.264 in MP4, which every browser and player shows."""
+"""Encoding of pictures as a video: H.264 in MP4, which every browser and player shows."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from player.errors import MissingExtraError, OutputError
 from player.files.files import new_file
 
 QUALITY = 18
-"""x264's constant rate factor: 0 is lossless, 18 looks it, 23 is its default."""
+"""x264's constant rate factor: 0 is lossless, 18 looks lossless, 23 is x264's default."""
 
 
 def load_av() -> Any:
-    """PyAV, which brings FFmpeg along. Raises MissingExtraError."""
+    """Import PyAV, which brings FFmpeg along. Raises MissingExtraError."""
     try:
         import av
     except ImportError as error:
@@ -30,12 +30,12 @@ def load_av() -> Any:
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write an MP4; the name appears when the file is complete.
+    """Write an MP4; the file appears under its name when it is complete.
 
     Args:
         path: the file.
-        pictures: [h, w, 3] uint8 each, all of one size. An odd width or height is filled up with a copy of
-            the last column or row: H.264 stores colour for two by two pixels.
+        pictures: [h, w, 3] uint8 each, all of one size. An odd width or height is extended by a copy of the
+            last column or row: H.264 stores colour for two by two pixels.
         fps: frames a second.
 
     Raises:
@@ -63,7 +63,8 @@ def _encode(av: Any, container: Any, pictures: Iterable[np.ndarray], fps: float)
             stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.options = {"crf": str(QUALITY)}
-            # Said in the file too, or players guess by the picture's size and shift the colours.
+            # Written into the file, too: otherwise players guess by the picture's size, and shift the
+            # colours.
             stream.codec_context.colorspace = stream.codec_context.color_primaries = 1
             stream.codec_context.color_trc, stream.codec_context.color_range = 1, 1
         frame = av.VideoFrame.from_ndarray(padded, format="rgb24")

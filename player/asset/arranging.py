@@ -1,9 +1,9 @@
-"""Which sections the parts of a new asset hold: the first part is a whole, coarser picture.
+"""Arrange the sections of a new asset in parts, of which the first is a whole, coarser picture.
 
-The order of the sections is that of what they show: first all that the coarsest picture needs, then what
-makes it sharper, the density before the features and the first channels before the others. It is cut so that
-what the first picture needs, head and cameras with it, is a few hundredths of the bytes of the asset, so that
-it is there at once; a tenth and half of the bytes end with a part, too.
+Sections are sorted by what they show: first all that the coarsest picture needs, then what makes it sharper,
+with densities before features and the first channels before the others. They are cut into parts so that the
+first picture, head and cameras included, needs only a few hundredths of the asset's bytes and appears at
+once. Further parts end at about a tenth, a quarter and half of the bytes (`SHARES`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from player.asset.symbols import encode_level, level_rows
 from player.errors import FormatError
 
 SHARES = (0.025, 0.1, 0.25, 0.5, 1.0)
-"""The most of all bytes that are read with the first part, with the first two, ..."""
+"""The largest share of all bytes that is read up to the end of the first part, of the second, ..."""
 THREADS = 2
-"""Sections that are encoded at a time: each takes memory of its own."""
+"""Number of sections that are encoded at a time: each takes memory of its own."""
 
 
 class WrittenSection(NamedTuple):
@@ -46,15 +46,15 @@ class WrittenPart(NamedTuple):
 def write_parts(
     densities: PyramidValues, features: PyramidValues, manifest: Manifest, n_before: int, n_behind: int
 ) -> list[WrittenPart]:
-    """The parts of an asset.
+    """Encode an asset's values as parts.
 
     Args:
-        densities, features: what is stored.
-        manifest: resolutions and steps.
-        n_before: bytes of what is read before the first part.
-        n_behind: bytes of what is read behind the last part.
+        densities, features: the codes to store.
+        manifest: has the quantization steps of the levels.
+        n_before: bytes of the files that are read before the first part.
+        n_behind: bytes of the files that are read after the last part.
 
-    Raises FormatError: values that the steps of the manifest do not reach.
+    Raises FormatError: there are values that the steps of the manifest cannot reach.
     """
     with ThreadPoolExecutor(THREADS) as threads:
         sections = [
@@ -78,7 +78,7 @@ def _sections(
                 f"the border, from the next coarser level: {got[row, channel]} at row {row}, channel "
                 f"{channel}, got {wanted[row, channel]}"
             )
-    del again  # as many bytes as the symbols
+    del again  # it takes as many bytes as the symbols
     for level, bricks in enumerate(pyramid.levels):
         if not len(bricks):
             continue
@@ -96,7 +96,8 @@ def _sections(
 
 
 def channel_groups(n_channels: int) -> list[int]:
-    """Where the groups of channels begin, and the number of channels: each group doubles those before it.
+    """Return where each group of channels begins, and last the number of channels. Each group doubles the
+    number of channels up to its end.
 
     >>> channel_groups(1), channel_groups(8), channel_groups(10)
     ([0, 1], [0, 2, 4, 8], [0, 2, 4, 8, 10])
@@ -105,8 +106,11 @@ def channel_groups(n_channels: int) -> list[int]:
 
 
 def _turn(written: WrittenSection) -> tuple[float, ...]:
-    """By what the sections of an asset are sorted: a level after the coarser one, but later channels when
-    finer levels have their first ones, half a level for each group of channels from the third on."""
+    """Return the key by which the sections of an asset are sorted.
+
+    A level comes after the coarser one. Later channels come together with the first channels of finer levels:
+    each group of channels from the third on is delayed by half a level.
+    """
     section = written.section
     late = max((section.end_channel - 1).bit_length() - 2, 0) if section.kind == "symbols" else 0
     return (
@@ -119,11 +123,11 @@ def _turn(written: WrittenSection) -> tuple[float, ...]:
 
 
 def _cut(sections: Sequence[WrittenSection], n_before: int, n_behind: int) -> Iterator[WrittenPart]:
-    """Parts of sections that follow each other, none of them empty."""
+    """Yield parts made of successive sections, none of them empty."""
     ends = n_before + np.cumsum([len(written.data) for written in sections])
     firsts = [0]
     kinds = [(section.grid, section.kind) for section, _ in sections]
-    whole = kinds.index(("features", "symbols")) + 1  # the least that can be shown
+    whole = kinds.index(("features", "symbols")) + 1  # the fewest sections that can be shown
     for share in SHARES:
         most = share * (ends[-1] + n_behind)
         n = int(np.searchsorted(ends, most, side="right"))

@@ -1,4 +1,4 @@
-"""An asset on disk: opened and checked, or written as a whole. docs/format.md specifies the format."""
+"""Open and check an asset on disk, or write one as a whole. docs/format.md specifies the format."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from player.files.replace import clear_up
 
 @dataclass(frozen=True, eq=False)
 class GridArrays:
-    """What is stored of the field: the same in memory whatever version of the format it was read from."""
+    """The stored codes of a field, laid out the same whatever version of the format they were read from."""
 
     densities: PyramidValues
     """Codes uint8 [n_vertices, 1] of each level."""
@@ -43,7 +43,7 @@ class GridArrays:
     """Codes int8 [n_vertices, n_channels] of each level."""
 
     def check(self, manifest: Manifest) -> None:
-        """Raise FormatError unless types, shapes and bricks agree with each other and with the manifest."""
+        """Raise FormatError unless dtypes, shapes and bricks agree with each other and with the manifest."""
         _check_grid("densities", self.densities, manifest)
         _check_grid("features", self.features, manifest)
 
@@ -58,7 +58,7 @@ def _check_grid(grid: Grid, stored: PyramidValues, manifest: Manifest) -> None:
             f"{grid}: expected bricks and values of {n_levels} levels, got {len(levels)} and "
             f"{len(stored.values)}"
         )
-    if grid == "features" and not len(levels[-1]):  # every sample that counts is given a feature
+    if grid == "features" and not len(levels[-1]):  # every sample with weight needs a feature
         raise FormatError(f"{grid}: expected at least one live cell, got none")
     for level, bricks in reversed(list(enumerate(levels))):
         where = f"{grid}, level {level}"
@@ -84,16 +84,16 @@ def _check_array(where: str, array: np.ndarray, kind: type[np.generic], shape: t
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """An opened asset, its values decoded. `asset.grid` arranges them for the march."""
+    """An opened asset with its values decoded; `asset.grid` has them arranged for the march."""
 
     folder: Path
     manifest: Manifest
     arrays: GridArrays
     n_parts: int = 0
-    """Parts that have been read; version 3 has none."""
+    """Number of parts that have been read; 0 for version 3, which has none."""
     missing: str | None = None
-    """Why there is less than was asked for, in one line: a later part is not there, cut short, or another
-    one. What there is plays."""
+    """One line that says why fewer parts were read than asked for: a later one is missing, cut short, changed
+    or broken. None if all were read. The asset can be played either way."""
 
     @classmethod
     def open(
@@ -106,19 +106,19 @@ class Asset:
         """Open the asset in `folder`.
 
         Args:
-            folder: the asset's folder; its files are regular ones inside it.
-            verify: compare every checksum first, which reads every byte, and refuse a part that cannot be
-                decoded. Otherwise only the checksums of the parts are compared, and a part behind the first
-                that is not there, cut short or another one is no error: `asset.missing` tells.
-            max_memory: gigabytes that the asset may take, unpacked and arranged for marching; half of what
-                the machine has if None.
-            parts: how many of the parts to read, 1 or more: the fewer, the coarser and the sooner. All if
-                None.
+            folder: the asset's folder; its files must be regular files inside it.
+            verify: first compare the checksum of every file, which reads every byte, and raise if any part
+                cannot be decoded. If False, only the checksums of the parts are compared, and a part after
+                the first that is missing, cut short, changed or broken is no error: `asset.missing` says so.
+            max_memory: gigabytes that the asset may take, unpacked and arranged for marching. If None, half
+                of what the machine has.
+            parts: number of parts to read, 1 or more: the fewer, the coarser the picture and the sooner it
+                is there. All if None.
 
         Raises:
-            FormatError: not an asset, or one that breaks the format; VersionError if it is a newer one.
+            FormatError: not an asset, or one that breaks the format; VersionError: another major version.
             IntegrityError: a file is cut short or changed.
-            ConfigError: it takes more memory than it may, or `parts` is less than 1.
+            ConfigError: the asset takes more memory than allowed, or `parts` is less than 1.
 
         >>> asset = Asset.open("out/", parts=1)
         >>> asset.n_parts, asset.missing
@@ -133,11 +133,11 @@ class Asset:
     def growing(
         cls, folder: str | Path, verify: bool = False, max_memory: float | None = None
     ) -> Iterator[Asset]:
-        """Open the asset in `folder` part by part: first a whole, coarser picture, then sharper ones. Each
-        part is read and decoded once.
+        """Yield the asset in `folder` after each further part is read: first a whole, coarser picture, then
+        sharper ones. Each part is read and decoded once.
 
-        Arguments and errors as `open`, but that an asset and the one yielded before it take no more than
-        `max_memory` together: that one may still be shown.
+        Arguments and errors are those of `open`, except that `max_memory` bounds an asset together with the
+        one yielded before it, because the earlier one may still be shown.
 
         >>> for asset in Asset.growing("out/"):
         ...     print(asset.n_parts, asset.missing)
@@ -151,28 +151,31 @@ class Asset:
             if asset.missing is not None:
                 return
         asset = opening.asset(n_all)
-        del opening  # its symbols take more than the values
+        del opening  # frees the decoded symbols, which take more memory than the values
         yield asset
 
     def path(self, name: str) -> Path:
-        """Path of one of the asset's files, for example `asset.path("mesh.ply")`."""
+        """Return the path of one of the asset's files, for example `asset.path("mesh.ply")`.
+
+        Raises FormatError: the manifest lists no such file.
+        """
         if name not in self.manifest.files:
             raise FormatError(f"{self.folder}: expected one of {sorted(self.manifest.files)}, got {name}")
         return self.folder / name
 
     def read(self, name: str) -> bytes:
-        """The content of one of the asset's files. Raises FormatError."""
+        """Return the content of one of the asset's files. Raises FormatError."""
         return read_bytes(self.path(name), "a file of an asset", self.manifest.files[name].bytes, self.folder)
 
     def verify(self) -> None:
-        """Compare every file with its checksum; raises IntegrityError that names the first that differs."""
+        """Compare every file with its checksum. Raises IntegrityError that names the first that differs."""
         for _, error in checksums(self.folder, self.manifest):
             if error is not None:
                 raise error
 
     @cached_property
     def grid(self) -> SparseGrid:
-        """The arrays arranged for marching; built when first asked for."""
+        """The arrays arranged for marching; built at the first access."""
         m, a = self.manifest, self.arrays
         low, high = m.density_range
         return build_grid(
@@ -189,7 +192,7 @@ class Asset:
 
     @property
     def most_samples(self) -> int:
-        """Samples that a ray can have; more feature fetches than that are as good as one at every sample."""
+        """The most samples that a ray can have; a ray never needs more feature lookups than that."""
         low, high = self.manifest.aabb
         return most_samples(math.dist(low, high), self.manifest.step)
 
@@ -200,7 +203,7 @@ class Asset:
 
     @property
     def scale(self) -> float:
-        """World units in a model unit."""
+        """World units per model unit."""
         return math.sqrt(sum(row[0] ** 2 for row in self.manifest.world_from_model[:3]))
 
 
@@ -220,7 +223,7 @@ class _Opening:
         self._parts = PartsReader(folder, self.manifest, self._allowed)
 
     def asset(self, n_parts: int) -> Asset:
-        """The asset as its first `n_parts` parts have it, as far as they are there."""
+        """Return the asset made of its first `n_parts` parts, or of fewer if a later one cannot be read."""
         folder, manifest, parts = self._folder, self.manifest, self._parts
         if manifest.version < (4, 0):
             return Asset(folder, manifest, GridArrays(*read_version_3(folder, manifest, self._allowed)))
@@ -236,7 +239,7 @@ class _Opening:
 
 
 def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatError | None]]:
-    """Every file's name with what is wrong with it, or None; reads each byte once."""
+    """Yield the name of every file and the error found in it, or None; reads each byte once."""
     for name, entry in sorted(manifest.files.items()):
         try:
             check_size(folder, name, entry)
@@ -248,13 +251,13 @@ def checksums(folder: Path, manifest: Manifest) -> Iterator[tuple[str, FormatErr
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """The manifest alone, for looking at an asset whose other files may be broken.
+    """Read the manifest alone, for looking at an asset whose other files may be broken.
 
     Raises FormatError: not an asset, or a manifest that breaks the format.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        clear_up(folder.parent)  # it may be there, if whoever replaced it was killed
+        clear_up(folder.parent)  # brings the folder back if a process was killed while replacing it
     if not folder.is_dir():
         raise FormatError(
             f"{folder}: expected the folder of an asset, got {'a file' if folder.exists() else 'nothing'}"
@@ -275,7 +278,7 @@ def write_asset(
     force: bool = False,
     finish: Callable[[Path], dict[str, bytes]] | None = None,
 ) -> None:
-    """Write an asset; it appears under `folder` complete or not at all.
+    """Write an asset, which appears under `folder` complete or not at all.
 
     Args:
         folder: the new folder.
@@ -285,11 +288,12 @@ def write_asset(
         mesh: bytes of `mesh.ply`, world frame.
         cameras: bytes of `cameras.json`, world frame.
         force: replace a folder that exists.
-        finish: called with the complete asset while it still has another name, so that it can be played; the
-            files that it returns, content by name, are added. What it raises leaves nothing.
+        finish: called with the temporary folder of the complete asset, which can already be played. It
+            returns further files to add, content by name. If it raises, nothing is left on disk.
 
     Raises:
-        FormatError: the arrays contradict the manifest, or hold values that its steps do not reach.
+        FormatError: the arrays contradict the manifest, or hold values that its quantization steps cannot
+            reach.
         OutputError: the folder exists, or the disk is full.
     """
     arrays.check(manifest)
@@ -309,7 +313,7 @@ def write_asset(
 
 
 def _write_manifest(folder: Path, manifest: Manifest) -> None:
-    """The manifest of what is in the folder."""
+    """Write the manifest, which lists all files in the folder."""
     paths = sorted(path for path in folder.iterdir() if path.name != NAME)
     files = {path.name: _entry(path) for path in paths}
     data = manifest_bytes(replace(manifest, files=files))

@@ -1,11 +1,11 @@
-"""Bricks: how a sparse set of grid vertices is written, and what follows from which of them are stored.
+"""Bricks: the layout of a sparse set of grid vertices, and the cells that follow from the stored vertices.
 
 A brick is 8 x 8 x 8 vertices; its coordinate is the vertex index >> 3, and bricks are sorted by (x, y, z).
 A brick's mask is eight 64-bit words: vertex (x, y, z) is bit `b = (x & 7) * 64 + (y & 7) * 8 + (z & 7)`, in
-word `b >> 6` (so the word is x & 7) at bit `b & 63`. Rows of `density` and `features` follow the set bits: by
-brick, then by b.
+word `b >> 6` (so the word is x & 7) at bit `b & 63`. Rows of values follow the set bits: by brick, then by b.
 
-A cell is named by its lowest vertex and is live when all eight of its corners are stored.
+A cell is named by its lowest vertex. Here it is live when all eight of its corners are stored, as in versions
+3.x of the format; a pyramid (`player.asset.pyramid`) stores masks of live cells with the same bits instead.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 BRICK = 8
-"""Vertices along each edge of a brick."""
+"""Vertices, or in a pyramid cells, along each edge of a brick."""
 
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _Y_FIRST = np.uint64(0xFF)  # the bits of a word with y = 0
@@ -22,7 +22,7 @@ _Z_FIRST = np.uint64(0x0101010101010101)  # the bits of a word with z = 0
 
 
 def bricks_per_axis(resolution: int) -> int:
-    """Bricks along each axis of a grid of `resolution` cells, that is `resolution + 1` vertices.
+    """Return the bricks along each axis of a grid of `resolution` cells, that is `resolution + 1` vertices.
 
     >>> bricks_per_axis(7), bricks_per_axis(8), bricks_per_axis(512)
     (1, 2, 65)
@@ -31,7 +31,7 @@ def bricks_per_axis(resolution: int) -> int:
 
 
 def pack_vertices(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices to bricks.
+    """Pack vertices into bricks.
 
     Args:
         vertices: [n_vertices, 3] integer grid indices, each at most once, in any order.
@@ -59,7 +59,7 @@ def pack_vertices(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def stored_bits(brick_masks: np.ndarray) -> np.ndarray:
-    """[n_bricks, 8] masks to [n_bricks, 512] bool, indexed by b.
+    """Unpack masks [n_bricks, 8] to [n_bricks, 512] bool, indexed by b.
 
     >>> np.flatnonzero(stored_bits(np.array([[5, 1, 0, 0, 0, 0, 0, 0]], np.uint64))).tolist()
     [0, 2, 64]
@@ -69,7 +69,7 @@ def stored_bits(brick_masks: np.ndarray) -> np.ndarray:
 
 
 def unpack_vertices(brick_coords: np.ndarray, brick_masks: np.ndarray) -> np.ndarray:
-    """The stored vertices [n_vertices, 3] int64 in the order of the rows on disk; undoes `pack_vertices`.
+    """Return the stored vertices [n_vertices, 3] int64 in the order of the rows; undoes `pack_vertices`.
 
     >>> masks = np.array([[2, 0, 0, 0, 0, 0, 0, 1]], np.uint64)
     >>> unpack_vertices(np.array([[1, 0, 2]], np.uint16), masks).tolist()
@@ -81,30 +81,33 @@ def unpack_vertices(brick_coords: np.ndarray, brick_masks: np.ndarray) -> np.nda
 
 
 def dense_index(brick_coords: np.ndarray, n_per_axis: int) -> np.ndarray:
-    """[n, n, n] int32: which brick is where, -1 where there is none."""
+    """Return [n, n, n] int32: the index of the brick at each coordinate, -1 where there is none."""
     index = np.full((n_per_axis,) * 3, -1, np.int32)
     index[tuple(np.asarray(brick_coords, np.int64).T)] = np.arange(len(brick_coords), dtype=np.int32)
     return index
 
 
 def neighbours(brick_coords: np.ndarray, index: np.ndarray, offset: tuple[int, ...]) -> np.ndarray:
-    """[n] int32: the brick at `offset` (components 0 or 1) from each coordinate, -1 where there is none.
+    """Return the index [n] int32 of the brick at `offset` (components 0 or 1) from each coordinate, -1 where
+    there is none.
 
-    -1 addresses the last row: append a row of zeros to what is gathered.
+    -1 addresses the last row, so append a row of zeros to the array that is gathered from.
     """
     padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)
     return padded[tuple((np.asarray(brick_coords, np.int64) + offset).T)]
 
 
 def with_apron(values: np.ndarray, brick_coords: np.ndarray, index: np.ndarray, out: np.ndarray) -> None:
-    """Values of bricks and, behind their last vertices, of the first of the next bricks: into `out` [n, 9, 9,
-    9], so that the eight corners of a cell are in one brick.
+    """Write the values of bricks with an apron to `out` [n, 9, 9, 9].
+
+    The apron holds the first vertices of the next bricks behind a brick's own last ones, so that the eight
+    corners of each cell are in one brick.
 
     Args:
-        values: [n_bricks + 1, 512], indexed by b; the last row stands for every brick that is not there.
-        brick_coords: [n, 3] the bricks that are wanted.
-        index: as `dense_index` has it.
-        out: of the type of `values`.
+        values: [n_bricks + 1, 512], indexed by b; the last row stands for every missing brick.
+        brick_coords: [n, 3] coordinates of the wanted bricks.
+        index: the index of each brick in `values`, from `dense_index`.
+        out: written here; has the dtype of `values`.
     """
     blocks = values.reshape(-1, BRICK, BRICK, BRICK)
     for offset in np.ndindex(2, 2, 2):
@@ -115,8 +118,8 @@ def with_apron(values: np.ndarray, brick_coords: np.ndarray, index: np.ndarray, 
 
 
 def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: int) -> np.ndarray:
-    """[n, 3] int64, sorted: the bricks in which a cell has a corner that is stored, there or in the next
-    brick.
+    """Return the coordinates [n, 3] int64, sorted, of the bricks in which a cell has a stored corner, which
+    may lie in the next brick.
 
     >>> coords, masks, _ = pack_vertices(np.array([[8, 1, 0]]))
     >>> with_corners(coords, masks, 2).tolist()
@@ -124,7 +127,7 @@ def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: 
     """
     found = np.zeros((n_per_axis,) * 3, bool)
     coords, masks = np.asarray(brick_coords, np.int64), np.asarray(brick_masks, np.uint64)
-    some = (np.bitwise_or.reduce(masks, axis=1), masks[:, 0])  # a corner at any x of a brick; at its first
+    some = (np.bitwise_or.reduce(masks, axis=1), masks[:, 0])  # vertices at any x of a brick; at its first x
     for offset in np.ndindex(2, 2, 2):
         words = some[offset[0]] & (_Y_FIRST if offset[1] else _ALL) & (_Z_FIRST if offset[2] else _ALL)
         before = coords - offset
@@ -134,10 +137,11 @@ def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: 
 
 
 def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[n_bricks, 8] uint64 masks, laid out like `brick_masks`, of the cells with all eight corners stored.
+    """Return masks [n_bricks, 8] uint64, laid out like `brick_masks`, of the cells with all eight corners
+    stored.
 
-    A corner counts axis by axis: along z, then y, then x, with the first layer of the next brick at the far
-    end.
+    Corners are combined axis by axis: along z, then y, then x. A brick's last cells take their far corners
+    from the first layer of the next brick.
 
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
     >>> live = live_cells(coords, masks, dense_index(coords, 2))
@@ -158,8 +162,8 @@ def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndar
 
 
 def corner_masks(brick_coords: np.ndarray, cells: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[n_bricks, 8] uint64 masks, laid out like `cells`, of the corners of cells, where the bricks hold all
-    of them; `live_cells` of what it returns has these cells again.
+    """Return masks [n_bricks, 8] uint64, laid out like `cells`, of the corners of cells. The bricks must hold
+    all corners. For the cells that `live_cells` returned, `live_cells` of the result returns them again.
 
     >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
     >>> index = dense_index(coords, 2)

@@ -1,4 +1,4 @@
-"""What holds for the bricks of every level of a pyramid, and is checked when one is read or written."""
+"""Checks of the bricks of a pyramid, made when an asset is read or written."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from player.errors import FormatError
 
 
 def check_level(bricks: Bricks, above: Bricks | None, n_cells: int, where: str) -> None:
-    """Raise FormatError unless a level's bricks are sorted, each once, inside the grid and with a live cell,
-    and the next coarser level has live cells exactly where, beneath its refined octants, these have some.
+    """Raise FormatError unless the bricks of a level are valid.
+
+    They must be sorted, each once, inside the grid, and each must have a live cell. Where they refine an
+    octant of the next coarser level, its live cells must be exactly those that hold a live cell of theirs.
 
     Args:
-        bricks: of the level.
-        above: those of the next coarser level; None for the coarsest.
+        bricks: the bricks of the level.
+        above: the bricks of the next coarser level; None for the coarsest.
         n_cells: cells of the level along each axis.
-        where: what to call the level in messages.
+        where: the level's name in error messages.
     """
     check_sorted(bricks.coords, where)
     check_inside(bricks, n_cells, "cells", where)
@@ -39,7 +41,8 @@ def check_level(bricks: Bricks, above: Bricks | None, n_cells: int, where: str) 
 
 
 def _cells_of(octants: np.ndarray) -> np.ndarray:
-    """[n, 8] uint64: masks of all cells of the octants [n, 2, 2, 2] of bricks."""
+    """Return masks [n, 8] uint64 with all cells set in those octants of bricks that `octants`, [n, 2, 2, 2]
+    bool, selects."""
     bits = np.zeros((2, 2, 2, 8), np.uint64)
     for i, j, k in np.ndindex(2, 2, 2):
         word = sum(0xF << (8 * row + 4 * k) for row in range(4 * j, 4 * j + 4))
@@ -51,15 +54,15 @@ def _cells_of(octants: np.ndarray) -> np.ndarray:
 
 
 def check_sorted(coords: np.ndarray, where: str) -> None:
-    """Raise FormatError unless coordinates of bricks [n, 3] are sorted by x, y, z, each once."""
+    """Raise FormatError unless coordinates of bricks [n, 3] are sorted by (x, y, z), each once."""
     x, y, z = np.asarray(coords, np.int64).T
     if (np.diff((x << 32) | (y << 16) | z) <= 0).any():
         raise FormatError(f"{where}: expected bricks sorted by x, y, z, each once")
 
 
 def check_inside(bricks: Bricks, n: int, what: str, where: str) -> None:
-    """Raise FormatError unless what the masks of bricks are of, cells or vertices, is below `n` on each
-    axis."""
+    """Raise FormatError unless all cells (or vertices, as `what` says) that are set in the masks have
+    coordinates below `n` along each axis."""
     n_bricks = -(-n // 8)
     if (bricks.coords >= n_bricks).any():
         raise FormatError(f"{where}: expected coordinates below {n_bricks}, got {bricks.coords.max()}")

@@ -1,8 +1,8 @@
-"""How a density is written in eight bits: one encoder, one decoder, shared by the bake and the player.
+"""Encode densities in eight bits and decode them; shared by the bake and the player.
 
-Letters: sigma is the volume density in 1/model unit, a code is what `density.codes` holds, 0..255. The
+Letters: sigma is the volume density in 1/model unit; a code is the integer 0..255 that an asset stores. The
 logarithm of sigma is linear in the code, `log sigma = lo + (hi - lo) * code / 255` with `(lo, hi) =
-density_range`, and it is the CODE that is interpolated between vertices: the density is stored before its
+density_range`. It is the CODE that is interpolated between vertices: the density is stored before its
 activation.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def decode_density(codes: np.ndarray, density_range: tuple[float, float]) -> np.ndarray:
-    """Codes, interpolated or not, to densities; float32 throughout.
+    """Decode codes, interpolated or not, to densities; float32 throughout.
 
     Args:
         codes: [...] codes, 0..255, any real dtype.
@@ -29,7 +29,7 @@ def decode_density(codes: np.ndarray, density_range: tuple[float, float]) -> np.
 
 
 def decode_constants(density_range: tuple[float, float]) -> tuple[np.float32, np.float32]:
-    """`low`, `slope` float32 with `sigma = exp(low + slope * code)`; every decoder starts from these two.
+    """Return float32 `low` and `slope` with `sigma = exp(low + slope * code)`; every decoder uses these two.
 
     >>> low, slope = decode_constants((-1.0, 254.0))
     >>> float(low), float(slope)
@@ -40,8 +40,8 @@ def decode_constants(density_range: tuple[float, float]) -> tuple[np.float32, np
 
 
 def encode_density(log_sigmas: np.ndarray, density_range: tuple[float, float]) -> np.ndarray:
-    """Logarithms of densities to the nearest code; what is outside the range is clipped, -inf (no density)
-    to 0.
+    """Encode logarithms of densities as the nearest codes. Values outside the range are clipped; -inf (no
+    density) becomes code 0.
 
     Args:
         log_sigmas: [...] natural logarithm of the density in 1/model unit; no NaN.

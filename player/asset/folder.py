@@ -1,4 +1,4 @@
-"""The files of an asset's folder: each as large as the manifest says, and with its checksum."""
+"""Check the files in an asset's folder: their sizes and checksums must be those in the manifest."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ MAX_CAMERA_BYTES = 64 << 20
 
 
 def check_files(folder: Path, files: Mapping[str, FileEntry], allowed: int) -> None:
-    """Look at files of an asset before any is opened: sizes against the manifest, against what they can hold,
-    and against the memory that is allowed.
+    """Check files of an asset before any is opened: their sizes against the manifest, against the most that
+    files of their kind can hold, and against the memory that is allowed.
 
-    Raises FormatError: not a file, outside the folder, larger than any of its kind; IntegrityError: of
-    another size; ConfigError: more than is allowed.
+    Raises FormatError: a file is not a regular one, outside the folder, or larger than any of its kind can
+    be; IntegrityError: it has another size; ConfigError: the files are larger than what is allowed.
     """
     for name, entry in files.items():
         check_size(folder, name, entry)
@@ -34,31 +34,31 @@ def check_files(folder: Path, files: Mapping[str, FileEntry], allowed: int) -> N
 
 
 def check_total(folder: Path, files: Mapping[str, FileEntry], allowed: int) -> None:
-    """Raise ConfigError if files of an asset are larger than what is allowed, all together."""
+    """Raise ConfigError if files of an asset are together larger than the memory that is allowed."""
     check_memory(sum(entry.bytes for entry in files.values()), allowed, str(folder))
 
 
 def check_size(folder: Path, name: str, entry: FileEntry) -> None:
-    """Raise FormatError unless the file is a regular one inside the folder; IntegrityError for another size
-    than the manifest has."""
+    """Raise FormatError unless the file is a regular one inside the folder; IntegrityError if its size is not
+    that in the manifest."""
     size = file_size(folder / name, f"a file of {entry.bytes} bytes", folder)
     if size != entry.bytes:
         raise IntegrityError(f"{folder / name}: size: expected {entry.bytes} bytes, got {size}")
 
 
 def check_sum(folder: Path, name: str, entry: FileEntry) -> None:
-    """Raise IntegrityError unless the file has the checksum that the manifest has."""
+    """Raise IntegrityError unless the file has the checksum in the manifest."""
     compare_sums(folder / name, entry, file_digest(folder / name, entry.bytes, folder))
 
 
 def compare_sums(path: Path, entry: FileEntry, digest: str) -> None:
-    """Raise IntegrityError unless `digest`, of what is at `path`, is the one that the manifest has."""
+    """Raise IntegrityError unless `digest`, that of the file at `path`, is the one in the manifest."""
     if digest != entry.sha256:
         raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")
 
 
 def file_digest(path: Path, most: int, inside: Path) -> str:
-    """The sha256 of a file of at most `most` bytes in the folder `inside`, in hexadecimal digits."""
+    """Return the sha256, in hexadecimal digits, of a file of at most `most` bytes in the folder `inside`."""
     digest = hashlib.sha256()
     with open_file(path, "a file of an asset", most, inside) as file:
         while block := file.read(1 << 20):

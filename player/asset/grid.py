@@ -1,21 +1,21 @@
-"""The sparse grid as the march wants it: built from the pyramids of an asset when it is opened, in numpy.
+"""The sparse grid that rays are marched through, arranged in numpy from the pyramids of an asset.
 
-Letters: R cells of the finest level per axis, nb its bricks per axis, C channels; a slot is the number of a
-brick from which some place is read. Everything is flat, so that one integer addresses it, in numpy as in
-compiled code:
+Letters: R cells of the finest level per axis, nb bricks of the finest level per axis, C channels. A *place*
+is the space of one brick of the finest level. A *slot* is the index of a brick, of any level, from which some
+place is read. All arrays are flat, so that one integer addresses an element, in numpy as in compiled code:
 
-    table      [nb^3] int32        at (bx * nb + by) * nb + bz, for a place in this brick of the finest level:
-                                   slot << 3 | level of the finest brick there, or minus the Chebyshev
-                                   distance, in bricks of the finest level, to the nearest place that has one
-                                   (at most MAX_DISTANCE). With `skip_dead`, a place where all cells of a
-                                   coarser brick are dead counts as one without a brick; but for the level of
-                                   that brick, which is above the distance's DISTANCE_BITS, if samples there
-                                   stand for several steps
-    live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z tells whether the cell is live
+    table      [nb^3] int32        at (bx * nb + by) * nb + bz for the place of this brick of the finest
+                                   level: slot << 3 | level of the finest brick there. Without a brick there,
+                                   minus the Chebyshev distance, in bricks of the finest level, to the nearest
+                                   place that has one (at most MAX_DISTANCE). With `skip_dead`, a place where
+                                   all cells of a coarser brick are dead counts as one without a brick. If
+                                   samples of that brick's level stand for several steps, the entry is minus
+                                   (level << DISTANCE_BITS | distance)
+    live       [n_slots * 64] u8   at slot * 64 + x * 8 + y: bit z is set if the cell is live
     density    [n_slots * 729] u8  at slot * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: codes with an apron, so
                                    that the eight corners of a cell are in one brick; SPARE bytes follow
-    features   [n_vertices, C] int8, the vertices of a pyramid of its own over the same box, the rows of the
-                                   finest level first, which `rows` finds
+    features   [n_vertices, C] int8, codes at the vertices of a separate pyramid over the same box, the rows
+                                   of the finest level first; `rows` finds the row of a vertex
 
 A slot's cells and vertices are those of its level: the cell of level l is that of the finest level >> l.
 """
@@ -34,57 +34,57 @@ from player.asset.density import decode_constants
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 
 SPARE = 2
-"""Bytes behind the densities: compiled code reads whole words."""
+"""Padding bytes behind the densities, because compiled code reads whole words."""
 
 DISTANCE_BITS = 5
-"""Bits of a distance in the table; above them is the level of a dead brick."""
+"""Bits of a distance in the table; the level of a dead brick is in the bits above them."""
 MAX_DISTANCE = 31
-"""Distances are capped here: a longer jump saves nothing, and a fine grid is built in bounded time."""
+"""Cap on distances: a longer jump saves nothing, and a fine grid is built in bounded time."""
 
 
 CELLS_OF_LEVELS = np.float32(0.5) ** np.arange(8, dtype=np.float32)
-"""Cells of each level in one of the finest level, along an axis."""
+"""Cells of each level per cell of the finest level, along an axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class VertexRows:
-    """Which row of an array holds which stored vertex of a pyramid. Rows are in the order of levels, the
-    finest first, then of bricks, then of bits (`player.asset.bricks`)."""
+    """Lookup table from the vertices of a pyramid to their rows in an array. Rows are sorted by level, the
+    finest first, then by brick, then by bit (`player.asset.bricks`)."""
 
     resolution: int
     """Cells of the finest level per axis."""
     n_per_axis: int
     """Bricks of the finest level per axis, nb."""
     bricks: np.ndarray
-    """[nb^3] int32 at (bx * nb + by) * nb + bz, for a place in this brick of the finest level: number << 3 |
-    level of the brick that its corners are in, -1 where no corner of any cell is stored. Where no level has a
-    brick, it is one of the finest level that has a corner stored there."""
+    """[nb^3] int32 at (bx * nb + by) * nb + bz, for the place of this brick of the finest level: number << 3
+    | level of the brick that holds the corners of the cells there; -1 where no corner is stored. Where no
+    level has a brick, this is a brick of the finest of the levels that have a corner stored there."""
     rows: np.ndarray
     """[n_bricks * 729] int32 at number * 729 + x * 81 + y * 9 + z, x, y, z = 0..8: the row of a vertex, -1 if
-    it is not stored. Bricks have an apron, so that the eight corners of a cell are in one."""
+    it is not stored. Bricks have an apron, so that the eight corners of a cell are in one brick."""
 
 
 class Found(NamedTuple):
-    """Where places are in a `SparseGrid`: the finest brick at each, and the cell of that brick's level."""
+    """Points located in a `SparseGrid`: the finest brick at each, and the cell of that brick's level."""
 
     entries: np.ndarray
-    """[...] int32, of the table."""
+    """[...] int32: entries of the grid's `table`."""
     cells: np.ndarray
-    """[3, ...] int32, cells of the brick's level; of the finest where there is no brick."""
+    """[3, ...] int32: cells of the brick's level, or of the finest level where there is no brick."""
     fractions: np.ndarray
-    """[3, ...] places in these cells, 0..1, of the type of the places."""
+    """[3, ...]: positions of the points in these cells, 0..1, in the dtype of the points."""
     live: np.ndarray
-    """[...] bool: whether the cell is live."""
+    """[...] bool: whether each cell is live."""
 
     @property
     def corners(self) -> np.ndarray:
-        """[...] int64: where in `density` the lowest corners of the cells are, where there is a brick."""
+        """[...] int64: index in `density` of each cell's lowest corner; valid where there is a brick."""
         return corner_number(self.entries >> 3, self.cells)
 
 
 @dataclass(frozen=True, eq=False)
 class SparseGrid:
-    """What a march reads; the arrays are described at the top of the module."""
+    """All data that a march reads; the arrays are described at the top of the module."""
 
     resolution: int
     n_per_axis: int
@@ -95,27 +95,27 @@ class SparseGrid:
     step: np.float32
     """Distance between base samples in model units; dphi of `player.march.contracted` if contracted."""
     level_steps: np.ndarray
-    """[n_levels] int32, powers of two that do not fall: for how many base steps one sample in a brick of each
-    level stands."""
+    """[n_levels] int32: the most base steps that one sample in a brick of each level stands for; powers of
+    two that never decrease."""
     density_low: np.float32
     density_slope: np.float32
     slot_coords: np.ndarray
     """[n_slots, 3] int32: brick coordinate of each slot, in bricks of its level."""
     slot_levels: np.ndarray
-    """[n_slots] int32."""
+    """[n_slots] int32: level of each slot."""
     table: np.ndarray
     live: np.ndarray
     density: np.ndarray
     rows: VertexRows
     features: np.ndarray
     contracted: bool = False
-    """Whether the box is all of space, contracted."""
+    """True if the box is all of space, contracted."""
     near: float = 0.0
-    """Where rays begin, model units, if contracted."""
+    """Distance at which rays begin, in model units, if contracted."""
 
     @cached_property
     def places(self) -> np.ndarray:
-        """[n, 3] int32: the bricks of the finest level in which rays look for live cells."""
+        """[n, 3] int32: the places in which rays look for live cells, in bricks of the finest level."""
         found = np.flatnonzero(self.table >= 0)
         return np.stack(np.unravel_index(found, (self.n_per_axis,) * 3), axis=-1).astype(np.int32)
 
@@ -129,28 +129,28 @@ class SparseGrid:
         return self.features.shape[1]
 
     def cells(self, g: np.ndarray) -> np.ndarray:
-        """The cells [3, ...] int32 of the finest level that hold the points `g` [3, ...], grid coordinates.
-        What is on the border belongs to the last cells, and so does what is beyond it."""
+        """Return the cells [3, ...] int32 of the finest level that hold the points `g` [3, ...], in grid
+        coordinates. Points on the far border, or outside the grid, are counted to the outermost cells."""
         return np.clip(g.astype(np.int32), 0, self.resolution - 1)
 
     def entries(self, cells: np.ndarray) -> np.ndarray:
-        """The entries [...] of `table` for cells [3, ...] of the finest level."""
+        """Return the entries [...] of `table` for cells [3, ...] of the finest level."""
         return self.table.take(brick_number(cells, self.n_per_axis))
 
     def steps_at(self, entries: np.ndarray) -> np.ndarray:
-        """For how many base steps a sample at most stands that begins where the table has `entries`."""
+        """Return the most base steps that a sample stands for if it begins where the table has `entries`."""
         taken = -entries >> DISTANCE_BITS
         steps = self.level_steps.take(np.where(entries < 0, taken, entries & 7), mode="clip")
         return np.where((entries < 0) & (taken == 0), 1, steps)
 
     @property
     def most_steps(self) -> int:
-        """For how many base steps a sample stands at most: a group of steps that begins with one that this
-        number does not divide, ends before the next that it does."""
+        """The most base steps that any sample stands for. A sample's steps always end before the next step
+        whose index is a multiple of this number."""
         return int(self.level_steps[-1])
 
     def find(self, g: np.ndarray) -> Found:
-        """What is at points `g` [3, ...], grid coordinates."""
+        """Locate the points `g` [3, ...], in grid coordinates."""
         cells = self.cells(g)
         entries = self.entries(cells)
         slots = np.maximum(entries >> 3, 0)
@@ -170,29 +170,29 @@ class SparseGrid:
 
     @property
     def codes(self) -> np.ndarray:
-        """[n_slots, 729] uint8: the densities, slot by slot."""
+        """[n_slots, 729] uint8: the codes of the densities, slot by slot."""
         return self.density[: 729 * len(self.slot_coords)].reshape(-1, 729)
 
     @property
     def feature_scale(self) -> np.float32:
-        """Cells of the features' grid in a cell of the density's."""
+        """Cells of the features' finest level per cell of the densities' finest level, along an axis."""
         return np.float32(self.rows.resolution / self.resolution)
 
     @property
     def most_samples(self) -> int:
-        """The number of base samples on the box's diagonal, and three for rounding: no ray is marched
-        further."""
+        """The number of base samples on the box's diagonal, plus three for rounding; no ray has more."""
         diagonal = float(np.linalg.norm(self.resolution / self.cells_per_unit.astype(np.float64)))
         return most_samples(diagonal, float(self.step))
 
 
 def most_samples(diagonal: float, step: float) -> int:
-    """The number of samples, `step` apart, on a diagonal of a box, and three for rounding."""
+    """Return the number of samples, `step` apart, on the diagonal of a box, plus three for rounding."""
     return int(diagonal / step) + 3
 
 
 def brick_number(cells: np.ndarray, n_per_axis: int) -> np.ndarray:
-    """Where in an array over all bricks, `n_per_axis` along each axis, those of cells [3, ...] are.
+    """Return the index [...] of the bricks of cells [3, ...] in a flat array with an element for each brick,
+    `n_per_axis` along each axis.
 
     >>> int(brick_number(np.array([0, 9, 17]), 3))
     5
@@ -202,12 +202,12 @@ def brick_number(cells: np.ndarray, n_per_axis: int) -> np.ndarray:
 
 
 def corner_number(bricks: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Where in an array of bricks with an apron, of 9 x 9 x 9 vertices each, the lowest corners of cells
-    [3, ...] are; its neighbours are 81 further along x, 9 along y, 1 along z.
+    """Return the index [...] of the lowest corners of cells [3, ...] in a flat array of bricks with an apron,
+    9 x 9 x 9 vertices each. The next vertex is 81 further along x, 9 along y, 1 along z.
 
     Args:
-        bricks: [...] the number of each cell's brick among those that the array has; one below 0 counts as 0.
-        cells: [3, ...].
+        bricks: [...] the number of each cell's brick in the array; negative numbers count as 0.
+        cells: [3, ...] cells of the bricks' levels.
 
     >>> int(corner_number(np.array(2), np.array([0, 9, 17])))
     1468
@@ -234,12 +234,12 @@ def build_grid(
         features: codes int8, or float32 values in units of the codes.
         aabb: [2, 3] the box, model frame.
         step: distance between base samples, model units; dphi if contracted.
-        level_steps: for each level of the densities, for how many base steps a sample stands.
+        level_steps: for each level of the densities, the most base steps that one sample stands for.
         density_range: log sigma at codes 0 and 255.
         contracted: whether the box is all of space, contracted.
-        near: where rays begin, model units, if contracted.
-        skip_dead: have the table say of a place where all cells of a coarser brick are dead that it has no
-            brick, which no picture shows and rays jump over.
+        near: distance at which rays begin, model units, if contracted.
+        skip_dead: treat places where all cells of a coarser brick are dead as places without a brick. Rays
+            jump over them, and no picture changes.
 
     >>> from player.asset.bricks import pack_vertices
     >>> from player.asset.single_level import VertexBricks, from_vertices
@@ -282,7 +282,7 @@ def build_grid(
 
 
 def vertex_rows(pyramid: Pyramid) -> VertexRows:
-    """The rows of the vertices of a pyramid.
+    """Return the lookup table of the rows of a pyramid's vertices.
 
     >>> from player.asset.pyramid import Bricks
     >>> one = Bricks(np.array([[0, 0, 0]], np.uint16), np.array([[1, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
@@ -290,7 +290,8 @@ def vertex_rows(pyramid: Pyramid) -> VertexRows:
     >>> found.bricks.tolist(), found.rows[[0, 1, 2, 9, 81, 91]].tolist()
     ([0], [0, 1, -1, 2, 4, 7])
     """
-    owners = np.full((1, 1, 1), -1, np.int32)  # -2 - number << 3 | level: a corner is stored, but no brick
+    # -2 - (number << 3 | level) stands for a place with a stored corner, but without a brick on any level
+    owners = np.full((1, 1, 1), -1, np.int32)
     held: list[np.ndarray] = []
     n_held = 0
     for level in reversed(range(len(pyramid.levels))):
@@ -322,7 +323,7 @@ def vertex_rows(pyramid: Pyramid) -> VertexRows:
 
 
 def _shown(pyramid: Pyramid, level: int) -> Bricks:
-    """The bricks of a level that finer ones do not hide wholly."""
+    """Return the bricks of a level that finer bricks do not hide completely."""
     bricks = pyramid.levels[level]
     if level == 0:
         return bricks
@@ -334,7 +335,7 @@ def _shown(pyramid: Pyramid, level: int) -> Bricks:
 
 
 def _refined(owners: np.ndarray, pyramid: Pyramid, level: int) -> np.ndarray:
-    """What `owners` [n, n, n] has for the bricks of the next coarser level, for those of `level`."""
+    """Expand `owners` [n, n, n] from the bricks of the next coarser level to the bricks of `level`."""
     n = bricks_per_axis(pyramid.cells_per_axis(level) - 1)
     if level + 1 == len(pyramid.levels):
         return np.full((n, n, n), owners[0, 0, 0])
@@ -344,7 +345,8 @@ def _refined(owners: np.ndarray, pyramid: Pyramid, level: int) -> np.ndarray:
 
 
 def _with_apron(densities: PyramidValues, coords: Sequence[np.ndarray]) -> np.ndarray:
-    """The codes of the bricks at `coords` [n, 3] of each level, level after level."""
+    """Return the codes, with an apron, of the bricks at `coords` [n, 3] of each level, level after level;
+    flat, with SPARE bytes behind them."""
     pyramid, n_slots = densities.pyramid, sum(len(some) for some in coords)
     n_codes = (BRICK + 1) ** 3 * n_slots
     flat = np.zeros(n_codes + SPARE, np.uint8)
@@ -362,8 +364,10 @@ def _with_apron(densities: PyramidValues, coords: Sequence[np.ndarray]) -> np.nd
 
 
 def _painted(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
-    """[nb, nb, nb] int32: the slots at `coords` [n, 3] of each level, which are numbered level by level, in
-    the places where they are the finest; -1 where there is none."""
+    """Return [nb, nb, nb] int32: slot << 3 | level of the finest brick at each place, -1 where there is none.
+
+    The slots are the bricks at `coords` [n, 3] of each level, numbered level by level.
+    """
     table = np.full((1, 1, 1), -1, np.int32)
     starts = np.cumsum([0, *(len(some) for some in coords)])
     for level in reversed(range(len(coords))):
@@ -376,14 +380,14 @@ def _painted(pyramid: Pyramid, coords: Sequence[np.ndarray]) -> np.ndarray:
 def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Sequence[int]) -> np.ndarray:
     """Take coarser bricks out of the `table` of `_painted`, in the places where all of their cells are dead.
 
-    Returns [nb, nb, nb] int32: the levels of what was taken out; 0 where nothing was, or where samples of the
+    Returns [nb, nb, nb] int32: the level of the brick taken out; 0 where none was, or where samples of its
     level stand for one step.
     """
     entries, taken = table.reshape(-1), np.zeros(table.size, np.int32)
     first = len(masks[0])
     for level in range(1, len(masks)):
         places = np.flatnonzero((entries >= 0) & (entries & 7 == level))
-        n = 1 << min(level, 3)  # parts of a brick along an axis, each one place wide or wider
+        n = 1 << min(level, 3)  # parts of a brick along an axis, each at least one place wide
         cells = stored_bits(masks[level]).reshape(-1, n, 8 // n, n, 8 // n, n, 8 // n)
         alive: np.ndarray = np.asarray(cells.any(axis=(2, 4, 6)))
         at = np.stack(np.unravel_index(places, table.shape))
@@ -396,9 +400,12 @@ def _forget_dead(table: np.ndarray, masks: Sequence[np.ndarray], level_steps: Se
 
 
 def _add_distances(table: np.ndarray, taken: np.ndarray | None) -> None:
-    """Put distances, and the levels of `taken`, where a table has no brick: in how many rounds a place is
-    not reached, if each round grows the reached set by one brick on every side."""
-    reached = np.packbits(table >= 0, axis=2)  # eight places a byte: there are up to 31 rounds
+    """Write minus the distance, and the levels of `taken`, to the places where a table has no brick.
+
+    Each round grows the set of reached places by one brick on every side; a place's distance is the number of
+    rounds that begin before it is reached.
+    """
+    reached = np.packbits(table >= 0, axis=2)  # eight places a byte, for speed: there are up to 31 rounds
     distance = np.zeros(table.shape, np.uint8)
     for _ in range(MAX_DISTANCE):
         missing = np.unpackbits(~reached, axis=2, count=table.shape[2])
@@ -412,7 +419,8 @@ def _add_distances(table: np.ndarray, taken: np.ndarray | None) -> None:
 
 
 def _dilated(bits: np.ndarray) -> np.ndarray:
-    """A set [n, n, n / 8] uint8, a bit a place along the last axis, and what is next to it on every side."""
+    """Return a set [n, n, n / 8] uint8, with a bit for each place along the last axis, grown by one place on
+    every side."""
     grown = bits | bits << 1 | bits >> 1
     grown[:, :, 1:] |= bits[:, :, :-1] << 7
     grown[:, :, :-1] |= bits[:, :, 1:] >> 7

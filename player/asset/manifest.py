@@ -1,16 +1,15 @@
-"""The manifest of the format `vfr-asset`, version 4.0; this module parses and writes it. docs/format.md
-specifies the format.
+"""Parse and write the manifest of the format `vfr-asset`, version 4.0. docs/format.md specifies the format.
 
 An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved.
 
 | file | content |
 |---|---|
-| `manifest.json` | what is described below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
+| `manifest.json` | the keys below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
 | `part_0.bin`, `part_1.bin`, ... | densities and features; the first is a whole, coarse picture |
 | `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
 | `mesh.ply` | the surface with vertex colours, world frame |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
-| `report.json`, `report.html` | what the bake measured; for people, no player reads them; may be absent |
+| `report.json`, `report.html` | the bake's measurements, for people; no player reads them; may be absent |
 
 | key | type | meaning |
 |---|---|---|
@@ -22,25 +21,25 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `aabb` | 2 x 3 numbers | box, model frame |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
 | `contracted` | true or false | whether the box is all of space, contracted (`player.march.contraction`) |
-| `near` | number, 0..1e6 | where rays begin, model units; 0 unless contracted |
-| `step` | number > 0 | between samples: model units, contracted an angle; at most 65536 along the diagonal |
-| `level_steps` | 1 to 8 integers, 1..128 | base steps of a sample on each density level, powers of two |
-| `n_fetches` | integer, 0..1024 | places where a ray fetches features; 0 means at every sample |
+| `near` | number, 0..1e6 | distance at which rays begin, model units; 0 unless contracted |
+| `step` | number > 0 | base step: model units, contracted radians; at most 65536 along the diagonal |
+| `level_steps` | 1 to 8 integers, 1..128 | most base steps of a sample on each density level, powers of two |
+| `n_fetches` | integer, 0..1024 | feature lookups a ray; 0 means one at every sample |
 | `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
-| `density_steps` | 1 to 8 integers, 1..255 | by how much a symbol changes a density code, on each level |
-| `n_channels` | integer, 1..1024 | of the features |
-| `feature_steps` | 1 to 8 integers, 1..255 | the same for features |
-| `agreement` | 2 numbers, 0..255 | levels for `high`, `fast`; [20, 40], contracted [14, 28], if absent |
-| `quality_fetches` | 2 integers, 0..1024 | most fetches of a ray in `high`, `fast`; [0, 0] if absent |
-| `background` | 3 numbers, 0..1 | white, or what surroundings without end look like on average |
+| `density_steps` | 1 to 8 integers, 1..255 | quantization step of the density codes on each level |
+| `n_channels` | integer, 1..1024 | feature channels |
+| `feature_steps` | 1 to 8 integers, 1..255 | quantization step of the feature codes on each level |
+| `agreement` | 2 numbers, 0..255 | tolerance for `high`, `fast`; [20, 40], contracted [14, 28], if absent |
+| `quality_fetches` | 2 integers, 0..1024 | most lookups a ray in `high`, `fast`; 0 or absent: `n_fetches` |
+| `background` | 3 numbers, 0..1 | colour behind the scene: white, or the mean of unbounded surroundings |
 | `colour_space` | "srgb" | |
 | `view_size` | 2 integers | width and height of the training pictures |
-| `parts` | list | {`file`, `sections`} of each part: `player.asset.sections` |
+| `parts` | list | {`file`, `sections`} of each part (`player.asset.sections`) |
 | `files` | object | name: {`bytes`: integer, `sha256`: 64 hexadecimal digits}, every file but the manifest |
 | `provenance` | object | settings and measured figures, free form |
 
-Numbers are finite everywhere. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot.
-A manifest of version 3.x has `n_samples` for `n_fetches`, and has no levels and no parts.
+All numbers are finite. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot. A
+manifest of version 3.x calls `n_fetches` `n_samples`, and has no levels and no parts.
 """
 
 from __future__ import annotations
@@ -79,9 +78,9 @@ MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_LEVEL_STEP = 128
 AGREEMENT = {False: (20.0, 40.0), True: (14.0, 28.0)}
-"""`agreement` where it is absent, by `contracted`."""
+"""Default of `agreement` where the key is absent, by `contracted`."""
 OPTIONAL = frozenset({"quality_fetches"})
-"""Keys that may be absent, and are None then."""
+"""Keys that may be absent; their fields are None then."""
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
@@ -97,8 +96,8 @@ class FileEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """The manifest; its fields are the keys above. Built by the bake or by `parse_manifest`, checked either
-    way.
+    """A manifest, whose fields are the keys above. The bake and `parse_manifest` build it; its values are
+    checked in either case.
 
     >>> manifest = Manifest(generator="doctest", resolution=8, feature_resolution=4, step=0.2,
     ...     density_range=(-5, 5), n_channels=4, view_size=(4, 3))
@@ -139,21 +138,21 @@ class Manifest:
 
     @property
     def n_levels(self) -> dict[Grid, int]:
-        """Levels of the two pyramids."""
+        """Number of levels of each of the two pyramids."""
         return {"densities": len(self.density_steps), "features": len(self.feature_steps)}
 
     @property
     def resolutions(self) -> dict[Grid, int]:
-        """Cells along each axis of the finest levels of the two pyramids."""
+        """Cells along each axis of the finest level of each of the two pyramids."""
         return {"densities": self.resolution, "features": self.feature_resolution}
 
 
 def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
-    """Bytes of `manifest.json` to a Manifest.
+    """Parse the bytes of `manifest.json`.
 
     Args:
         data: the file's bytes.
-        where: what to call the file in messages.
+        where: the file's name in error messages.
         complete: whether every file of the format must be listed.
 
     Raises:
@@ -193,9 +192,10 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
 
 
 def _of_version_4(document: dict[str, Any], version: tuple[int, ...]) -> dict[str, Any]:
-    """A manifest of version 3.x with the keys of version 4: one level, and no parts.
+    """Return a manifest of version 3.x with the keys of version 4: one level, and no parts.
 
-    What is not a key of version 3 stays and is found to be one too many.
+    Keys that version 3 does not have are kept, those of version 4 under another name, so that they are
+    reported as unknown.
     """
     levels = {"level_steps": [1], "density_steps": [1], "feature_steps": [1], "parts": []}
     found = {f"{key} in version 3" if key in {*levels, "n_fetches"} else key: value
@@ -210,8 +210,8 @@ def _of_version_4(document: dict[str, Any], version: tuple[int, ...]) -> dict[st
 def _check_files(
     where: str, version: tuple[int, ...], files: dict[str, FileEntry], parts: tuple[Part, ...]
 ) -> None:
-    """Raise FormatError unless every file that the version has is listed, and the parts as large as their
-    sections."""
+    """Raise FormatError unless every file that the version must have is listed, and each part is as large as
+    its sections together."""
     needed = FILES if version >= (4, 0) else FILES_OF_3
     if version >= (4, 0) and not parts:
         raise FormatError(f"{where.removesuffix(': files')}: parts: expected at least one, got none")
@@ -227,7 +227,10 @@ def _check_files(
 
 
 def manifest_bytes(manifest: Manifest) -> bytes:
-    """The one way to write a manifest: sorted keys, so that equal manifests are equal files."""
+    """Return the bytes of a manifest's file. Keys are sorted, so that equal manifests are equal files.
+
+    Raises FormatError: `provenance` holds something that is no finite JSON value.
+    """
     document: dict[str, Any] = {f.name: getattr(manifest, f.name) for f in fields(manifest)}
     document = {key: value for key, value in document.items() if value is not None}
     document["format"] = FORMAT

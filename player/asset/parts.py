@@ -1,8 +1,8 @@
-"""The pyramids of an asset out of its parts, one part after another, within a budget of memory.
+"""Read the pyramids of an asset from its parts, one part after another, within a memory budget.
 
-What a section holds is stated by the manifest: so many bricks and vertices of a level. That is compared with
-the budget before a part is opened, and again when the bricks are known, of which the vertices are the
-corners. No more than that is ever decoded, whatever a file holds.
+The manifest states how many bricks and vertices each section holds. The memory that these take is compared
+with the budget before a part is opened, and again, more exactly, once the live cells are known, whose corners
+are the vertices. No more than that is ever decoded, whatever a file holds.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from player.threads import default_threads
 T = TypeVar("T")
 
 LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127, 127)}
-"""The lowest and the highest code of a value."""
+"""The lowest and the highest code of each grid."""
 DTYPES: dict[Grid, type[np.generic]] = {"densities": np.uint8, "features": np.int8}
 
 
 NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 GRIDS: tuple[Grid, Grid] = ("densities", "features")
 MAX_THREADS = 8
-"""Sections that are decoded at a time at most: each takes memory of its own."""
+"""The most sections that are decoded at a time: each takes memory of its own."""
 
 
 class StoredSection(NamedTuple):
@@ -48,13 +48,13 @@ class StoredSection(NamedTuple):
     section: Section
     data: bytes
     where: str
-    """The file and the section, for messages."""
+    """Names the file and the section in error messages."""
 
 
 class PyramidReader:
     """One of the two pyramids, as far as its sections have been read.
 
-    A level whose structure is not known has no bricks, and a symbol that is not known is 0.
+    A level whose structure has not been read has no bricks, and a symbol that has not been read is 0.
     """
 
     def __init__(self, grid: Grid, manifest: Manifest) -> None:
@@ -66,7 +66,7 @@ class PyramidReader:
         self._symbols = [np.zeros((0, self.n_channels), np.int16)] * n_levels
 
     def read_structure(self, stored: StoredSection) -> None:
-        """Add a level. Raises FormatError: the section breaks the format."""
+        """Decode a structure and add its level. Raises FormatError: the section breaks the format."""
         section, data, where = stored
         level, levels = section.level, self.pyramid.levels
         coarser = levels[level + 1] if level + 1 < len(levels) else None
@@ -79,23 +79,26 @@ class PyramidReader:
         self.pyramid = pyramid
 
     def rows_of(self, level: int) -> LevelRows:
-        """The rows of a level that is there; before its symbols are read, which it makes room for."""
+        """Return the rows of a level whose structure has been read, and make room for its symbols; must be
+        called before the symbols are read."""
         rows = level_rows(self.pyramid.vertices[level])
         if not len(self._symbols[level]):
             shape = (rows.neighbours.n, self.n_channels)
-            self._symbols[level] = np.zeros(shape, np.int16, order="F")  # as they are decoded
+            self._symbols[level] = np.zeros(shape, np.int16, order="F")  # they are decoded by channel
         return rows
 
     def read_symbols(self, stored: StoredSection, rows: LevelRows) -> None:
-        """Add symbols to a level; sections can be read at the same time. Raises FormatError: the section
-        breaks the format."""
+        """Decode symbols and add them to their level; threads may do so for several sections at a time.
+
+        Raises FormatError: the section breaks the format.
+        """
         section, data, where = stored
-        own = LevelRows(Neighbours(rows.neighbours.rows), rows.classes)  # it keeps what belongs to a section
+        own = LevelRows(Neighbours(rows.neighbours.rows), rows.classes)  # Neighbours caches for one section
         found = decode_level(data, own, section.n_channels, where)
         self._symbols[section.level][:, section.first_channel : section.end_channel] = found
 
     def forget(self, section: Section) -> None:
-        """Undo that a section was read, or that it was begun to be; the last one first."""
+        """Undo that a section was read or begun. The section added last must be forgotten first."""
         if section.kind == "structure":
             self.pyramid = self.pyramid.with_level(section.level, NONE)
             self._symbols[section.level] = self._symbols[section.level][:0]
@@ -104,36 +107,37 @@ class PyramidReader:
 
     @property
     def n_symbol_bytes(self) -> int:
-        """What the symbols of the levels that are there take."""
+        """The most bytes that the symbols of the levels read so far can take."""
         n_vertices = sum(vertices.n for vertices in self.pyramid.vertices)
         return n_vertices * self.n_channels * np.dtype(np.int16).itemsize
 
     def values(self) -> PyramidValues:
-        """What is known so far."""
+        """Return the values that follow from the sections read so far."""
         vertices = self.pyramid.vertices
         values = values_of(vertices, self._symbols, self._steps, self._limits, self._dtype)
         return PyramidValues(self.pyramid, tuple(values))
 
 
 class Counts(NamedTuple):
-    """How much there is in all levels of a pyramid, as far as it is known."""
+    """The sizes of a pyramid, summed over its levels, as far as they are known."""
 
     n_per_axis: int
     """Bricks along an axis of the finest level."""
     n_bricks: int
     n_vertex_bricks: int
-    """Bricks of 8 x 8 x 8 vertices that have one."""
+    """Bricks of 8 x 8 x 8 vertices that have at least one vertex."""
     n_vertices: int
     n_channels: int
     n_held: int = 0
-    """Bricks that hold a cell with a stored corner, for features."""
+    """Bricks that hold a cell with a stored corner; counted for features only."""
 
 
 def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
-    """Most memory that is taken while `n_packed` bytes of parts become arrays and those a grid.
+    """Return the most bytes of memory taken while `n_packed` bytes of parts are decoded into arrays and these
+    are arranged in a grid.
 
-    Bytes a brick, a vertex, a cell of a table are those of the arrays in `player.asset` and of their
-    temporaries; tests/player/asset/test_parts.py compares the sum with what numpy asks for.
+    The bytes for each brick, vertex and table entry are those of the arrays in `player.asset` and of their
+    temporaries. tests/player/asset/test_parts.py compares the sum with what numpy allocates.
     """
     d, f = densities, features
     decoding = n_packed + sum(
@@ -149,7 +153,7 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
 
 
 def _of_both(work: Callable[[Grid], T]) -> list[T]:
-    """What `work` gives for the densities and for the features, at the same time."""
+    """Return the results of `work` for the densities and for the features, computed at the same time."""
     with ThreadPoolExecutor(min(len(GRIDS), default_threads())) as pool:
         return list(pool.map(work, GRIDS))
 
@@ -167,14 +171,14 @@ class PartsReader:
         self.n_read = 0
         """Parts that have been read."""
         self._taken = 0
-        """Bytes that the parts before took, which may still be shown."""
+        """Bytes that the parts read before take; their picture may still be shown."""
 
     def read(self, n_parts: int) -> None:
-        """Read on until `n_parts` are read, or one cannot be. What was read before may still be shown: its
-        memory counts.
+        """Read further parts until `n_parts` are read, or one cannot be. The memory of the parts read before
+        is counted too, because their picture may still be shown.
 
-        Raises FormatError, IntegrityError: a part is not there, or another one, or breaks the format; those
-        before it are read. ConfigError: it takes more memory than is allowed.
+        Raises FormatError, IntegrityError: a part is missing, changed or breaks the format; the parts before
+        it have been read. ConfigError: the parts take more memory than is allowed.
         """
         parts = self._manifest.parts[self.n_read : n_parts]
         allowed = self._allowed - self._taken
@@ -202,16 +206,17 @@ class PartsReader:
             raise error
 
     def _forget(self, read: Sequence[Sequence[StoredSection]]) -> None:
-        """Undo what was read of parts, of which some sections may not have been begun."""
+        """Undo the reading of parts; some of their sections may not have been begun."""
         for stored in reversed([stored for sections in read for stored in sections]):
             self._grids[stored.section.grid].forget(stored.section)
 
     def _read_structures(
         self, read: Sequence[Sequence[StoredSection]], error: FormatError | None
     ) -> tuple[int, FormatError | None]:
-        """Decode the structures of parts, both pyramids' at the same time.
+        """Decode the structures of parts, for both pyramids at the same time.
 
-        Returns how many parts are whole, and what is wrong with the next: `error` if all of these are.
+        Returns the number of parts before the first broken one, and that one's error. If none is broken, this
+        is the number of all parts, and `error`.
         """
 
         def of_grid(grid: Grid) -> tuple[int, FormatError | None]:
@@ -223,7 +228,7 @@ class PartsReader:
                             reader.read_structure(stored)
                     if grid == "features" and not reader.pyramid.levels[-1].masks.any():
                         file = self._folder / self._manifest.parts[self.n_read + number].file
-                        raise FormatError(  # every sample is given one
+                        raise FormatError(  # every sample with weight needs a feature
                             f"{file}: expected a live cell of the features, got none"
                         )
                 except FormatError as found:
@@ -237,7 +242,7 @@ class PartsReader:
     ) -> tuple[int, FormatError | None]:
         """Decode the symbols of parts, several sections at a time.
 
-        Returns how many parts are whole, and what is wrong with the next: `error` if all of these are.
+        Returns the number of parts before the first broken one, and its error, as `_read_structures`.
         """
         symbols = [
             (number, stored)
@@ -268,7 +273,7 @@ class PartsReader:
         return len(read), error
 
     def _sections(self, part: Part) -> list[StoredSection]:
-        """The sections of a part, whose file is compared with its checksum."""
+        """Read the sections of a part, and compare its file with the checksum."""
         path, entry = self._folder / part.file, self._manifest.files[part.file]
         check_size(self._folder, part.file, entry)
         data = read_bytes(path, "a part of an asset", entry.bytes, self._folder)
@@ -281,11 +286,12 @@ class PartsReader:
         return found
 
     def values(self) -> list[PyramidValues]:
-        """What is known of the densities and of the features so far."""
+        """Return the values of the densities and of the features that follow from the parts read so far."""
         return _of_both(lambda grid: self._grids[grid].values())
 
     def _stated_bytes(self, n_parts: int) -> int:
-        """What the first parts will take by the numbers of the manifest: every brick has vertices."""
+        """Return the bytes that the first parts will take at least, by the numbers in the manifest; each
+        brick of cells has at least one brick of vertices."""
         stored = [section for part in self._manifest.parts[:n_parts] for section in part.sections]
         counts = []
         for grid in GRIDS:
@@ -297,7 +303,7 @@ class PartsReader:
         return needed_bytes(self._n_packed(n_parts), *counts)
 
     def _exact_bytes(self, n_parts: int) -> int:
-        """What they take now that the bricks are known."""
+        """Return the bytes that the first parts take, now that their bricks are known."""
         counts = []
         for grid in GRIDS:
             reader = self._grids[grid]

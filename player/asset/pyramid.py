@@ -1,18 +1,18 @@
-"""A pyramid: one grid at several levels of detail, each as fine as the place needs.
+"""A pyramid: one sparse grid at several levels of detail, where each place is as fine as it needs to be.
 
 Level 0 is the finest, with R cells along each axis of the box; cells of level l are 2^l times as wide. A
 brick is 8 x 8 x 8 cells of its level, and its coordinate is that of its lowest cell >> 3. The mask of a brick
 says which of its cells are live, with the bits of `player.asset.bricks`.
 
-The pyramid is whole: below every live cell of a finer level there is a live cell of the next coarser one, so
-that the coarser levels alone are a picture, too. A place is read from the finest level that has a brick
-there; if that brick's cell is not live, nothing is there.
+The pyramid is whole: every live cell of a finer level lies in a live cell of the next coarser one, so that
+the coarser levels alone make a picture, too. A place is read from the finest level that has a brick there. If
+that brick's cell is not live, the place is empty.
 
-Vertices of a level are the corners of its live cells; their rows are in the order of the bricks of vertices,
-8 x 8 x 8 each, and then of the bits. A vertex is on the *border* of its level if it is also a corner of a
-place that is read from a live cell of a coarser level. What a level stores is by how much its values differ
-from those of the next coarser level, interpolated; on the border they do not, so that the field is
-continuous where levels meet.
+The vertices of a level are the corners of its live cells. Their rows are sorted by brick, of 8 x 8 x 8
+vertices each, and then by bit. A vertex is on the *border* of its level if it is also a corner of a place
+that is read from a live cell of a coarser level. A level stores by how much its values differ from those of
+the next coarser level, interpolated. On the border nothing is stored and they do not differ, so that the
+field is continuous where levels meet.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from player.asset.prediction.prediction import Places, values_from
 
 MAX_LEVELS = 8
 _ROWS_AT_ONCE = 1 << 18
-"""Vertices whose symbols are found at once: what is computed meanwhile is eight times as wide as they are."""
+"""Vertices whose symbols are found at a time: the temporaries are eight times as wide as the 8-bit codes."""
 
 _Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
 _ONE, _SEVEN, _EIGHT, _FIFTY_SIX = (np.uint64(n) for n in (1, 7, 8, 56))
@@ -41,7 +41,7 @@ class Bricks:
     coords: np.ndarray
     """[n_bricks, 3] uint16, sorted, each at most once."""
     masks: np.ndarray
-    """[n_bricks, 8] uint64: which cells are live, or which vertices there are."""
+    """[n_bricks, 8] uint64: which cells are live, or which vertices exist."""
 
     def __len__(self) -> int:
         return len(self.coords)
@@ -51,7 +51,7 @@ class Bricks:
         return _keys(self.coords)
 
     def find(self, coords: np.ndarray) -> np.ndarray:
-        """[n] int64: which bricks have the coordinates [n, 3]; -1 where there is none.
+        """Return the index [n] int64 of the brick at each of the coordinates [n, 3]; -1 where there is none.
 
         >>> some = Bricks(np.array([[0, 0, 1], [2, 0, 0]], np.uint16), np.ones((2, 8), np.uint64))
         >>> some.find(np.array([[2, 0, 0], [0, 0, 0], [-1, 0, 0]])).tolist()
@@ -64,12 +64,12 @@ class Bricks:
         return np.where(self._keys[index] == keys, index, -1)
 
     def masks_at(self, coords: np.ndarray) -> np.ndarray:
-        """[n, 8] uint64: the masks at the coordinates [n, 3]; 0 where there is no brick."""
+        """Return the masks [n, 8] uint64 at the coordinates [n, 3]; 0 where there is no brick."""
         index = self.find(coords)
         return np.where(index[:, None] >= 0, self.masks[index], 0) if len(self) else _no_masks(len(coords))
 
     def without_empty(self) -> Bricks:
-        """Those whose masks are not all 0."""
+        """Return the bricks whose masks are not all 0."""
         some = self.masks.any(axis=1)
         return self if some.all() else Bricks(self.coords[some], self.masks[some])
 
@@ -88,9 +88,9 @@ class Vertices:
     """The vertices of a level, in the order of their rows."""
 
     bricks: Bricks
-    """Bricks of vertices; the masks say which vertices there are."""
+    """Bricks of vertices; the masks say which vertices exist."""
     border: np.ndarray
-    """[n_bricks, 8] uint64: those of them on the border."""
+    """[n_bricks, 8] uint64: which of these vertices are on the border."""
 
     @cached_property
     def n(self) -> int:
@@ -98,12 +98,12 @@ class Vertices:
 
     @cached_property
     def on_border(self) -> np.ndarray:
-        """[n] bool."""
+        """[n] bool: whether each vertex is on the border."""
         return stored_bits(self.border).reshape(-1)[stored_bits(self.bricks.masks).reshape(-1)]
 
     @cached_property
     def index(self) -> np.ndarray:
-        """[n, 3] int32: positions in cells of the level."""
+        """[n, 3] int32: positions of the vertices, in cells of the level."""
         brick, bit = np.nonzero(stored_bits(self.bricks.masks))
         local = np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1).astype(np.int32)
         return self.bricks.coords.astype(np.int32)[brick] * BRICK + local
@@ -117,7 +117,7 @@ class Vertices:
         return rows
 
     def rows_of(self, part: Bricks) -> np.ndarray:
-        """[n] int32, ascending: the rows of the vertices of `part`, which are some of these.
+        """Return the rows [n] int32, ascending, of the vertices in `part`, a subset of these vertices.
 
         >>> brick = np.zeros((1, 3), np.uint16)
         >>> whole, part = (Bricks(brick, np.array([[bits] + [0] * 7], np.uint64)) for bits in (14, 10))
@@ -128,7 +128,7 @@ class Vertices:
         return np.flatnonzero(there).astype(np.int32)
 
     def rows(self, index: np.ndarray) -> np.ndarray:
-        """[n] int32: the rows of vertices [n, 3]; -1 where there is none."""
+        """Return the rows [n] int32 of the vertices at the positions [n, 3]; -1 where there is none."""
         if not len(self.bricks):
             return np.full(len(index), -1, np.int32)
         brick = self.bricks.find(index >> 3)
@@ -140,7 +140,7 @@ class Vertices:
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Which cells are live on which level."""
+    """The live cells of each level."""
 
     resolution: int
     """Cells of the finest level along each axis."""
@@ -151,8 +151,8 @@ class Pyramid:
         return -(-self.resolution // (1 << level))
 
     def shown(self, level: int, coords: np.ndarray) -> np.ndarray:
-        """[n, 8] uint64: which cells of `level`, in places of bricks [n, 3], are read from live cells when
-        all finer levels are left out."""
+        """Return masks [n, 8] uint64 of the cells of `level`, in bricks at `coords` [n, 3], that are read
+        from live cells of this or a coarser level when all finer levels are left out."""
         bricks = self.levels[level]
         index = bricks.find(coords)
         masks = bricks.masks_at(coords)
@@ -163,8 +163,8 @@ class Pyramid:
         return masks
 
     def with_level(self, level: int, bricks: Bricks) -> Pyramid:
-        """This pyramid with bricks on a level that has none so far, nor have finer ones. The vertices of the
-        other levels stay what they are, and are not looked for again."""
+        """Return this pyramid with other bricks on a level. Finer levels must have none. The vertices of the
+        other levels do not change, and are not computed again."""
         levels, vertices = list(self.levels), list(self.vertices)
         levels[level] = bricks
         grown = Pyramid(self.resolution, tuple(levels))
@@ -194,17 +194,17 @@ class Pyramid:
 
 @dataclass(frozen=True, eq=False)
 class PyramidValues:
-    """A pyramid with what is stored at its vertices."""
+    """A pyramid with the values at its vertices."""
 
     pyramid: Pyramid
     values: tuple[np.ndarray, ...]
-    """For each level [n_vertices, n_channels] uint8 or int8 codes, a row for each vertex, the border's
-    too."""
+    """For each level [n_vertices, n_channels] uint8 or int8 codes, a row for each vertex, those on the border
+    included."""
 
     @cached_property
     def first_rows(self) -> np.ndarray:
-        """[n_levels + 1] int64: where the rows of each level begin among those of all levels, the finest
-        first; last their number."""
+        """[n_levels + 1] int64: the first row of each level when the rows of all levels follow one another,
+        the finest first; the last entry is the number of all rows."""
         return np.cumsum([0, *(len(values) for values in self.values)])
 
     @property
@@ -213,9 +213,10 @@ class PyramidValues:
 
 
 def corners_of(cells: Bricks) -> Bricks:
-    """The corners of live cells, as masks of bricks of vertices.
+    """Return the corners of live cells, as masks of bricks of vertices.
 
-    A cell's corners are added axis by axis: along z, then y, then x, the last into the next brick.
+    Corners are added axis by axis: along z, then y, then x. Those behind a brick's last cells belong to the
+    next brick.
 
     >>> one = Bricks(np.array([[0, 0, 0]], np.uint16), np.array([[1 << 63, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
     >>> found = corners_of(one)
@@ -237,7 +238,8 @@ def corners_of(cells: Bricks) -> Bricks:
 
 
 def _neighbourhood(coords: np.ndarray, low: int, high: int) -> np.ndarray:
-    """[n, 3] int64, sorted: the coordinates at all offsets with components from `low` to `high`."""
+    """Return the coordinates [n, 3] int64, sorted, that are at offsets with components from `low` to `high`
+    from any of `coords`."""
     keys = _keys(coords)
     offsets = np.arange(low, high + 1)
     for shift in (0, 20, 40):
@@ -249,11 +251,11 @@ def _neighbourhood(coords: np.ndarray, low: int, high: int) -> np.ndarray:
 
 
 def expanded(masks: np.ndarray, octants: np.ndarray) -> np.ndarray:
-    """Each cell of an octant of a brick as eight cells of a brick of the next finer level.
+    """Return masks of bricks of the next finer level, in which each cell of a brick's octant is eight cells.
 
     Args:
         masks: [n, 8] uint64 of the coarser bricks.
-        octants: [n, 3] components 0 or 1: which half along each axis.
+        octants: [n, 3] components 0 or 1: which half of each brick along each axis.
 
     >>> masks = expanded(np.array([[1, 0, 0, 0, 0, 0, 0, 0]], np.uint64), np.array([[0, 0, 0]]))
     >>> np.flatnonzero(stored_bits(masks)).tolist()
@@ -272,13 +274,13 @@ def expanded(masks: np.ndarray, octants: np.ndarray) -> np.ndarray:
 
 
 def packed_bits(cells: np.ndarray) -> np.ndarray:
-    """[n, 8, 8, 8] bool to masks [n, 8] uint64."""
+    """Pack cells [n, 8, 8, 8] bool into masks [n, 8] uint64."""
     bits = np.packbits(cells.reshape(-1, BRICK**3), axis=1, bitorder="little")
     return bits.view("<u8").astype(np.uint64, copy=False)
 
 
 def coarser(bricks: Bricks) -> Bricks:
-    """The bricks of the next coarser level whose live cells hold a live cell of these.
+    """Return the bricks of the next coarser level whose live cells are those that hold a live cell of these.
 
     >>> fine = Bricks(np.array([[3, 0, 0]], np.uint16), np.array([[0, 0, 4, 0, 0, 0, 0, 0]], np.uint64))
     >>> found = coarser(fine)
@@ -290,15 +292,15 @@ def coarser(bricks: Bricks) -> Bricks:
     x, y, z = (bricks.coords & 1).T
     halved = _halved(bricks.masks) << (32 * y + 4 * z).astype(np.uint64)[:, None]
     whole = np.zeros((len(keys), 2, 4), np.uint64)
-    for octant in range(8):  # in each there is one brick at most
+    for octant in range(8):  # each coarser brick has at most one of the bricks in it
         some = np.flatnonzero(x * 4 + y * 2 + z == octant)
         whole[owner.reshape(-1)[some], octant >> 2] |= halved[some]
     return Bricks(coords.astype(np.uint16), whole.reshape(-1, 8))
 
 
 def _halved(masks: np.ndarray) -> np.ndarray:
-    """[n, 4] uint64: where one of 2 x 2 x 2 cells is live, as the first octant of a brick: word x, bits
-    y * 8 + z, each below 4.
+    """Return [n, 4] uint64: which groups of 2 x 2 x 2 cells have a live one, laid out as the first octant of
+    a brick: word x, bit y * 8 + z, with x, y and z below 4.
 
     >>> [hex(word) for word in _halved(np.array([[0, 1 << 63, 0, 0, 0, 0, 1 << 2, 0]], np.uint64))[0]]
     ['0x8000000', '0x0', '0x0', '0x2']
@@ -306,7 +308,7 @@ def _halved(masks: np.ndarray) -> np.ndarray:
     words = masks[:, 0::2] | masks[:, 1::2]
     words |= words >> _ONE
     words |= words >> _EIGHT
-    for shift, kept in (  # every other bit of every other byte, moved together
+    for shift, kept in (  # compact every other bit of every other byte
         (0, 0x0055005500550055), (1, 0x0033003300330033), (2, 0x000F000F000F000F),
         (8, 0x00000F0F00000F0F), (16, 0x000000000F0F0F0F),
     ):  # fmt: skip
@@ -315,10 +317,10 @@ def _halved(masks: np.ndarray) -> np.ndarray:
 
 
 def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
-    """The pyramid whose level l shows the live cells of `leaves[l]`, and what finer levels need below them.
+    """Return the pyramid whose level l has the live cells of `leaves[l]` and those that finer levels need.
 
-    Where a finer level has a brick, a coarser one does not show: its own live cells there are dropped unless
-    a finer one needs them.
+    A place where a finer level has a brick is not read from a coarser one. The coarser level's own live cells
+    there are dropped unless a finer level needs them.
     """
     levels = [leaves[0].without_empty()]
     for own in leaves[1:]:
@@ -336,11 +338,12 @@ def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
 
 
 def places_between(fine: Vertices, coarse: Vertices) -> Places:
-    """Where the vertices `coarse` of the next coarser level are around the vertices `fine` of a level."""
+    """Locate the vertices `coarse` of the next coarser level around the bricks of the vertices `fine`."""
     rows = np.append(coarse.row_of_bit, np.full(BRICK**3, -1, np.int32)).reshape(-1, BRICK, BRICK, BRICK)
     apron = np.empty((len(coarse.bricks), BRICK + 1, BRICK + 1, BRICK + 1), np.int32)
     for offset in np.ndindex(2, 2, 2):
-        beside = coarse.bricks.find(coarse.bricks.coords.astype(np.int64) + offset)  # -1: the last, of -1
+        # -1, for a brick that is missing, is the index of the last one, which is filled with -1
+        beside = coarse.bricks.find(coarse.bricks.coords.astype(np.int64) + offset)
         into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
         take = tuple(slice(1) if o else slice(None) for o in offset)
         apron[(slice(None), *into)] = rows[(slice(None), *take)][beside]
@@ -351,12 +354,12 @@ def places_between(fine: Vertices, coarse: Vertices) -> Places:
 
 
 def predicted(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
-    """What the next coarser level says at the vertices of a level.
+    """Return the values that the next coarser level predicts at the vertices of a level.
 
     Args:
-        fine: n vertices.
-        coarse: those of the next coarser level.
-        values: [n_coarse, n_channels] integers.
+        fine: the n vertices of the level.
+        coarse: the vertices of the next coarser level.
+        values: [n_coarse, n_channels] integers, the values at these.
 
     Returns:
         [n, n_channels] int16: (the sum of the values at floor(v / 2) and ceil(v / 2) of each axis + 4) >> 3.
@@ -372,16 +375,16 @@ def values_of(
     limits: tuple[int, int],
     dtype: type[np.generic] = np.int16,
 ) -> list[np.ndarray]:
-    """The values of all levels from what each stores.
+    """Return the values of all levels, decoded from the symbols that each stores.
 
     Args:
-        vertices: those of each level, the finest first.
+        vertices: the vertices of each level, the finest first.
         symbols: for each level [n_stored, n_channels] integers, one row for each vertex that is not on the
-            border: by how many steps it differs from what the coarser level says; on the coarsest level, from
-            0. [0, n_channels] where all are 0.
-        steps: for each level the width of a step, 1 or more.
+            border: by how many steps the value differs from the coarser level's prediction; on the coarsest
+            level, from 0. [0, n_channels] where all symbols of a level are 0.
+        steps: for each level the quantization step, 1 or more.
         limits: the lowest and the highest value.
-        dtype: of the values.
+        dtype: dtype of the values.
 
     Returns:
         for each level [n, n_channels], a row for each vertex.
@@ -404,10 +407,10 @@ def values_of(
 def symbols_of(
     vertices: Sequence[Vertices], wanted: Sequence[np.ndarray], steps: Sequence[int], limits: tuple[int, int]
 ) -> list[np.ndarray]:
-    """What each level stores so that `values_of` is as close to `wanted` as its steps allow.
+    """Return the symbols of each level with which `values_of` comes as close to `wanted` as the steps allow.
 
-    The arguments are those of `values_of`, with `wanted` [n, n_channels] of each level, which need not be
-    whole numbers.
+    The arguments are those of `values_of`, and `wanted`: for each level [n, n_channels] values, which need
+    not be whole numbers.
     """
     found: list[np.ndarray] = []
     coarse: np.ndarray | None = None

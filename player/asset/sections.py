@@ -2,8 +2,8 @@
 
 A section is either the *structure* of one level of one of the two pyramids (its bricks and live cells), or
 the *symbols* of some channels of one level: by how many steps the values differ from what the next coarser
-level says. Sections stand behind one another in the files `part_0.bin`, `part_1.bin`, ..., in an order in
-which each can be decoded from those before it.
+level predicts. Sections follow one another in the files `part_0.bin`, `part_1.bin`, ..., in an order in which
+each can be decoded from those before it.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ Grid = Literal["densities", "features"]
 Kind = Literal["structure", "symbols"]
 
 MAX_ROWS = 2**31 - 1
-"""Vertices of all levels of a pyramid: rows are numbered in 32 bits."""
+"""The most vertices of all levels of a pyramid together: rows are numbered in int32."""
 MAX_PARTS = 64
 MAX_SECTIONS = 1024
-"""Sections of all parts."""
+"""The most sections of all parts together."""
 MAX_CHANNELS = 1024
 
 
 @dataclass(frozen=True)
 class Section:
-    """One section: what it is, and how many bytes it takes."""
+    """One section: its grid, level and kind, its sizes, and the bytes that it takes."""
 
     grid: Grid
     level: int
     bytes: int
     kind: Kind
     n_bricks: int = 0
-    """Bricks of the level, for a structure."""
+    """For a structure: bricks of the level."""
     n_vertices: int = 0
-    """Vertices of the level, those on the border too, for a structure."""
+    """For a structure: vertices of the level, those on the border included."""
     first_channel: int = 0
     n_channels: int = 0
-    """Channels from the first on, for symbols."""
+    """For symbols: number of channels, from `first_channel` on."""
 
     @property
     def end_channel(self) -> int:
@@ -48,7 +48,7 @@ class Section:
 
     @property
     def name(self) -> str:
-        """What to call the section in messages.
+        """Name of the section in messages.
 
         >>> Section("features", 2, 900, "symbols", first_channel=4, n_channels=4).name
         'features, level 2, symbols of channels 4 to 7'
@@ -74,7 +74,8 @@ class Part:
 
 
 def part_name(number: int) -> str:
-    """
+    """Return the file name of a part.
+
     >>> part_name(0)
     'part_0.bin'
     """
@@ -82,7 +83,7 @@ def part_name(number: int) -> str:
 
 
 def parts_as_json(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """The value of the manifest's key `parts`."""
+    """Return the value of the manifest's key `parts`."""
     return [
         {"file": part.file, "sections": [_section_as_json(section) for section in part.sections]}
         for part in parts
@@ -98,9 +99,9 @@ def _section_as_json(section: Section) -> dict[str, Any]:
 
 
 def parse_parts(where: str, value: object) -> tuple[Part, ...]:
-    """The manifest's `parts`, each number within its bounds. Raises FormatError.
+    """Parse the manifest's `parts`, and check that each number is within its bounds. Raises FormatError.
 
-    Whether they agree with the rest of the manifest is for `check_parts`.
+    `check_parts` checks that they agree with the rest of the manifest.
     """
     if isinstance(value, tuple) and all(isinstance(part, Part) for part in value):
         value = parts_as_json(value)
@@ -161,9 +162,9 @@ def check_parts(
     after those of the channels before them, and after those of the same channels on the next coarser level.
 
     Args:
-        parts: as parsed.
-        resolutions: cells along each axis of the finest levels.
-        n_levels: levels of each pyramid.
+        parts: the parts, as `parse_parts` returns them.
+        resolutions: cells along each axis of the finest level of each pyramid.
+        n_levels: number of levels of each pyramid.
         n_channels: channels of the features.
     """
     done = Progress(n_levels)
@@ -201,14 +202,14 @@ def _check_structure(section: Section, resolution: int, where: str) -> None:
 
 
 class Progress:
-    """What of the two pyramids the sections so far have brought."""
+    """The levels and channels of the two pyramids that the sections so far have brought."""
 
     def __init__(self, n_levels: dict[Grid, int]) -> None:
         self.n_channels = {grid: [-1] * n for grid, n in n_levels.items()}
-        """For each level: channels that are known, or -1 before its structure is."""
+        """For each level: number of known channels, or -1 as long as its structure is not known."""
 
     def add(self, section: Section, where: str) -> None:
-        """Note a section. Raises FormatError: something that it needs, or itself, is not in its turn."""
+        """Add a section. Raises FormatError: the section was there before, or comes before one it needs."""
         known = self.n_channels[section.grid]
         level, coarser = section.level, section.level + 1
         last = coarser == len(known)

@@ -1,8 +1,8 @@
-"""Pyramids of one level, made of vertices: how versions 3.x of the format store a grid.
+"""Pyramids of one level, made from the stored vertices of a grid in versions 3.x of the format.
 
-There a brick is 8 x 8 x 8 vertices, and a cell is live where all eight of its corners are stored. In a
-pyramid a brick is of cells, and its vertices follow from them, so that a vertex which is a corner of no live
-cell is left out.
+In these versions a brick is 8 x 8 x 8 vertices, and a cell is live where all eight of its corners are stored.
+In a pyramid a brick is 8 x 8 x 8 cells, and the vertices are the corners of the live cells. A vertex that is
+a corner of no live cell is therefore left out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from player.asset.pyramid import Bricks, Pyramid, PyramidValues, Vertices
 
 
 class VertexBricks(NamedTuple):
-    """Vertices in bricks and what is stored at them, as versions 3.x write a grid."""
+    """Bricks of vertices and the values stored at these, as versions 3.x of the format write a grid."""
 
     coords: np.ndarray
     """[n_bricks, 3] uint16, sorted."""
@@ -27,7 +27,7 @@ class VertexBricks(NamedTuple):
 
 
 def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
-    """The pyramid of one level whose live cells are those with all eight corners stored.
+    """Return the pyramid of one level whose live cells are those with all eight corners stored.
 
     Args:
         stored: vertices and their values; values of one channel may be [n_vertices].
@@ -48,7 +48,7 @@ def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
     pyramid = Pyramid(resolution, (Bricks(coords, live).without_empty(),))
     kept = corner_masks(coords, live, index)
     vertices = Bricks(coords, kept).without_empty()
-    vars(pyramid)["vertices"] = (Vertices(vertices, np.zeros_like(vertices.masks)),)  # they are known already
+    vars(pyramid)["vertices"] = (Vertices(vertices, np.zeros_like(vertices.masks)),)  # already known
     if not np.array_equal(kept, masks):
         values = values[stored_bits(kept)[stored_bits(masks)]]
     return PyramidValues(pyramid, (values,))

@@ -1,20 +1,21 @@
-"""Which bricks and cells a level of a pyramid has, as bytes: an octree, coded from the coarse to the fine.
+"""Encode and decode which bricks and cells a level of a pyramid has: an octree, from the coarse to the fine.
 
-A level is coded by what the next coarser one has. An *octant* is 4 x 4 x 4 cells of a coarser brick, which
-are the place of one brick of the finer level. First each octant with a live cell has one symbol, 1 if there
-is a brick. Then the *parents*, which are the live cells of those octants, have eight symbols each, 1 for each
-child that is live: child k = 4 x + 2 y + z is at twice the parent's position plus (x, y, z).
+A level is coded relative to the next coarser one. An *octant* is 4 x 4 x 4 cells of a coarser brick, which
+cover the same space as one brick of the finer level. First, each octant with a live cell has one symbol: 1 if
+the finer level has a brick there, and the octant is *refined*. Then the *parents*, which are the live cells
+of refined octants, have eight symbols each, one for each child: 1 if it is live. Child k = 4 x + 2 y + z is
+at twice the parent's position plus (x, y, z).
 
-Above the coarsest level there are further ones, each with half as many cells along each axis, rounded up,
-until there is one cell, which is live. All their octants with live cells are refined, and nothing is said
-about them.
+The coarsest level is coded below imagined levels, each with half as many cells along each axis as the one
+below it, rounded up, until there is one cell, which is live. All octants with live cells are refined there,
+so that they need no symbols.
 
-Both are blocks of `player.asset.coder`. Octants, in the order of (x, y, z), are rows of one channel and one
-class. Parents, in the order of octants and then of 16 x + 4 y + z within them, are rows of eight channels.
-The class of a child is `live * 7 + dead`, which count, among its six neighbours through a face at the finer
-level, those that are known to be so: those of channels before, those whose parent is not live, and those
-whose parent is live in an octant without a brick, which count as live. A last child without a live
-sibling has the class 49, and must be live.
+Both kinds of symbols are blocks of `player.asset.coder`. Octants, sorted by (x, y, z), are rows of one
+channel and one class. Parents, sorted by octant and then by 16 x + 4 y + z within it, are rows of eight
+channels. The class of a child is `live * 7 + dead`: of its six neighbours through a face at the finer level,
+the numbers that are known to be live and to be dead. Known are the children of earlier channels; cells whose
+parent is not live, which are dead; and cells whose parent is live in an octant that is not refined, which
+count as live. The last child of a parent without another live child has the class 49, and must be live.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ N_CHILDREN = 8
 MUST = 49
 N_CLASSES = 50
 _DEAD, _LIVE, _UNKNOWN = 1, 7, 0
-"""What a neighbour adds to the class of a child."""
+"""Number that a dead, a live or an unknown neighbour adds to the class of a child."""
 _QUARTERS = np.array([[0x0F0F0F0F, 0xF0F0F0F0]], np.uint64) << np.array([[0], [32]], np.uint64)
-"""[2, 2] uint64: the bits of a mask's word that are in the half along y and along z."""
+"""[2, 2] uint64: the bits of a mask's word in each half along y (first index) and along z (second index)."""
 _LENGTH = struct.Struct("<I")
 
 
@@ -44,27 +45,28 @@ class _Octants(NamedTuple):
     """The octants of a level that have live cells."""
 
     coords: np.ndarray
-    """[n, 3] int64, sorted: coordinates of bricks of the next finer level."""
+    """[n, 3] int64, sorted: coordinates of the bricks of the next finer level at the octants."""
     live: np.ndarray
-    """[n, 4, 4, 4] bool: the live cells of each."""
+    """[n, 4, 4, 4] bool: which cells of each octant are live."""
 
 
 class _Parents(NamedTuple):
-    """The live cells of octants that are refined."""
+    """The live cells of refined octants."""
 
     octant: np.ndarray
-    """[n] int64: the number of each one's octant among those that are refined."""
+    """[n] int64: index of each parent's octant among the refined ones."""
     local: np.ndarray
-    """[n] int64: 16 x + 4 y + z in it."""
+    """[n] int64: position of each parent in its octant, 16 x + 4 y + z."""
     beside: np.ndarray
-    """[3, 2, n] int32: the rows before and after each one along x, y and z; n for a cell that is not live,
-    n + 1 for one in an octant that is not refined."""
+    """[3, 2, n] int32: the rows of the cells before and after each parent along x, y and z; n for a cell that
+    is not live, n + 1 for a live one in an octant that is not refined."""
 
 
 def encode_structure(pyramid: Pyramid, level: int) -> bytes:
-    """The bricks and cells of a level, as `decode_structure` reads them with those of the next coarser one.
+    """Encode the bricks and cells of a level, relative to those of the next coarser one.
 
-    Raises ShapeError: a live cell of a refined octant has no live child, or one beside it has.
+    Raises ShapeError: a live cell of a refined octant has no live child, a live cell has no live parent, or
+    the coarsest level has no live cell.
     """
     parts = []
     if level + 1 < len(pyramid.levels):
@@ -92,17 +94,17 @@ def decode_structure(
 
     Args:
         data: the bytes.
-        cells_per_axis: those of the level.
+        cells_per_axis: cells of the level along each axis.
         parent: the bricks of the next coarser level; None for the coarsest.
-        n_bricks: how many bricks the level has.
-        where: the name of what is read, in error messages.
+        n_bricks: number of bricks that the level must have.
+        where: the section's name in error messages.
 
     Returns:
-        the level's bricks, each with a live cell; each live cell of an octant with a brick has a live child.
+        the level's bricks, each with a live cell; each live cell of a refined octant has a live child.
 
     Raises:
-        FormatError: it breaks the format, or has another number of bricks. Memory is bounded by the bricks of
-            the two levels and the length of `data`.
+        FormatError: the data breaks the format, or has another number of bricks. Memory is bounded by the
+            bricks of the two levels and the length of `data`.
     """
     parts = _parts(data, _n_above(cells_per_axis) if parent is None else 2, where)
     if parent is not None:
@@ -119,7 +121,7 @@ def decode_structure(
         bricks = Bricks(np.zeros((1, 3), np.uint16), np.array([[1] + [0] * 7], np.uint64))
         for above, part in zip(range(len(parts))[::-1], parts, strict=True):
             octants = _octants(bricks)
-            if len(octants.coords) > n_bricks:  # each brick that is found holds a brick of the level
+            if len(octants.coords) > n_bricks:  # each octant holds at least one brick of the level
                 raise FormatError(f"{where}: expected {n_bricks} bricks, got more at {above} levels above")
             bricks = _decode_children(part, octants, np.ones(len(octants.coords), bool), where)
         if len(bricks) != n_bricks:
@@ -129,12 +131,12 @@ def decode_structure(
 
 
 def _n_above(cells_per_axis: int) -> int:
-    """Levels above one with so many cells along each axis, until there is one cell."""
+    """Return the number of imagined levels above a level, until there is one cell."""
     return (cells_per_axis - 1).bit_length()
 
 
 def _parts(data: bytes, n_parts: int, where: str) -> list[bytes]:
-    """Pieces of bytes, each behind its length."""
+    """Split bytes into `n_parts` pieces, each of which follows its length."""
     parts, at = [], 0
     for _ in range(n_parts):
         if len(data) < at + _LENGTH.size:
@@ -170,7 +172,7 @@ def _octants(bricks: Bricks) -> _Octants:
 
 
 def _octant_rows(octants: _Octants) -> tuple[Neighbours, list[np.ndarray], int]:
-    """What `encode` takes for one symbol an octant."""
+    """Return the neighbours, classes and number of classes that `encode` needs for one symbol an octant."""
     named = _named(octants.coords)
     beside = [named.find(octants.coords - offset) for offset in np.eye(3, dtype=np.int64)[::-1]]
     neighbours = Neighbours(np.stack(beside).astype(np.int32))
@@ -178,14 +180,14 @@ def _octant_rows(octants: _Octants) -> tuple[Neighbours, list[np.ndarray], int]:
 
 
 def _named(coords: np.ndarray) -> Bricks:
-    """Bricks to look coordinates up in."""
+    """Return bricks with empty masks, for looking coordinates up."""
     return Bricks(coords, np.zeros((len(coords), 8), np.uint64))
 
 
 def _parents(octants: _Octants, refined: np.ndarray) -> _Parents:
     used = octants.live & refined[:, None, None, None]
     n = int(np.count_nonzero(used))
-    row = np.full((len(used) + 1, 4, 4, 4), n, np.int32)  # the last is that of octants without live cells
+    row = np.full((len(used) + 1, 4, 4, 4), n, np.int32)  # the last entry: octants without live cells
     flat = row[:-1].reshape(-1)
     flat[octants.live.reshape(-1)] = n + 1
     flat[used.reshape(-1)] = np.arange(n, dtype=np.int32)
@@ -208,7 +210,7 @@ def _neighbours(parents: _Parents) -> Neighbours:
 
 
 class _Children:
-    """Which children are live, of those channels that are known."""
+    """The states of the children in the channels known so far: live or dead."""
 
     def __init__(self, parents: _Parents) -> None:
         n = parents.beside.shape[2]
@@ -217,7 +219,7 @@ class _Children:
         self._known[:, n], self._known[:, n + 1] = _DEAD, _LIVE
 
     def classes(self, child: int) -> np.ndarray:
-        """[n] uint8: the class of a child of each parent."""
+        """Return the class [n] uint8 of child number `child` of every parent."""
         n = self._beside.shape[2]
         counts = np.zeros(n, np.uint8)
         for axis, bit in enumerate((4, 2, 1)):
@@ -229,6 +231,7 @@ class _Children:
         return counts
 
     def tell(self, child: int, live: np.ndarray) -> None:
+        """Note which of the children number `child` are live, [n] bool."""
         self._known[child, : len(live)] = np.where(live, np.uint8(_LIVE), np.uint8(_DEAD))
 
 
@@ -269,6 +272,6 @@ def _decode_children(data: bytes, octants: _Octants, refined: np.ndarray, where:
 
 
 def _places(parents: _Parents) -> tuple:
-    """Where the children of each parent are in an array [n_octants, 4, 2, 4, 2, 4, 2]."""
+    """Return the index of the children of each parent in an array [n_octants, 4, 2, 4, 2, 4, 2]."""
     x, y, z = parents.local >> 4, (parents.local >> 2) & 3, parents.local & 3
     return parents.octant, x, slice(None), y, slice(None), z, slice(None)

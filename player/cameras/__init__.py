@@ -1,1 +1,1 @@
-"""Cameras, the files that hold them, and paths that join them."""
+"""Cameras, the files that hold them, and camera paths through a few views."""

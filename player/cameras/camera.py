@@ -1,4 +1,4 @@
-"""Pinhole cameras, the rays that leave them, and an orbit around what a set of them looks at.
+"""Pinhole cameras, their rays, and an orbit around the point that a set of cameras looks at.
 
 Conventions: `c2w` [4, 4] maps camera to world, OpenGL/Blender axes (x right, y up, the camera looks along
 -z). Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5); `fx fy cx cy` are in pixels. `rays_d` has
@@ -49,7 +49,7 @@ class Camera:
             raise FormatError(f"{self.name}: cx, cy: expected finite numbers, got {self.cx}, {self.cy}")
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on a grid of `width` x `height` pixels."""
+        """Return the same view on a grid of `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -62,7 +62,8 @@ class Camera:
         )
 
     def at_most(self, longest: int) -> Camera:
-        """The same view with at most `longest` pixels along each side; itself if it has no more.
+        """Return the same view with at most `longest` pixels along each side: this camera itself if it has no
+        more.
 
         >>> small = Camera("a", np.eye(4), 1600, 1200, 800.0, 800.0, 800.0, 600.0).at_most(640)
         >>> small.width, small.height, small.fx
@@ -74,7 +75,7 @@ class Camera:
         return self.resized(max(round(self.width * share), 1), max(round(self.height * share), 1))
 
     def transformed(self, matrix: np.ndarray) -> Camera:
-        """The camera in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale,
+        """Return the camera in another frame; `matrix` [4, 4] is a similarity (rotation, uniform scale,
         translation).
         """
         scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
@@ -83,14 +84,15 @@ class Camera:
         return replace(self, c2w=c2w)
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rays through the centres of all pixels in row-major order.
+        """Make rays through the centres of all pixels in row-major order.
 
         Returns `rays_o`, `rays_d` [n_rays, 3] float32, `rays_d` of unit length.
         """
         return self.rays_through(np.arange(self.width * self.height))
 
     def rays_through(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rays through the centres of `pixels` [n], numbers in row-major order; as `rays` returns them.
+        """Make rays through the centres of `pixels` [n], numbers in row-major order, in the form that `rays`
+        returns.
 
         >>> camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
         >>> bool(np.allclose(camera.rays_through(np.array([7, 2]))[1], camera.rays()[1][[7, 2]], atol=1e-7))
@@ -114,7 +116,7 @@ def check_pose(c2w: np.ndarray, where: str) -> None:
     rotation = c2w[:3, :3]
     rigid = (
         np.isfinite(c2w).all()
-        and np.abs(c2w).max() <= 1e12  # further away float32 rays say nothing, and squares overflow
+        and np.abs(c2w).max() <= 1e12  # further away, float32 rays are too coarse, and squares overflow
         and np.allclose(c2w[3], [0, 0, 0, 1], atol=1e-6)
         and np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3)
         and np.linalg.det(rotation) > 0
@@ -126,10 +128,10 @@ def check_pose(c2w: np.ndarray, where: str) -> None:
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """The point [3] that is nearest to all optical axes, in the least-squares sense.
+    """Return the point [3] that is nearest to all optical axes, in the least-squares sense.
 
-    Where the axes do not tell (parallel, or one camera) or meet behind the cameras, a point ahead of the mean
-    camera, as far as the cameras are spread.
+    Where the axes do not determine a point (they are parallel, or there is one camera), or meet behind the
+    cameras, the point is ahead of the mean camera, at a distance equal to the spread of the cameras.
 
     >>> pose = np.eye(4)
     >>> pose[:3, 3] = 0, 0, 4
@@ -141,15 +143,15 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     origins, forwards = _axes(cameras)
     middle = origins.mean(axis=0)
     spread = float(np.sqrt(((origins - middle) ** 2).sum(axis=-1).mean()))
-    # In units of the cameras' spread around their mean: the solution is then free of the scene's unit and
-    # origin.
+    # Positions are in units of the cameras' spread around their mean, so that the solution does not depend on
+    # the scene's unit and origin.
     unit = spread if spread > 0 else 1.0
     ahead = _unit(forwards.mean(axis=0), np.zeros(3))
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     a = across.mean(axis=0)
     b = (across @ ((origins - middle) / unit)[:, :, None]).mean(axis=0)[:, 0]
-    # The weight of the point ahead: far below what axes one degree apart know (eigenvalue 1e-4), far above
-    # rounding.
+    # The weight of the point ahead is far below what axes one degree apart determine (eigenvalue 1e-4), and
+    # far above rounding errors.
     weight = 1e-7
     point = np.linalg.solve(a + weight * np.eye(3), b + weight * ahead)
     in_front = np.median(((point - (origins - middle) / unit) * forwards).sum(axis=-1)) > -1e-6
@@ -157,10 +159,10 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
-    """A turn around what `cameras` look at, at their median distance and elevation, starting beside the first
-    one.
+    """Return views in a circle around what `cameras` look at, at their median distance and elevation,
+    beginning beside the first camera.
 
-    `n_frames`: views in the turn, equal steps. `size`: (width, height) of the pictures; the first camera's
+    `n_frames`: number of views, in equal steps. `size`: (width, height) of the pictures; the first camera's
     field of view is kept as large as fits, with its pixel shape. Raises FormatError for no cameras or no
     frames.
 
@@ -180,7 +182,7 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
     radii = np.linalg.norm(arms, axis=-1)
     radius = float(np.median(radii))
     sines = arms @ up / np.maximum(radii, 1e-12)
-    limit = np.deg2rad(85)  # straight above, left and right mean nothing
+    limit = np.deg2rad(85)  # straight above, left and right are undefined
     elevation = float(np.clip(np.median(np.arcsin(np.clip(sines, -1, 1))), -limit, limit))
     start = _unit(arms[0] - (arms[0] @ up) * up, np.cross(up, np.eye(3)[np.argmin(np.abs(up))]))
     left = np.cross(up, start)
@@ -198,23 +200,23 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
 
 
 def _axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and viewing directions, [n_cameras, 3] each."""
+    """Return positions and viewing directions, [n_cameras, 3] each."""
     c2w = np.stack([camera.c2w for camera in cameras])
     return c2w[:, :3, 3], -c2w[:, :3, 2] / np.linalg.norm(c2w[:, :3, 2], axis=-1, keepdims=True)
 
 
 def world_up(cameras: Sequence[Camera]) -> np.ndarray:
-    """The world's up [3], of unit length.
+    """Estimate the world's up direction [3], of unit length.
 
-    Nobody holds a camera crooked for long: up is at right angles to the cameras' right hands as well as it
-    can be, and where these do not tell it is the mean of the cameras' own ups, which leans when all of them
-    stand on one side.
+    Cameras are rarely tilted sideways for long. So up is the direction most nearly at right angles to the
+    cameras' right-hand directions. Where these do not determine it, up is the mean of the cameras' own up
+    directions, which leans when all cameras stand on one side.
     """
     c2w = np.stack([camera.c2w for camera in cameras])
     rights, ups = c2w[:, :3, 0], c2w[:, :3, 1]
     mean = _unit(ups.mean(axis=0), ups[0])
     spread = rights.T @ rights / len(rights)
-    weight = 1e-3  # as much as right hands tell that turn by two degrees
+    weight = 1e-3  # as much as right-hand directions that vary by two degrees count
     return _unit(np.linalg.solve(spread + weight * np.eye(3), weight * mean), mean)
 
 

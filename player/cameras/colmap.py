@@ -1,9 +1,9 @@
-"""COLMAP models: the lenses, the pictures' poses and the points of `cameras.bin`, `images.bin`,
+"""Reader of COLMAP models: the lenses, the pictures' poses and the points of `cameras.bin`, `images.bin`,
 `points3D.bin`.
 
-The format is COLMAP's (scene/reconstruction_io.cc); it is read here because pycolmap's reader takes files
-that were cut short for whole ones or never comes back from them. COLMAP's cameras look along +z with y down
-(OpenCV); the pixel centre is at +0.5 as here. Of the text form, `cameras.txt` and `images.txt` are read.
+The format is COLMAP's (scene/reconstruction_io.cc). pycolmap's reader is not used, because it takes truncated
+files for whole ones, or never returns from them. COLMAP's cameras look along +z with y down (OpenCV); the
+pixel centre is at +0.5 as here. Of the text form, `cameras.txt` and `images.txt` are read.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ MODELS = {
     3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
 }
-"""Number, name and parameters of the camera models that are a pinhole behind OpenCV's lens."""
+"""Numbers, names and parameters of the camera models that are a pinhole with OpenCV's lens distortion or
+none."""
 MAX_FILE_BYTES = 1 << 30
-"""Bytes of each file of a model: ten thousand pictures of a thousand points each that several pictures share
-take half of it."""
+"""Largest size of each file of a model. Half of it holds ten thousand pictures with a thousand points each
+that several pictures share."""
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of one camera, and the lens in front of it."""
+    """Intrinsics of one camera, and the distortion of its lens."""
 
     width: int
     height: int
@@ -49,7 +50,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class RegisteredImage:
-    """One picture that COLMAP has placed."""
+    """One picture whose pose COLMAP has found."""
 
     name: str
     camera_id: int
@@ -58,7 +59,7 @@ class RegisteredImage:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """The folder of the COLMAP model that belongs to the pictures in `folder`, if there is one."""
+    """Find the folder of the COLMAP model that belongs to the pictures in `folder`; None if there is none."""
     for name in FOLDERS:
         if (folder / name / "images.bin").exists():
             return folder / name
@@ -66,10 +67,10 @@ def colmap_folder(folder: Path) -> Path | None:
 
 
 def read_views(model: Path) -> list[Camera]:
-    """The registered pictures of a COLMAP model as pinhole cameras, in the order of their names.
+    """Read the registered pictures of a COLMAP model as pinhole cameras, in the order of their names.
 
-    `model`: the folder of `cameras.bin` and `images.bin`, or of `cameras.txt` and `images.txt`. What lenses
-    do beyond a pinhole is left out, as in pictures that were undistorted. Raises FormatError, DataError (a
+    `model`: the folder of `cameras.bin` and `images.bin`, or of `cameras.txt` and `images.txt`. Lens
+    distortion is ignored, as is right for pictures that were undistorted. Raises FormatError, DataError (a
     camera model that is no pinhole).
     """
     suffix = "bin" if (model / "images.bin").exists() else "txt"
@@ -90,7 +91,8 @@ def read_views(model: Path) -> list[Camera]:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """The lenses in `cameras.bin` by camera number. Raises FormatError, DataError (an unknown model)."""
+    """Read the lenses in `cameras.bin`, by camera number. Raises FormatError, DataError (an unknown
+    model)."""
     file = _Reader(path)
     lenses = {}
     for _ in range(file.count(24)):
@@ -123,7 +125,7 @@ def _lens(model: int, width: float, height: float, parameters: Sequence[float], 
 
 
 def read_images(path: Path) -> list[RegisteredImage]:
-    """The pictures in `images.bin`, in the file's order. Raises FormatError."""
+    """Read the pictures in `images.bin`, in the file's order. Raises FormatError."""
     file = _Reader(path)
     images = []
     for _ in range(file.count(73)):
@@ -136,7 +138,7 @@ def read_images(path: Path) -> list[RegisteredImage]:
 
 
 def read_points(path: Path) -> np.ndarray:
-    """The points [n_points, 3] of `points3D.bin`, world frame. Raises FormatError."""
+    """Read the points [n_points, 3] of `points3D.bin`, world frame. Raises FormatError."""
     file = _Reader(path)
     points = []
     for _ in range(file.count(51)):
@@ -149,8 +151,8 @@ def read_points(path: Path) -> np.ndarray:
 
 
 def _c2w(pose: np.ndarray, where: str) -> np.ndarray:
-    """Camera to world [4, 4], OpenGL axes, from COLMAP's world to camera (w, x, y, z of a quaternion,
-    translation)."""
+    """Return camera to world [4, 4], OpenGL axes, from COLMAP's world to camera (w, x, y, z of a quaternion,
+    then a translation)."""
     length = np.linalg.norm(pose[:4])
     if not np.isfinite(pose).all() or length < 1e-9:
         raise FormatError(f"{where}: pose: expected a rotation and a translation, got {pose.tolist()}")
@@ -178,7 +180,8 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 
 
 def _text_images(path: Path) -> list[RegisteredImage]:
-    """Each picture has two lines, the second of which holds its points and may be empty."""
+    """Read the pictures in `images.txt`. Each has two lines, of which the second holds its points and may be
+    empty."""
     images, skip = [], 0
     for number, line in _lines(path, empty=True):
         if number == skip or not line:
@@ -195,7 +198,7 @@ def _text_images(path: Path) -> list[RegisteredImage]:
 
 
 def _lines(path: Path, empty: bool = False) -> list[tuple[int, str]]:
-    """The numbers and texts of lines that are no comments; `empty`: also of empty ones."""
+    """Return the numbers and texts of lines that are not comments; with `empty`, also of empty lines."""
     try:
         text = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES).decode()
     except UnicodeDecodeError as error:
@@ -215,7 +218,7 @@ def _floats(words: list[str], where: str) -> list[float]:
 
 
 class _Reader:
-    """A little-endian binary file, with every read checked against what is left."""
+    """Reader of a little-endian binary file, which checks every read against the bytes that are left."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -233,7 +236,7 @@ class _Reader:
         self._at += n_bytes
 
     def count(self, least_bytes: int) -> int:
-        """A number of things of at least so many bytes each, which must still fit."""
+        """Read a count of entries, and check that so many of at least `least_bytes` each still fit."""
         (n,) = self.take("<Q")
         if n * least_bytes > len(self._data) - self._at:
             raise FormatError(f"{self._path}: cut short: {n} entries do not fit into {len(self._data)} bytes")

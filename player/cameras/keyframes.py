@@ -12,11 +12,12 @@ from player.cameras.rotations import quaternion, rotation_matrix
 
 
 def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
-    """Cameras on a path through `views`: `n_between` steps from each view to the next, the last one included.
+    """Return cameras on a path through `views`: `n_between` steps from each view to the next, the last view
+    included.
 
-    Places lie on a Catmull-Rom spline, rotations turn evenly from view to view (slerp), the focal length
-    changes by equal factors. Size and name are those of the first view; the vertical field of view is each
-    view's own, whatever its size.
+    Positions lie on a Catmull-Rom spline, rotations turn evenly from view to view (slerp), and the focal
+    length changes by equal factors. Size and name are those of the first view. The vertical field of view is
+    that of each view, whatever the view's size.
 
     >>> views = [Camera(str(x), np.eye(4), 4, 4, f, f, 2.0, 2.0) for x, f in enumerate((5.0, 20.0))]
     >>> [round(camera.fx, 6) for camera in smooth_path(views, 2)]
@@ -31,7 +32,8 @@ def smooth_path(views: Sequence[Camera], n_between: int) -> list[Camera]:
 
 
 def camera_on_path(views: Sequence[Camera], index: int, share: float) -> Camera:
-    """One camera of `smooth_path`: at `share`, 0 to 1, of the way from `views[index]` to the next.
+    """Return one camera of `smooth_path`: at `share`, 0 to 1, of the way from `views[index]` to the next
+    view.
 
     >>> views = [Camera(str(x), np.eye(4), 4, 4, f, f, 2.0, 2.0) for x, f in enumerate((5.0, 20.0))]
     >>> round(camera_on_path(views, 0, 0.5).fx, 6)
@@ -41,14 +43,14 @@ def camera_on_path(views: Sequence[Camera], index: int, share: float) -> Camera:
     one, other = views[index], views[index + 1]
     a, b = quaternion(one.c2w[:3, :3]), quaternion(other.c2w[:3, :3])
     c2w = np.eye(4)
-    c2w[:3, :3] = rotation_matrix(_slerp(a, -b if a @ b < 0 else b, share))  # the short way
+    c2w[:3, :3] = rotation_matrix(_slerp(a, -b if a @ b < 0 else b, share))  # turn the short way
     c2w[:3, 3] = _spline(around, share)
     fy = _focal(views[0], one) ** (1 - share) * _focal(views[0], other) ** share
     return _zoomed(views[0], c2w, fy)
 
 
 def _focal(size: Camera, view: Camera) -> float:
-    """`fy` of a picture as high as that of `size` with the vertical field of view of `view`."""
+    """Return `fy` of a picture as high as that of `size` with the vertical field of view of `view`."""
     return view.fy / view.height * size.height
 
 
@@ -57,7 +59,7 @@ def _zoomed(camera: Camera, c2w: np.ndarray, fy: float) -> Camera:
 
 
 def _spline(points: Sequence[np.ndarray], share: float) -> np.ndarray:
-    """The Catmull-Rom point between the second and the third of four."""
+    """Return the point of a Catmull-Rom spline between the second and the third of four points."""
     a, b, c, d = points
     linear, square, cube = c - a, 2 * a - 5 * b + 4 * c - d, 3 * b - 3 * c + d - a
     return b + share / 2 * (linear + share * (square + share * cube))

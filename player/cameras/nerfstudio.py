@@ -1,10 +1,9 @@
 """Reading and writing nerfstudio's `camera_path.json`.
 
 The axes are those of `player.cameras.camera`. `fov` is the whole vertical field of view in degrees; a path
-has one size for all pictures. nerfstudio moves and scales a scene before it trains:
-`dataparser_transforms.json`, which it keeps beside its checkpoints, says how. If that file lies beside the
-path it is undone; without it the path is taken to be in the photographs' world, as the paths of our own
-viewer are.
+has one size for all pictures. nerfstudio moves and scales a scene before it trains, and records this in
+`dataparser_transforms.json` beside its checkpoints. If that file lies beside the path, the transform is
+undone. Without it, the path is taken to be in the photographs' world, as the paths that `vfr-play` saves are.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ PLACEMENT = "dataparser_transforms.json"
 
 
 def is_camera_path(document: Any) -> bool:
-    """Whether a JSON document is a camera path and not a transforms.json."""
+    """Return whether a JSON document is a camera path and not a transforms.json."""
     return isinstance(document, dict) and "camera_path" in document
 
 
 def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
-    """The cameras of a camera path that was read from `path`, world frame.
+    """Return the cameras of a camera path that was read from `path`, world frame.
 
     Raises FormatError in one line: file, frame, expected, got.
     """
@@ -54,7 +53,7 @@ def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
             raise FormatError(
                 f"{where}: fov: expected degrees between 0 and 180, got {brief(frame.get('fov'))}"
             )
-        focal = height / 2 / max(math.tan(math.radians(fov) / 2), 1e-300)  # a field of 1e-323 degrees is none
+        focal = height / 2 / max(math.tan(math.radians(fov) / 2), 1e-300)  # keeps it finite
         c2w = _matrix(frame.get("camera_to_world"), where)
         camera = Camera(where, c2w, width, height, focal, focal, width / 2, height / 2)
         placed = camera if world_from_path is None else camera.transformed(world_from_path)
@@ -63,7 +62,7 @@ def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
 
 
 def path_frame_rate(document: dict[str, Any], path: Path) -> float | None:
-    """Frames a second of a camera path, None if it does not say. Raises FormatError."""
+    """Return the frames per second of a camera path, None if it has none. Raises FormatError."""
     if document.get("fps") is None:
         return None
     fps = as_float(document["fps"])
@@ -73,7 +72,7 @@ def path_frame_rate(document: dict[str, Any], path: Path) -> float | None:
 
 
 def write_camera_path(cameras: Sequence[Camera], fps: float) -> bytes:
-    """The camera_path.json of `cameras`, which share their size and have square pixels and a centred axis.
+    """Encode `cameras` as a camera_path.json; they must have one size, square pixels and a centred axis.
 
     >>> camera = Camera("a", np.eye(4), width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
     >>> document = json.loads(write_camera_path([camera], fps=30))
@@ -109,7 +108,7 @@ def _size(document: dict[str, Any], key: str, path: Path) -> int:
 
 
 def _matrix(values: Any, where: str) -> np.ndarray:
-    """[4, 4] float64 of 16 numbers row by row, or of 4 rows of 4."""
+    """Return [4, 4] float64 from 16 numbers row by row, or from 4 rows of 4."""
     if isinstance(values, list) and values and all(isinstance(row, list) for row in values):
         values = [value for row in values for value in row]
     if not isinstance(values, list) or len(values) != 16 or any(as_float(value) is None for value in values):
@@ -118,10 +117,12 @@ def _matrix(values: Any, where: str) -> np.ndarray:
 
 
 def _placement(path: Path) -> np.ndarray | None:
-    """[4, 4] from the path's frame to the world's, out of a `dataparser_transforms.json`, if there is one.
+    """Return the matrix [4, 4] from the path's frame to the world's, from a `dataparser_transforms.json`;
+    None without the file.
 
-    That has what nerfstudio has done to the cameras as COLMAP had found them, `applied_transform` of the data
-    set's `transforms.json` included; the world is that of `transforms.json`, in which it is done already.
+    The file has everything that nerfstudio has done to the cameras as COLMAP found them, including the
+    `applied_transform` of the data set's `transforms.json`. The world here is that of `transforms.json`, to
+    which `applied_transform` has already been applied.
     """
     if not path.exists():
         return None
@@ -140,7 +141,8 @@ def _placement(path: Path) -> np.ndarray | None:
 
 
 def _applied(path: Path) -> tuple[np.ndarray, float]:
-    """The `applied_transform` [4, 4] and `applied_scale` of a `transforms.json`; of none the identity."""
+    """Read `applied_transform` [4, 4] and `applied_scale` of a `transforms.json`; without the file, the
+    identity and 1."""
     document = parse_json(read_json(path, "nerfstudio's cameras"), str(path)) if path.exists() else {}
     if not isinstance(document, dict):
         raise FormatError(f"{path}: expected nerfstudio's cameras, got {brief(document)}")

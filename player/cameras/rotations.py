@@ -1,18 +1,21 @@
-"""The turn between the camera axes of OpenGL and OpenCV, and rotations as unit quaternions (w, x, y, z)."""
+"""The rotation between the camera axes of OpenGL and OpenCV, and rotations as unit quaternions (w, x, y,
+z)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""[4, 4] from OpenCV's camera axes (x right, y down, looks along +z) to OpenGL's (x right, y up, looks along
--z). It is its own inverse: `c2w @ OPENGL_FROM_OPENCV` turns a pose of either kind into the other."""
+"""Matrix [4, 4] from OpenCV's camera axes (x right, y down, looks along +z) to OpenGL's (x right, y up, looks
+along -z). It is its own inverse: `c2w @ OPENGL_FROM_OPENCV` turns a pose of either kind into the other."""
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4] (w, x, y, z) of a rotation [3, 3]; the first part that is not 0 is positive.
+    """Return the unit quaternion [4] (w, x, y, z) of a rotation [3, 3]; its first component that is not 0 is
+    positive.
 
-    From the largest of its four parts (Shepperd 1978), so that no rotation is lost to rounding.
+    It is computed from the largest of its four components (Shepperd 1978), so that no rotation suffers from
+    rounding.
 
     >>> quaternion(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])).round(4).tolist()
     [0.7071, 0.0, 0.0, 0.7071]
@@ -37,7 +40,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def rotation_matrix(q: np.ndarray) -> np.ndarray:
-    """The rotation [3, 3] of a unit quaternion (w, x, y, z)."""
+    """Return the rotation [3, 3] of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q
     return np.array(
         [

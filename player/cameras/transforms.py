@@ -22,7 +22,7 @@ PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIA
 
 
 def load_transforms(path: str | Path) -> dict[str, Any]:
-    """The JSON of a transforms.json, with `frames` checked to be a list of objects that each have a
+    """Read the JSON of a transforms.json, and check that `frames` is a list of objects that each have a
     `file_path`.
 
     Raises FormatError: no such file, over 64 MB, not JSON (NaN and Infinity are not), no frames, not a
@@ -33,7 +33,7 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
 
 
 def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
-    """The JSON of a transforms.json from the file's bytes, checked as `load_transforms` does.
+    """Parse the JSON of a transforms.json from the file's bytes, and check it as `load_transforms` does.
 
     `where` names the file in messages.
 
@@ -66,12 +66,12 @@ def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
 def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> list[Camera]:
     """Read the cameras of a transforms.json, in the NeRF-synthetic, the instant-ngp or the nerfstudio form.
 
-    `path`: the file. `size`: (width, height) in pixels for cameras that the file gives no `w`, `h`.
+    `path`: the file. `size`: (width, height) in pixels of cameras for which the file has no `w`, `h`.
 
-    The focal length is `fl_x`, `fl_y` in pixels, or else `camera_angle_x`, `camera_angle_y`, the whole field
-    of view in radians; a key inside a frame wins over the same key at the top. A matrix of three rows is
-    completed. Lens distortion (`k1`, ...) is not a camera's: pictures are undistorted when they are read, and
-    these are the cameras of the result.
+    The focal length is `fl_x`, `fl_y` in pixels, or else follows from `camera_angle_x`, `camera_angle_y`, the
+    whole field of view in radians. A key inside a frame takes precedence over the same key at the top. A
+    matrix of three rows is completed. Lens distortion (`k1`, ...) is not part of a camera: pictures are
+    undistorted when they are read, and the cameras returned are those of the undistorted pictures.
 
     Raises FormatError in one line: file, frame, expected, got.
 
@@ -90,8 +90,8 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> list[
 def transforms_cameras(
     document: dict[str, Any], where: Path | str, sizes: Sequence[tuple[int, int] | None] | None = None
 ) -> list[Camera]:
-    """The cameras of what `load_transforms` returned; `where` is for the messages, `sizes` (width, height) of
-    the frames that give none. Raises FormatError."""
+    """Return the cameras of what `load_transforms` returned. `where` names the file in messages; `sizes` are
+    the (width, height) of frames that have none. Raises FormatError."""
     frames = document["frames"]
     return [
         _frame_camera(document, frame, f"{where}: frame {index} ({brief(frame['file_path'])})", size)
@@ -100,7 +100,8 @@ def transforms_cameras(
 
 
 def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str, where: str) -> float | None:
-    """The finite number called `key` in the frame, else at the top, else None. Raises FormatError."""
+    """Return the finite number `key` of the frame, else of the top of the document, else None. Raises
+    FormatError."""
     value = frame.get(key, document.get(key))
     if value is None:
         return None
@@ -111,7 +112,8 @@ def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str,
 
 
 def write_cameras(cameras: Sequence[Camera]) -> bytes:
-    """The transforms.json of `cameras`, each frame with its own `fl_x fl_y cx cy w h` (instant-ngp form).
+    """Encode `cameras` as a transforms.json, each frame with its own `fl_x fl_y cx cy w h` (instant-ngp
+    form).
 
     >>> camera = Camera("a.png", np.eye(4), width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
     >>> json.loads(write_cameras([camera]))["frames"][0]["w"]
@@ -134,10 +136,10 @@ def write_cameras(cameras: Sequence[Camera]) -> bytes:
 
 
 def frame_names(cameras: Sequence[Camera]) -> list[str]:
-    """One file stem a camera, all different on any file system, without separators.
+    """Return a file stem for each camera, all different on any file system, without separators.
 
-    Cameras that share a stem get their folders joined in with `_`, and a running number if that is not
-    enough.
+    Cameras that share a stem get the names of their folders put before it, joined with `_`, and a running
+    number if that is not enough.
 
     >>> pose = np.eye(4)
     >>> names = ["./test/r_0", "images/0001.jpg", "left/a.png", "right/a.png", "right/a.png"]
@@ -210,7 +212,8 @@ def _frame_camera(
 def _focal(
     document: dict[str, Any], frame: dict[str, Any], axis: str, n_pixels: int, where: str
 ) -> float | None:
-    """The focal length along `axis` in pixels, given or from an angle; the frame's wins over the top's."""
+    """Return the focal length along `axis` in pixels, given as such or by an angle. The frame's takes
+    precedence over the top's."""
     for level in (frame, document):
         focal = transforms_number({}, level, f"fl_{axis}", where)
         if focal is not None:
@@ -221,7 +224,7 @@ def _focal(
                 raise FormatError(
                     f"{where}: camera_angle_{axis}: expected radians between 0 and pi, got {angle}"
                 )
-            return float(0.5 * n_pixels / max(np.tan(0.5 * angle), 1e-300))  # an angle of 1e-308 is none
+            return float(0.5 * n_pixels / max(np.tan(0.5 * angle), 1e-300))  # keeps it finite
     return None
 
 
@@ -235,7 +238,7 @@ def _pixels(document: dict[str, Any], frame: dict[str, Any], key: str, where: st
 
 
 def _matrix(rows: Any) -> np.ndarray:
-    """The rows of a `transform_matrix` as [4, 4] float64; three rows are completed."""
+    """Return the rows of a `transform_matrix` as [4, 4] float64; three rows are completed."""
     expected = "camera matrix: expected 4 rows of 4 numbers"
     if not isinstance(rows, list):
         raise FormatError(f"{expected}, got {brief(rows)}")
@@ -248,12 +251,13 @@ def _matrix(rows: Any) -> np.ndarray:
 
 
 def _unwritable(character: str) -> bool:
-    """Whether no file name has this character: it controls, ends a line, or is half a surrogate pair."""
+    """Return whether a character cannot be in a file name: control characters, line ends and halves of
+    surrogate pairs."""
     return character < " " or character in "\x7f\x85\u2028\u2029" or "\ud800" <= character <= "\udfff"
 
 
 def _name_parts(name: str) -> list[str]:
-    """The folders and the stem of a picture's path, made fit for file names on any system."""
+    """Return the folders and the stem of a picture's path, made fit for file names on any system."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     if parts and parts[-1].lower().endswith(PICTURE_SUFFIXES):
         parts[-1] = parts[-1].rpartition(".")[0]

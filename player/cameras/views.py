@@ -1,4 +1,4 @@
-"""The cameras of any file that has some: transforms.json, nerfstudio's camera_path.json, COLMAP, an asset."""
+"""Cameras from any file that has some: transforms.json, nerfstudio's camera_path.json, COLMAP, an asset."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ EXPECTED = "a transforms.json, a camera_path.json or the folder of a COLMAP mode
 
 
 def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Camera]:
-    """The cameras of a file, in its order; those of COLMAP in the order of their names.
+    """Read the cameras of a file, in the file's order; those of COLMAP in the order of their names.
 
     Args:
         path: a transforms.json, a nerfstudio camera_path.json, or a COLMAP model: its folder, the folder
             above, or one of its files.
-        size: (width, height) in pixels for cameras that the file gives no size.
+        size: (width, height) in pixels of cameras for which the file has no size.
 
     Raises:
         FormatError: file, frame, expected, got.
@@ -43,7 +43,8 @@ def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Ca
 
 
 def asset_cameras(asset: Asset) -> list[Camera]:
-    """The training cameras that an asset holds, in the WORLD frame. Raises FormatError if they are damaged.
+    """Read the training cameras that an asset holds, in the WORLD frame. Raises FormatError if they are
+    damaged.
 
     >>> [camera.name for camera in asset_cameras(Asset.open("out/"))][:2]
     ['./test/r_0', './test/r_1']
@@ -53,7 +54,7 @@ def asset_cameras(asset: Asset) -> list[Camera]:
 
 
 def frame_rate(path: str | Path) -> float | None:
-    """Frames a second that a camera_path.json asks for; None for any other file. Raises FormatError."""
+    """Return the frames per second of a camera_path.json; None for any other file. Raises FormatError."""
     path = Path(path)
     if _colmap_model(path) is not None:
         return None
@@ -62,7 +63,8 @@ def frame_rate(path: str | Path) -> float | None:
 
 
 def _colmap_model(path: Path) -> Path | None:
-    """The folder with `images.bin` or `images.txt` that `path` means; None for a file of another kind."""
+    """Return the folder with `images.bin` or `images.txt` that `path` refers to; None for a file of another
+    kind."""
     if path.name in ("images.bin", "images.txt", "cameras.bin", "cameras.txt"):
         return path.parent
     if not path.is_dir():

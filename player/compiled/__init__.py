@@ -1,1 +1,1 @@
-"""The march of a ray, compiled by numba, and how compiled code is made, kept and checked for."""
+"""The march and the work around it, compiled by numba, and the vectors that compiled code is written in."""

@@ -1,7 +1,8 @@
-"""Eight rows of features added up at once: 8-bit codes are unpacked in registers, CHANNELS at a time.
+"""Weighted sums of eight rows of features: 8-bit codes are unpacked in registers, CHANNELS at a time.
 
-A loop over ten channels of eight rows is not vectorised by the compiler, which cannot know that the sum lies
-elsewhere than the rows, and ten is less than what one register holds. Compiled code alone imports this.
+The compiler does not vectorise a loop over, say, ten channels of eight rows: it cannot know that the sum lies
+elsewhere in memory than the rows, and ten numbers are fewer than one register holds. Only compiled code
+imports this module.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 CHANNELS = 16
-"""Channels at a time; fewer are read together with what follows them in memory."""
+"""Channels that are read at a time. Where fewer are left, the bytes behind them in memory are read, too."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), CHANNELS)
 _CODES = ir.VectorType(ir.IntType(8), CHANNELS)
@@ -58,9 +59,10 @@ def _add_rows(
 
 add_rows: Any = intrinsic(_add_rows)
 """add_rows(features [n, n_channels] int8 or float32, rows [8, m] int32, shares [8 or more, m] float32, which,
-out [n_out, width] float32, row, first): add the eight rows in column `which` of `rows`, weighted by that of
-`shares`, to `out[row]`, CHANNELS channels from `first` on.
+out [n_out, width] float32, row, first): add up the eight rows of `features` that column `which` of `rows`
+names, weighted by column `which` of `shares`, and add the sum to `out[row]`: CHANNELS channels from `first`
+on.
 
-CHANNELS values are read and as many sums written whatever n_channels: both have to be there. Sums beyond
-n_channels are of no meaning.
+CHANNELS values are read and as many sums are written whatever n_channels is, so that both must be inside
+their arrays. Sums beyond n_channels have no meaning.
 """

@@ -1,7 +1,8 @@
-"""Where a packet of rays fetches features, and which rows those are: LANES rays at a time, in registers.
+"""Choice of where a packet of rays fetches features, and of the rows it reads: LANES rays at a time, in
+registers.
 
-What `player.march.fetches` states, in float32 and in one pass over the samples. Compiled code alone imports
-this.
+This computes what `player.march.fetches` defines, in float32 and in one pass over the samples. Only compiled
+code imports this module.
 """
 
 from __future__ import annotations
@@ -34,17 +35,18 @@ from player.compiled.packets import N_WEIGHTS, TOTAL, brick_number, corner_numbe
 
 
 class _Chosen:
-    """The table that fetches are written into: [3, n, LANES] float32, s, weight, another s."""
+    """Writer of the table of fetches, [3, n, LANES] float32: s, weight, and the s to use if little is stored
+    at the first."""
 
     def __init__(self, base: Any, most: Any, lane: Lanes) -> None:
-        """most: fetches that a ray can have, k, in 64 bits."""
+        """`most`: the most fetches that a ray can have, k, in 64 bits."""
         b = lane.b
         self._rows = [b.gep(base, [b.mul(most, LONG(row * LANES))]) for row in range(3)]
         self._lane = lane
         self.n = Variable(lane.like(0))
 
     def add(self, s: Lanes, weight: Lanes, other: Lanes, where: Lanes) -> None:
-        """The next fetch of the rays in `where`."""
+        """Append a fetch to the rays that are true in `where`."""
         n = self.n.get()
         at = n * LANES + self._lane
         for row, values in zip(self._rows, (s, weight, other), strict=True):
@@ -95,13 +97,13 @@ def _choose_fetches(_: Any, samples: Any, n_rows: Any, sums: Any, mass: Any, cho
                     moment.set(choose(full, zero, moment.get()))
                     heaviest.set(choose(full, heaviest.get().like(-1.0), heaviest.get()))
                 active.set(now & (left.get() > 0) & (out.n.get() < room))
-        # a last bin that lacks what float32 has rounded away
+        # a last bin whose mass is not full, because of rounding in float32
         begun = cut & (visible > 0) & (need.get() < share) & (out.n.get().to_float() < bins)
         with b.if_then(begun.any()):
             out.add(moment.get() / (share - need.get()), weight_of_bin, of_heaviest.get(), begun)
         n = out.n.get()
         longest = n.greatest()
-        with cgutils.for_range(b, b.sext(longest, LONG)) as loop:  # rays with fewer have weight 0
+        with cgutils.for_range(b, b.sext(longest, LONG)) as loop:  # rays with fewer get weight 0
             row = b.mul(loop.index, LONG(LANES))
             behind = b.add(row, b.mul(most, LONG(LANES)))
             beyond = n <= splat(b, b.trunc(loop.index, INT))
@@ -115,12 +117,13 @@ def _choose_fetches(_: Any, samples: Any, n_rows: Any, sums: Any, mass: Any, cho
 
 choose_fetches: Any = intrinsic(_choose_fetches)
 """choose_fetches(samples [2, n, LANES] float32, n_rows, sums [SUMS, LANES] float32, mass [LANES] float32,
-chosen [3, k, LANES] float32): rows of `chosen` that were written.
+chosen [3, k, LANES] float32): choose where rays fetch features; returns the number of rows of `chosen`
+written.
 
-`samples` and `sums` are what a march of `player.compiled.packets` has found, `mass` the opacity of each ray,
-0 where nothing is to be fetched. Into `chosen` go s and weight of each fetch, and another s, where to fetch
-if little is stored at the first, NaN for none. A ray with fewer fetches than others has weight 0
-there. k is at least 1; of every sample, `samples` are the fetches as they are.
+`samples`, of which `n_rows` rows count, and `sums` are results of a march of `player.compiled.packets`.
+`mass` is the opacity of each ray, 0 where nothing is to be fetched. `chosen` gets s and weight of each fetch,
+and the s to fetch at instead if little is stored at the first, NaN for none. Where a ray has fewer fetches
+than others, its weight is 0. k is at least 1: to fetch at every sample, `samples` themselves are the fetches.
 """
 
 
@@ -133,7 +136,7 @@ class Stored(NamedTuple):
     resolution: int
     n_per_axis: int
     scale: np.float32
-    """Cells of the features' grid in a cell of the densities'."""
+    """Cells of the features' grid per cell of the densities' grid, along an axis."""
 
 
 def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, shares: Any) -> Any:
@@ -183,9 +186,10 @@ def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, s
 
 stored_corners: Any = intrinsic(_stored_corners)
 """stored_corners(stored: Stored, places [3, LANES] float32, weights [LANES] float32, rows [8, LANES] int32,
-shares [9, LANES] float32): the greatest of the rows.
+shares [9, LANES] float32): find the stored corners around LANES places; returns the greatest of their rows.
 
-The corners around LANES places, cells of the densities' grid: their rows, and their shares of the weights.
-Of what is not stored the share is 0, and the row. Behind the shares there is how much of the interpolation
-is stored: where that is 0, shares are NaN.
+`places` are in cells of the densities' grid. `rows` gets the row of each corner. `shares` gets the corner's
+interpolation weight, divided by the sum of those of all stored corners and multiplied by the place's number
+in `weights`. For a corner that is not stored, both are 0. The last row of `shares` gets the sum over the
+stored corners; where that sum is 0, the shares are NaN.
 """

@@ -1,4 +1,4 @@
-"""Pixels that become the mean of four others, compiled by numba; the readable twin is
+"""Interpolation of pixels between four neighbours, compiled by numba; the readable twin is
 `player.march.interpolation`, which gives the same bits."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ F32 = np.float32
 def interpolate(
     planes: Planes, size: tuple[int, int], pixels: Pixels, stage: Stage, transparent: bool
 ) -> np.ndarray:
-    """As `player.march.interpolation.interpolate`."""
+    """Interpolate pixels as `player.march.interpolation.interpolate` does."""
     if not len(stage.neighbours):
         return np.arange(len(pixels.rows))
     rest = scratch(len(pixels.rows), np.int64)
@@ -43,7 +43,7 @@ def _interpolate(planes, size, rows, columns, neighbours, allowed, transparent, 
 
 @inlined
 def _agree(planes, width, row, column, neighbours, allowed, transparent):
-    """Write the mean of the four to a pixel; returns whether they agree. If not, nothing is written."""
+    """Write the mean of a pixel's four neighbours to it if they agree; returns whether they do."""
     a = (row + neighbours[0, 0]) * width + column + neighbours[0, 1]
     b = (row + neighbours[1, 0]) * width + column + neighbours[1, 1]
     c = (row + neighbours[2, 0]) * width + column + neighbours[2, 1]
@@ -85,5 +85,5 @@ def _four_colours(planes, a, b, c, d, channel, transparent):
 
 @inlined
 def _four(a, b, c, d):
-    """The least of four numbers, the greatest, and their mean."""
+    """Return the least of four numbers, the greatest, and their mean."""
     return min(min(a, b), min(c, d)), max(max(a, b), max(c, d)), ((a + b) + (c + d)) * F32(0.25)

@@ -1,8 +1,8 @@
-"""Vectors of LANES numbers in registers, for compiled code that a compiler does not vectorise by itself.
+"""Vectors of LANES numbers in registers, for code that the compiler does not vectorise by itself.
 
-A march looks up what the last lookup told it to, and branches on it: no compiler makes vectors of that. Here
-the vectors are written down, by Python's operators, and become LLVM's instructions while a function is
-compiled (`numba.extending.intrinsic`). Compiled code alone imports this.
+In a march, every lookup and every branch depends on the lookup before it: no compiler vectorises that. Here
+the vectors are written explicitly, with Python's operators, which emit LLVM's instructions while a function
+is compiled (`numba.extending.intrinsic`). Only compiled code imports this module.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from numba.core import cgutils
 from player.compiled.processor import has_wide_registers
 
 LANES = 16 if has_wide_registers() else 8
-"""Numbers in a vector: as many as a register of the processor holds, or two where it holds four."""
+"""Numbers in a vector: as many as one register of the processor holds, or as two hold where one holds
+four."""
 
 FLOAT, INT, LONG, BYTE = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(8)
 SHORT = ir.IntType(16)
@@ -29,13 +30,13 @@ EXP = (
     1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1,
     1.0, 1.0,
 )  # fmt: skip
-"""exp(r) for |r| <= log(2) / 2, highest power first: the polynomial of Cephes."""
+"""Coefficients of the polynomial of Cephes for exp(r), |r| <= log(2) / 2, highest power first."""
 
 
 SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
 COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
-"""(sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4 for |r| <= pi / 4, as polynomials in r^2, highest power
-first: those of Cephes."""
+"""Coefficients of the polynomials of Cephes in r^2 for (sin(r) - r) / r^3 and (cos(r) - 1 + r^2 / 2) / r^4,
+|r| <= pi / 4, highest power first."""
 
 
 def vector(element: Any) -> ir.VectorType:
@@ -43,8 +44,9 @@ def vector(element: Any) -> ir.VectorType:
 
 
 class Lanes:
-    """LANES float32, int32 or truth values. Operators take another vector of the same kind, or a Python
-    number that stands for LANES of it; comparisons give truth values, which &, | and ~ combine."""
+    """A vector of LANES float32, int32 or truth values. Operators take another vector of the same kind, or a
+    Python number, which stands for LANES copies of itself. Comparisons give truth values, which &, | and ~
+    combine."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.b, self.value = builder, value
@@ -61,7 +63,7 @@ class Lanes:
         return ir.Constant(vector(self.element), [number] * LANES)
 
     def like(self, number: float) -> Lanes:
-        """LANES of a number, as this is."""
+        """Return LANES copies of a number, as a vector of the same kind."""
         return self._new(self._other(number))
 
     def _binary(self, of_floats: str, of_integers: str, other: Any) -> Lanes:
@@ -127,7 +129,7 @@ class Lanes:
         return self._compare("!=", other)
 
     def call(self, name: str, *others: Any) -> Lanes:
-        """One of LLVM's intrinsic functions on vectors of this kind."""
+        """Call one of LLVM's intrinsic functions on vectors of this kind."""
         kind = vector(self.element)
         values = [self.value, *(self._other(other) for other in others)]
         function = ir.FunctionType(kind, [kind] * len(values))
@@ -144,25 +146,26 @@ class Lanes:
         return self._new(self.b.sitofp(self.value, vector(FLOAT)))
 
     def to_int(self) -> Lanes:
-        """Towards zero."""
+        """Convert to int32, rounded towards zero."""
         return self._new(self.b.fptosi(self.value, vector(INT)))
 
     def wide(self) -> Lanes:
-        """Integers in 64 bits, for what a large grid counts further than 32 bits do."""
+        """Extend integers to 64 bits, for indices into large grids, which exceed 32 bits."""
         return self._new(self.b.sext(self.value, vector(LONG)))
 
     def halves(self) -> tuple[Lanes, Lanes]:
-        """The lower and the upper int32 of integers of 64 bits."""
+        """Return the lower and the upper int32 of integers of 64 bits."""
         upper = self.b.lshr(self.value, self._other(32))
         low, high = (self.b.trunc(value, vector(INT)) for value in (self.value, upper))
         return self._new(low), self._new(high)
 
     def as_float(self) -> Lanes:
-        """The same bits, taken for float32."""
+        """Reinterpret the same bits as float32."""
         return self._new(self.b.bitcast(self.value, vector(FLOAT)))
 
     def exp(self) -> Lanes:
-        """exp, to a relative 2e-7; 0 below what float32 holds and infinite above it; NaN of NaN."""
+        """Return exp, to a relative error of 2e-7: 0 below the range of float32, infinity above it, NaN for
+        NaN."""
         y = choose(self < -104, self.like(-104), self)
         y = choose(y > 89, y.like(89), y)
         power = (y * np.log2(np.e)).call("rint")
@@ -172,13 +175,13 @@ class Lanes:
         for coefficient in EXP[1:]:
             total = total.call("fma", rest, coefficient)
         exponent = power.to_int()
-        half = exponent >> 1  # in two parts: 2^-150 is no float32, but what it makes of 1 is
+        half = exponent >> 1  # multiplied in two steps: 2^-150 itself is no float32
         for part in (half, exponent - half):
             total = total * ((part + 127) << 23).as_float()
         return total
 
     def sin_cos(self) -> tuple[Lanes, Lanes]:
-        """sin and cos, each to 1.2e-7, of angles up to a thousand."""
+        """Return sin and cos, each to 1.2e-7, of angles of up to a thousand radians."""
         quarters = (self * (2 / np.pi)).call("rint")
         rest = quarters.call("fma", -float(np.float32(np.pi / 2)), self)
         rest = quarters.call("fma", float(np.float32(np.pi / 2)) - np.pi / 2, rest)
@@ -197,13 +200,13 @@ class Lanes:
         )
 
     def greatest(self) -> Any:
-        """The greatest of the lanes, one int32."""
+        """Return the greatest of the lanes, one int32."""
         kind = ir.FunctionType(INT, [vector(INT)])
         name = f"llvm.vector.reduce.smax.v{LANES}i32"
         return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), [self.value])
 
     def any(self) -> Any:
-        """Whether one of the truth values is true, as a single one."""
+        """Return whether any lane is true, as a single truth value."""
         word = self.b.bitcast(self.value, ir.IntType(LANES))
         return self.b.icmp_unsigned("!=", word, ir.Constant(ir.IntType(LANES), 0))
 
@@ -213,12 +216,13 @@ def choose(condition: Lanes, yes: Lanes, no: Any) -> Lanes:
 
 
 def address(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Where the numbers of an array begin, an argument of type `kind`."""
+    """Return the address of the first number of `array`, an argument of type `kind`."""
     return context.make_array(kind)(context, builder, array).data
 
 
 def unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """A named tuple, an argument of type `kind`, whose arrays are addresses of their numbers."""
+    """Unpack a named tuple, an argument of type `kind`. Its arrays become the addresses of their first
+    numbers."""
     parts = (builder.extract_value(value, n) for n in range(len(kind.types)))
     return kind.instance_class(
         *(
@@ -229,14 +233,14 @@ def unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 def splat(builder: Any, scalar: Any) -> Lanes:
-    """LANES of one number."""
+    """Return LANES copies of one number."""
     nothing = ir.Constant(vector(scalar.type), ir.Undefined)
     one = builder.insert_element(nothing, scalar, INT(0))
     return Lanes(builder, builder.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES)))
 
 
 def load(builder: Any, base: Any, first: Any, element: Any = FLOAT) -> Lanes:
-    """LANES numbers from `first` on."""
+    """Load LANES numbers from the index `first` on."""
     place = builder.bitcast(builder.gep(base, [first]), ir.PointerType(vector(element)))
     return Lanes(builder, builder.load(place, align=2 if element == SHORT else 4))
 
@@ -248,13 +252,14 @@ def store(base: Any, first: Any, values: Lanes) -> None:
 
 
 def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT, offset: int = 0) -> Lanes:
-    """Integers of a `kind` that begin `index` times `size` bytes behind the address `base`, of the lanes that
-    are true in `where`; the others read what is at `base`, and are 0.
+    """Load an integer of a `kind` for each lane that is true in `where`, from `index` times `size` bytes
+    behind the address `base`. The other lanes read at index 0, and become 0.
 
-    `index` is in 32 bits or, `wide`, in 64; in bytes it is 64 bits either way. `offset` is a number that is
-    added to the index of all lanes: what is gathered around one index shares all but the reading.
+    `index` has 32 bits or, from `wide`, 64; offsets in bytes have 64 bits either way. `offset` is a number
+    that is added to the index of all lanes: several gathers around one index share the computation of
+    addresses.
 
-    One by one: the gathering instructions of Intel's processors take a fifth longer here.
+    Lanes are loaded one by one: the gather instructions of Intel's processors take a fifth longer here.
     """
     b = where.b
     numbers = choose(where, index, 0).value
@@ -269,8 +274,8 @@ def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT, of
 
 
 def scatter(base: Any, index: Lanes, values: Lanes, where: Lanes) -> None:
-    """Store numbers of four bytes at `index` behind the address `base`, of the lanes that are true in
-    `where`."""
+    """Store numbers of four bytes, of the lanes that are true in `where`, at the indices `index` from the
+    address `base` on."""
     b, nothing = where.b, ir.Constant(vector(LONG), ir.Undefined)
     one = b.insert_element(nothing, b.ptrtoint(base, LONG), INT(0))
     start = b.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES))
@@ -283,7 +288,7 @@ def scatter(base: Any, index: Lanes, values: Lanes, where: Lanes) -> None:
 
 
 class Variable:
-    """A vector that changes."""
+    """A vector whose value can change, for instance in a loop."""
 
     def __init__(self, first: Lanes) -> None:
         self._b = first.b
@@ -299,7 +304,7 @@ class Variable:
 
 @contextmanager
 def while_any(builder: Any, active: Variable) -> Iterator[None]:
-    """A loop that goes on as long as one lane of `active` is true."""
+    """Make the code of the `with` block a loop that goes on as long as any lane of `active` is true."""
     head, body, end = (builder.append_basic_block(name) for name in ("any", "lanes", "none"))
     builder.branch(head)
     builder.position_at_end(head)

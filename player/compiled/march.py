@@ -44,30 +44,30 @@ F32 = np.float32
 
 
 class Work(NamedTuple):
-    """What the march of a packet and its fetches work in."""
+    """Work arrays for the march of a packet and its fetches."""
 
     samples: np.ndarray
     """[2, n, LANES] float32: s and weights of the samples."""
     sums: np.ndarray
-    """[SUMS, LANES] float32: what is found of the rays."""
+    """[SUMS, LANES] float32: the results of the march, for each ray."""
     chosen: np.ndarray
-    """[3, k, LANES] float32: what `choose_fetches` chooses."""
+    """[3, k, LANES] float32: the fetches that `choose_fetches` chooses."""
     masses: np.ndarray
     """[LANES] float32: opacities, 0 where nothing is fetched."""
     into: np.ndarray
-    """[LANES] int64: rows of the features that the rays are added to."""
+    """[LANES] int64: the row of `Found.features` that each ray's fetches are added to."""
     places: np.ndarray
-    """[3, LANES] float32: where a fetch of each ray is, cells of the densities' grid."""
+    """[3, LANES] float32: the position of one fetch of each ray, in cells of the densities' grid."""
     weights: np.ndarray
     """[LANES] float32: the weights of these fetches."""
     rows: np.ndarray
-    """[8, LANES] int32: rows of the features that are stored around the places."""
+    """[8, LANES] int32: rows of the features at the eight corners around the places."""
     shares: np.ndarray
     """[9, LANES] float32: shares of these rows, as `stored_corners` finds them."""
 
 
 class Found(NamedTuple):
-    """What is found on n rays; `player.march.march.MarchResult` has the first rows of the last two."""
+    """The results for n rays. `player.march.march.MarchResult` gets the first rows of the last two arrays."""
 
     opacity: np.ndarray
     depth: np.ndarray
@@ -75,7 +75,7 @@ class Found(NamedTuple):
     hits: np.ndarray
     """[n] int64."""
     features: np.ndarray
-    """[n, whole CHANNELS] float32."""
+    """[n, n_channels rounded up to a multiple of CHANNELS] float32."""
 
 
 def march(
@@ -86,7 +86,8 @@ def march(
     bounds: Bounds | None = None,
     opaque_depth: np.float32 = MAX_TAU,
 ) -> MarchResult:
-    """`player.march.march.march`, compiled: same arguments, same result to float32 rounding."""
+    """March rays and fetch their features: arguments and result are those of `player.march.march.march`, to
+    float32 rounding."""
     lookup, steps, packets, capacity = enter(grid, rays_o, rays_d, bounds, opaque_depth)
     n_rays, width = len(rays_o), -(-grid.n_channels // CHANNELS) * CHANNELS
     k = min(n_fetches, capacity)  # no ray has more samples
@@ -123,14 +124,14 @@ def march(
 
 
 class Entered(NamedTuple):
-    """n rays where they begin, as `march_packet` takes them."""
+    """n rays where they begin, in the form that `march_packet` takes."""
 
     lookup: Lookup
     steps: BoxSteps | SpaceSteps
     packets: np.ndarray
     """[n_packets, BOX_ROWS or SPACE_ROWS, LANES] float32; the last packet may have lanes without a ray."""
     most_samples: int
-    """No ray has more samples."""
+    """The most samples that a ray can have."""
 
 
 def enter(
@@ -140,7 +141,7 @@ def enter(
     bounds: Bounds | None = None,
     opaque_depth: np.float32 = MAX_TAU,
 ) -> Entered:
-    """Rays where they enter a grid of either kind; the arguments are those of `march`."""
+    """Find where rays enter a grid of either kind; the arguments are those of `march`."""
     lookup = Lookup(
         grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
         int(grid.level_steps[0] == 1), grid.most_steps, grid.density_low, grid.density_slope,
@@ -158,7 +159,7 @@ def _enter_box(
     rays_d: np.ndarray,
     bounds: Bounds | None,
 ) -> tuple[BoxSteps, np.ndarray]:
-    """The packets of rays through a box, [n_packets, BOX_ROWS, LANES] float32."""
+    """Make the packets of rays through a box, [n_packets, BOX_ROWS, LANES] float32."""
     n_rays = len(rays_o)
     near, far = (np.zeros(n_rays, F32), np.full(n_rays, np.inf, F32)) if bounds is None else bounds
     packets = scratch((-(-n_rays // LANES), BOX_ROWS, LANES), F32, 0)
@@ -172,7 +173,7 @@ def _enter_box(
 
 
 def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[SpaceSteps, np.ndarray]:
-    """The packets of rays through contracted space, [n_packets, SPACE_ROWS, LANES] float32."""
+    """Make the packets of rays through contracted space, [n_packets, SPACE_ROWS, LANES] float32."""
     packets = scratch((-(-len(rays_o) // LANES), SPACE_ROWS, LANES), F32, 0)
     _enter_curves(
         np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), float(grid.near),
@@ -189,8 +190,8 @@ def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tu
 
 @compiled
 def _enter_curves(rays_o, rays_d, near, end, packets):
-    """Rays where they begin, as `player.march.contracted.enter_space`, into rows of packets; they end where
-    phi is `end`."""
+    """Write where rays begin, as `player.march.contracted.enter_space` finds it, into rows of packets. The
+    rays end where phi is `end`."""
     for ray in range(len(rays_o)):
         packet, lane = ray // LANES, ray % LANES
         nearest, squares = 0.0, 0.0
@@ -212,7 +213,7 @@ def _enter_curves(rays_o, rays_d, near, end, packets):
 
 @compiled
 def _enter_rays(size, origin, scale, step, longest, most_steps, rays_o, rays_d, near, far, packets):
-    """Rays where they enter the box of `size` cells, into rows of packets."""
+    """Write where rays enter the box of `size` cells into rows of packets."""
     for ray in range(len(rays_o)):
         dx, dy, dz = rays_d[ray, 0] * scale[0], rays_d[ray, 1] * scale[1], rays_d[ray, 2] * scale[2]
         ox = (rays_o[ray, 0] - origin[0]) * scale[0]
@@ -248,8 +249,8 @@ def _slab(o, d, size, t_in, t_out):
 
 @compiled
 def _march_rays(lookup, stored, steps, packets, k, work, found):
-    """Packets of rays: their samples first, then a fetch of each ray at a time into its row of the features.
-    Returns the number of hits."""
+    """March packets of rays. For each packet, its samples are found first; then its features are fetched, one
+    fetch of each ray at a time, and added to the ray's row. Returns the number of hits."""
     n_hits = 0
     for number in range(len(packets)):
         rows = march_packet(lookup, steps, packets, number, work.samples, work.sums)
@@ -273,8 +274,8 @@ def _march_rays(lookup, stored, steps, packets, k, work, found):
 
 @inlined
 def _take_hits(start, work, found, n_hits):
-    """What was found of the packet's rays, those from `start` on; a visible one is a hit, with a mass and a
-    row of the features. Returns how many hits there are now."""
+    """Store the results of the packet's rays, which are those from `start` on. A visible ray is a hit, and
+    gets a mass and a row of the features. Returns the number of hits so far."""
     work.masses[:] = F32(0.0)
     for lane in range(min(LANES, len(found.opacity) - start)):
         ray = start + lane
@@ -292,7 +293,8 @@ def _take_hits(start, work, found, n_hits):
 
 @inlined
 def opacity_of(tau):
-    """1 - exp(-tau) to float32 rounding: the difference in float64, or the series where that would cancel."""
+    """Return 1 - exp(-tau) to float32 rounding: the difference in float64, or a series where that would
+    cancel."""
     if tau < F32(1e-5):
         return tau - F32(0.5) * tau * tau
     return F32(1.0 - math.exp(-np.float64(tau)))
@@ -300,15 +302,15 @@ def opacity_of(tau):
 
 @inlined
 def _add_fetches(stored, work, out):
-    """Add a fetch of each ray to its row of `out`. Those that found too little stored keep their weight, all
-    others lose it; returns their number."""
+    """Add one fetch of each ray to its row of `out`. Fetches where too little is stored keep their weight,
+    all others get weight 0; returns the number of those that keep it."""
     features, weights, rows, shares = stored.features, work.weights, work.rows, work.shares
     most = stored_corners(stored, work.places, weights, rows, shares)
     n_channels = features.shape[1]
-    whole = most * n_channels + out.shape[1] <= features.size  # or the last rows cannot be read in registers
+    whole = most * n_channels + out.shape[1] <= features.size  # else whole registers would reach past it
     for lane in range(LANES):
         if weights[lane] > F32(0.0):
-            for corner in range(0, 8, 2):  # the next along z is the next row
+            for corner in range(0, 8, 2):  # the corner next along z is in the next row
                 prefetch(features, rows[corner, lane])
     left = 0
     for lane in range(LANES):

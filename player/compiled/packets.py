@@ -1,13 +1,14 @@
-"""The march of LANES rays at a time, in step, each at a place of its own.
+"""The march of packets of LANES rays: the rays of a packet take their steps together, each at its own
+position.
 
-Rays beside one another meet the same bricks at nearly the same samples, so that a packet takes hardly more
-steps than its longest ray does alone, and every step serves all of them. What `player.march.march` states is
-done here in the same order, in float32, on either path of `player.march.path`. Compiled code alone imports
-this.
+Neighbouring rays meet the same bricks at nearly the same samples. So a packet takes hardly more steps than
+its longest ray would alone, and every step serves all of its rays. The march does what `player.march.march`
+defines, in the same order and in float32, on either path of `player.march.path`. Only compiled code imports
+this module.
 
-A packet's numbers are float32 in rows of LANES, one of each ray. What is found is written in rows, too: s and
-weight of sample j of all rays, the weight 0 where a ray has none. Where to fetch features is for
-`player.compiled.fetches` to say.
+A packet's numbers are float32 in rows of LANES, one number for each ray. Samples are written in rows, too: s
+and weight of sample j of all rays, with weight 0 where a ray has none. `player.compiled.fetches` decides
+where features are fetched.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from player.march.march import MAX_TAU
 
 
 class Lookup(NamedTuple):
-    """What a march reads of a `player.asset.grid.SparseGrid`."""
+    """The parts of a `player.asset.grid.SparseGrid` that a march reads."""
 
     table: np.ndarray
     live: np.ndarray
@@ -51,62 +52,65 @@ class Lookup(NamedTuple):
     resolution: int
     n_per_axis: int
     least_coarse: int
-    """Places of levels below this one are read like those of a grid of one level: 0 or 1."""
+    """The first level whose samples may stand for several steps: 1 if those of the finest level stand for
+    one, else 0."""
     most_steps: int
-    """For how many base steps a sample stands at most."""
+    """The most base steps that a sample stands for."""
     density_low: np.float32
     density_slope: np.float32
     opaque_depth: np.float32
-    """As the argument of `player.march.march.march`."""
+    """The optical depth at which rays stop; see `player.march.march.march`."""
 
 
 class BoxSteps(NamedTuple):
-    """What all rays through a box have in common."""
+    """The numbers that all rays through a box share."""
 
     step: np.float32
     """Length of a base step, model units."""
 
 
 class SpaceSteps(NamedTuple):
-    """What all rays through contracted space have in common."""
+    """The numbers that all rays through contracted space share."""
 
     middles: np.ndarray
-    """[n_steps, 2] float32: cos and sin of s at the middles of base steps, beside each other: one word of 64
-    bits, and one read. s itself is the product that the lattice of `player.march.contracted` is made of."""
+    """[n_steps, 2] float32: cos and sin of s at the middles of base steps, side by side, so that one read of
+    64 bits gets both. s itself is computed by the same product as in the lattice of
+    `player.march.contracted`."""
     ends: np.ndarray
-    """[n_steps, 2] float32: the same at their ends."""
+    """[n_steps, 2] float32: the same at the ends of base steps."""
     step: np.float32
     """dphi."""
     angles: np.ndarray
-    """[3, n_sizes] float32: cos and sin of half the angle of so many base steps, and sin of the angle."""
+    """[3, n_sizes] float32, indexed by a number of base steps: cos and sin of half their angle, and sin of
+    their angle."""
     n_steps: int
     n_sizes: int
     fastest: np.float32
-    """Cells that a step makes at most."""
+    """The most cells that a ray moves in one base step."""
     cells: np.float32
-    """Cells in a contracted unit."""
+    """Cells per contracted unit."""
 
 
 BOX_ROWS = 9
 """Rows of a packet in a box: entry point x, y, z and direction x, y, z in grid coordinates, length, t of the
 entry, first base step. A length of 0 stands for no ray."""
 LENGTH, ENTRY, FIRST = 6, 7, 8
-"""Those of the rows that are one number each."""
+"""Numbers of the rows for length, t of the entry and first base step."""
 SPACE_ROWS = 11
 """Rows of a packet in contracted space: p and w d, x, y, z each, cos and sin of phi_0, w, length, t_p
 (`player.march.contracted.ContractedPath`). A length of 0 stands for no ray."""
 
 TAU, N_SAMPLES, N_WEIGHTS, TOTAL, DEPTH = range(5)
-"""Rows of what is found of a ray: its optical depth, the number of density samples, the number of those with
-weight, the sum of the weights, and t at their mean place."""
+"""Rows of the results of a march, for each ray: its optical depth, the number of density samples, the number
+of samples with weight, the sum of the weights, and t at the weighted mean position."""
 SUMS = 5
-"""Rows of what is found of a ray, in all."""
+"""Number of these rows."""
 
 Three = tuple[Lanes, Lanes, Lanes]
 
 
 class _Box:
-    """The path of a packet through a box, as `player.march.box.BoxPath`."""
+    """The path of a packet through a box: `player.march.box.BoxPath` for LANES rays."""
 
     def __init__(self, b: Any, packet: Any, steps: BoxSteps) -> None:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(BOX_ROWS)]
@@ -119,24 +123,26 @@ class _Box:
         self._inverse = [1.0 / d for d in self._d]
 
     def first(self) -> Lanes:
-        """The first base steps to look at."""
+        """Return the first base steps to look at."""
         return self._first.to_int()
 
     def place(self, i: Lanes, active: Lanes) -> tuple[Lanes, Lanes, Three]:
-        """s of the middles of base steps `i`, whether the rays reach so far, and their grid coordinates."""
+        """Return s at the middles of base steps `i`, whether the rays reach that far, and the grid
+        coordinates there."""
         s = (i.to_float() + 0.5) * self._step
         self._way.set(self._step)
         return s, active & (s < self._length), self.at(s)
 
     def place_group(self, i: Lanes, size: Lanes, where: Lanes) -> tuple[Lanes, Lanes, Three]:
-        """As `place`, of the middles of `size` base steps from `i` on, of the lanes that are true in `where`;
-        the others stay where they were placed."""
+        """Do the same as `place` for the middles of `size` base steps from `i` on, in the lanes that are true
+        in `where`; `way` keeps its former values in the others."""
         s = (i.to_float() + size.to_float() * 0.5) * self._step
         self._way.set(choose(where, size.to_float() * self._step, self._way.get()))
         return s, where & (s < self._length), self.at(s)
 
     def jump(self, i: Lanes, g: Three, bricks: Three, reach: Lanes) -> Lanes:
-        """The base step to look at next, from one in a brick around which all are empty within `reach`."""
+        """Return the base step to look at next after step `i`, which is in a brick around which all bricks
+        are empty within `reach`."""
         leave = self._length
         for e, inverse, still, brick in zip(self._e, self._inverse, self._still, bricks, strict=True):
             ahead = ((brick + reach + 1) << 3).to_float() - float(SKIP_MARGIN)
@@ -146,22 +152,22 @@ class _Box:
         return (i + 1).most((leave * self._per_step + 0.5).to_int())
 
     def way(self) -> Lanes:
-        """Model units that the samples placed last stand for."""
+        """Return the length of ray, model units, that the samples placed last stand for."""
         return self._way.get()
 
     def at(self, s: Lanes) -> Three:
-        """Grid coordinates of the places `s`."""
+        """Return the grid coordinates at the positions `s`."""
         x, y, z = (e + s * d for e, d in zip(self._e, self._d, strict=True))
         return x, y, z
 
     def distance(self, s: Lanes) -> Lanes:
-        """t of the places `s`, model units."""
+        """Return t at the positions `s`, model units."""
         return self._entry + s
 
 
 class _Space:
-    """The path of a packet through contracted space, as `player.march.contracted.ContractedPath`; its methods
-    are those of `_Box`."""
+    """The path of a packet through contracted space: `player.march.contracted.ContractedPath` for LANES rays.
+    Its methods are those of `_Box`."""
 
     def __init__(self, b: Any, packet: Any, steps: SpaceSteps) -> None:
         rows = [load(b, packet, LONG(row * LANES)) for row in range(SPACE_ROWS)]
@@ -224,7 +230,7 @@ class _Space:
         return self._t_nearest + self._width * sin / cos.most(float(MIN_COS))
 
     def _turned(self, cos_s: Lanes, sin_s: Lanes) -> tuple[Lanes, Lanes]:
-        """cos and sin of phi, from those of s."""
+        """Return cos and sin of phi, from those of s."""
         return self._cos0 * cos_s - self._sin0 * sin_s, self._sin0 * cos_s + self._cos0 * sin_s
 
     def _on_grid(self, cos: Lanes, sin: Lanes) -> Three:
@@ -237,13 +243,13 @@ class _Space:
 
 
 def _pairs(table: Any, index: Lanes, where: Lanes) -> tuple[Lanes, Lanes]:
-    """Two float32 of each of the rows `index` of a table, for the lanes that are true in `where`."""
+    """Load the two float32 in row `index` of a table, for the lanes that are true in `where`."""
     one, other = gather(table, index, 8, where, LONG).halves()
     return one.as_float(), other.as_float()
 
 
 def _path(context: Any, b: Any, kinds: Any, steps: Any, packets: Any, number: Any) -> _Box | _Space:
-    """The path of one of the packets; which one it is the type of `steps` says."""
+    """Make the path of the packet `number`; the type of `steps` tells whether it is through a box."""
     common = unpacked(context, b, kinds[0], steps)
     n_rows = BOX_ROWS if isinstance(common, BoxSteps) else SPACE_ROWS
     packet = b.gep(address(context, b, kinds[1], packets), [b.mul(number, LONG(n_rows * LANES))])
@@ -251,13 +257,14 @@ def _path(context: Any, b: Any, kinds: Any, steps: Any, packets: Any, number: An
 
 
 def brick_number(cells: Sequence[Lanes], n_per_axis: Lanes) -> Lanes:
-    """As that of `player.asset.grid`."""
+    """Compute the same as `player.asset.grid.brick_number`."""
     x, y, z = (cell >> 3 for cell in cells)
     return (x * n_per_axis + y) * n_per_axis + z
 
 
 def corner_number(bricks: Lanes, cells: Sequence[Lanes]) -> Lanes:
-    """As that of `player.asset.grid`, in 64 bits; for bricks that are there."""
+    """Compute the same as `player.asset.grid.corner_number`, in 64 bits; no number of `bricks` may be below
+    0."""
     x, y, z = (cell & 7 for cell in cells)
     return bricks.wide() * 729 + (x * 81 + y * 9 + z).wide()
 
@@ -265,8 +272,9 @@ def corner_number(bricks: Lanes, cells: Sequence[Lanes]) -> Lanes:
 def _collect(
     b: Any, grid: Lookup, path: _Box | _Space, samples: Any, pitch: Any, out: Any, ways: bool
 ) -> Any:
-    """March a packet: s into `samples`, weights `pitch` numbers behind and, with `ways`, behind these what
-    each sample stands for; SUMS of each ray into `out`. Returns how many rows were written."""
+    """March a packet. Write s to `samples`, weights `pitch` numbers behind s and, with `ways`, the lengths
+    that samples stand for `pitch` numbers behind the weights. Write the SUMS results of each ray to `out`.
+    Returns the number of rows of samples written."""
     resolution, n_per_axis = (splat(b, b.trunc(n, INT)) for n in (grid.resolution, grid.n_per_axis))
     low, slope = splat(b, grid.density_low), splat(b, grid.density_slope)
     last, zero, first = (resolution - 1).to_float(), low.like(0.0), path.first()
@@ -280,7 +288,7 @@ def _collect(
     closing = opaque_depth < float(MAX_TAU)  # whether the sample that passes it counts as opaque
 
     def look_up(g: Three, where: Lanes) -> tuple[list[Lanes], Lanes]:
-        """Cells of the finest level, and the table's entries."""
+        """Return cells of the finest level, and the table's entries for them."""
         cell = [x.most(0.0).least(last).to_int() for x in g]
         return cell, gather(grid.table, brick_number(cell, n_per_axis), 4, where)
 
@@ -302,10 +310,11 @@ def _collect(
         coarse = inside & (level >= choose(empty, one, least_coarse))
         with b.if_then(coarse.any()):
             size = gather(grid.level_steps, level, 4, coarse)
-            size = choose(now > 0, size.least(now & (0 - now)), size)  # the least power of two divides all
+            size = choose(now > 0, size.least(now & (0 - now)), size)  # now & -now: the lowest bit of now
             after = now + size
             i.set(choose(coarse & (busy | (after > i.get())), after, i.get()))
-            # what begins in a dead brick may have its middle in a live cell, if that is not jumped over
+            # a group that begins in a dead brick may have its middle in a live cell, unless that is jumped
+            # over
             grouped = coarse & (size > 1) & (busy | (after > there.get()))
             with b.if_then(grouped.any()):
                 s, reached, g = path.place_group(now, size, grouped)
@@ -362,19 +371,19 @@ def _collect(
 
 
 class _At:
-    """Where the samples of a packet are: s, the table's entry, whether there is a brick, grid coordinates and
-    cell; those that are not on the finest level move to cells of their own."""
+    """The positions of a packet's samples: s, the table's entry, whether there is a brick, grid coordinates
+    and cell. Samples in bricks of coarser levels are moved to cells of those levels."""
 
     def __init__(self, s: Lanes, entry: Lanes, busy: Lanes, g: Three, cell: list[Lanes]) -> None:
         self._all = [Variable(value) for value in (s, entry, busy, *g, *cell)]
 
     def move(self, where: Lanes, s: Lanes, entry: Lanes, busy: Lanes, g: Three, cell: list[Lanes]) -> None:
-        """Put those that are true in `where` elsewhere."""
+        """Replace the values of the lanes that are true in `where`."""
         for variable, value in zip(self._all, (s, entry, busy, *g, *cell), strict=True):
             variable.set(choose(where, value, variable.get()))
 
     def to_own_cells(self) -> None:
-        """Coordinates and cells of the brick's level."""
+        """Convert coordinates and cells from the finest level to that of each sample's brick."""
         _, entry, busy, *_ = (variable.get() for variable in self._all)
         level = choose(busy, entry & 7, 0)
         width = ((127 - level) << 23).as_float()
@@ -388,14 +397,15 @@ class _At:
 
 
 class _Sum:
-    """A sum of many numbers to the rounding of the last (Kahan)."""
+    """A compensated sum (Kahan) of many numbers, exact to the rounding of the last addition."""
 
     def __init__(self, zero: Lanes) -> None:
         self._sum, self._lost = Variable(zero), Variable(zero)
 
     def add(self, number: Lanes, where: Lanes) -> None:
-        """Add the numbers that are true in `where`. Adding 0 to the others would move what they have lost,
-        and with it the last bit of their sums: those of a ray must not depend on the rays beside it."""
+        """Add the numbers of the lanes that are true in `where`. The other lanes are not touched: adding 0 to
+        them would change their compensation, and with it the last bit of their sums. The sum of a ray must
+        not depend on the rays beside it."""
         missing = number - self._lost.get()
         total = self._sum.get() + missing
         self._lost.set(choose(where, (total - self._sum.get()) - missing, self._lost.get()))
@@ -406,7 +416,7 @@ class _Sum:
 
 
 def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
-    """Codes between the corners of cells: along z, then y, then x."""
+    """Interpolate codes in cells trilinearly: along z, then y, then x."""
 
     def along_z(offset: int) -> Lanes:
         pair = gather(density, at, 1, where, offset=offset)
@@ -419,7 +429,7 @@ def _trilinear(density: Any, at: Lanes, f: list[Lanes], where: Lanes) -> Lanes:
 
 
 def _marching(ways: bool) -> Any:
-    """The intrinsic of `march_packet`, or of `march_packet_ways`."""
+    """Make the intrinsic `march_packet` or, with `ways`, `march_packet_ways`."""
 
     def typed(_: Any, lookup: Any, steps: Any, packets: Any, number: Any, samples: Any, out: Any) -> Any:
 
@@ -440,13 +450,14 @@ def _marching(ways: bool) -> Any:
 march_packet: Any = _marching(ways=False)
 """march_packet(lookup: Lookup, steps: BoxSteps or SpaceSteps, packets [n_packets, BOX_ROWS or SPACE_ROWS,
 LANES] float32, number, samples [2, n, LANES] float32, out [SUMS, LANES] float32): march the packet `number`;
-rows written.
+returns the number of rows of `samples` written.
 
-Into `samples` go s and weights; it has room for the most samples that a ray can have.
+`samples` gets s and weights, and must have room for the most samples that a ray can have. `out` gets the
+results of each ray.
 """
 march_packet_ways: Any = _marching(ways=True)
-"""`march_packet` with `samples` [3, n, LANES]: behind the weights go the model units that each sample stands
-for."""
+"""`march_packet` with `samples` [3, n, LANES]: behind the weights, it gets the length of ray, model units,
+that each sample stands for."""
 
 
 def _place_fetches(
@@ -470,6 +481,6 @@ def _place_fetches(
 
 place_fetches: Any = intrinsic(_place_fetches)
 """place_fetches(steps, packets, number, table float32, first, places [3, LANES] float32, weights [LANES]
-float32): grid coordinates of the LANES places s that are in `table` from its number `first` on, on the rays
-of the packet `number`. Where s is NaN the weight becomes 0.
+float32): write to `places` the grid coordinates of LANES positions on the rays of the packet `number`. Their
+s are in `table` from the index `first` on. Where s is NaN the weight becomes 0.
 """

@@ -1,7 +1,7 @@
-"""What surrounds the march, compiled by numba: pixels of blocks to rays, and what was found into the frame.
+"""The work around the march, compiled by numba: pixels of blocks to rays, and results into the frame.
 
-Each function has its readable twin in `player.march.pixels`, which gives the same to float32 rounding. In
-numpy they took a tenth of a frame.
+Each function has its readable twin in `player.march.pixels`, which gives the same to float32 rounding. The
+numpy twins took a tenth of the time of a frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ F32 = np.float32
 
 
 def directions(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """[n, 3] float32 unit directions through pixel centres, as `Camera.rays` defines them."""
+    """Return unit directions [n, 3] float32 through pixel centres, as `Camera.rays` defines them."""
     rays_d = scratch((len(columns), 3), F32)
     lens = (camera.cx, camera.cy, camera.fx, camera.fy)
     _directions(columns, rows, lens, np.ascontiguousarray(camera.c2w[:3, :3]), rays_d)
@@ -37,7 +37,7 @@ def write_pixels(
     start: float,
     scale: float,
 ) -> None:
-    """As `player.march.pixels.write_pixels`."""
+    """Write pixels as `player.march.pixels.write_pixels` does."""
     colour = (0.0, 0.0, 0.0) if behind is None else behind
     _write(
         planes, index, result.opacity, result.depth, result.n_density_samples, result.hits, rgb,

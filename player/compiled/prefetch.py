@@ -1,7 +1,8 @@
-"""Asking for memory before it is needed.
+"""Prefetching: asking for memory before it is needed.
 
-The rows of a hash table or of a grid that one sample or one step reads lie all over it, and a core that meets
-them one by one waits for each: asked for ahead, they come side by side. Compiled code alone imports this.
+The rows of a hash table or of a grid that one sample or one step reads are scattered over memory, and a core
+that reads them one by one waits for each. If all are prefetched first, they arrive side by side. Only
+compiled code imports this module.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 READ, KEEP, DATA = 0, 3, 1
-"""LLVM's words: to be read, in all caches, not code."""
+"""Arguments of LLVM's prefetch: for reading, to be kept in all caches, data and not code."""
 
 
 def _prefetch(typing_context: Any, array: Any, row: Any) -> Any:
@@ -36,4 +37,4 @@ def _prefetch(typing_context: Any, array: Any, row: Any) -> Any:
 
 
 prefetch: Any = intrinsic(_prefetch)
-"""prefetch(array, row): ask for the start of a row of an array; it changes no value."""
+"""prefetch(array, row): prefetch the start of a row of an array; no value changes."""

@@ -1,9 +1,10 @@
-"""What the processor has that numba compiles for: this machine's, or the one that NUMBA_CPU_NAME and
+"""Features of the processor that numba compiles for: this machine's, or the one that NUMBA_CPU_NAME and
 NUMBA_CPU_FEATURES name.
 
-LLVM knows which name has which instructions, and does not say so. It is asked by what it makes of a few lines
-that every processor can run: sums of many numbers tell how wide its registers are, a sum of products of bytes
-whether it adds up four of them at once. Compiled code alone imports this.
+LLVM knows which processor has which instructions, but cannot be asked directly. So the assembly is inspected
+that it makes of a few lines which every processor can run: sums of many numbers show how wide the registers
+are, a sum of products of bytes shows whether four of them are added up at once. Only compiled code imports
+this module.
 """
 
 from __future__ import annotations
@@ -38,33 +39,34 @@ define i32 @dot(<N x i8> %a, <N x i8> %b) {
 }
 """
 _REGISTERS = {32: "ymm", 64: "zmm"}
-"""Names of registers by the bytes that they hold."""
+"""Names of registers, by the number of bytes that they hold."""
 
 
 @lru_cache(maxsize=1)
 def target() -> tuple[str, str, str]:
-    """What numba tells LLVM to compile for: the kind of machine (a triple), the processor's name, and what it
-    has beyond that name ("+avx2,-avx512f")."""
+    """Return what numba tells LLVM to compile for: the kind of machine (a triple), the processor's name, and
+    the features in which the processor differs from that name ("+avx2,-avx512f")."""
     context: Any = registry.cpu_target.target_context
     return context.codegen().magic_tuple()
 
 
 def has_wide_registers(of: tuple[str, str, str] | None = None) -> bool:
-    """Whether registers hold sixteen float32 (AVX-512), on the processor that numba compiles for, or on that
-    `of` another target."""
+    """Return whether registers hold sixteen float32 (AVX-512), on the processor that numba compiles for or on
+    that of another target, `of`."""
     return bool(re.search(r"vaddps\s.*zmm", _assembly(_SUM, of or target())))
 
 
 def multiplies_bytes(n: int, of: tuple[str, str, str] | None = None) -> bool:
-    """Whether one instruction (VNNI) multiplies `n` bytes, 32 or 64, by as many and adds up fours of the
-    products."""
+    """Return whether one instruction (VNNI) multiplies `n` bytes, 32 or 64, by as many others and adds up the
+    products in groups of four."""
     module = _DOT.replace("N", str(n))
     return bool(re.search(rf"vpdpbusd\s.*{_REGISTERS[n]}", _assembly(module, of or target())))
 
 
 def multiplies_shorts(n: int, of: tuple[str, str, str] | None = None) -> bool:
-    """Whether registers hold `n` bytes, 32 or 64, of integers of 8 and 16 bits (AVX2 and AVX-512BW): then two
-    instructions multiply as many bytes and add up fours of the products, if twos of them fit into 16 bits."""
+    """Return whether registers hold `n` bytes, 32 or 64, of integers of 8 and 16 bits (AVX2 and AVX-512BW).
+    Then two instructions multiply as many bytes and add up the products in groups of four, if sums of two
+    products fit into 16 bits."""
     module = _SHORT_SUM.replace("N", str(n // 2))
     return bool(re.search(rf"vpaddw\s.*{_REGISTERS[n]}", _assembly(module, of or target())))
 

@@ -1,5 +1,5 @@
-"""The samples of rays one by one, and where they lie, for those who want more of them than a picture: the
-compiled twin of `player.march.march.sample_rays`."""
+"""The single samples of rays and their positions, for callers that need more than a picture: the compiled
+twin of `player.march.march.sample_rays`."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from player.scratch import check_scratch, scratch
 
 F32 = np.float32
 MOST_AT_ONCE = 1 << 20
-"""Samples that are held beside those that are handed out: 34 MB."""
+"""Samples that are collected at a time before they are copied to the result: 34 MB."""
 
 
 class PlacedSamples(NamedTuple):
-    """n rays and what they meet, as in `player.march.march.SampledRays`, and where that is."""
+    """n rays and their samples, as in `player.march.march.SampledRays`, and the samples' points."""
 
     samples: Samples
     ways: np.ndarray
     tau: np.ndarray
     n_density_samples: np.ndarray
     points: np.ndarray
-    """[n_samples, 3] float32: where the samples are, cells of the finest level of the densities."""
+    """[n_samples, 3] float32: the samples' grid coordinates, in cells of the finest level of the
+    densities."""
 
 
 class _Met(NamedTuple):
-    """Samples as they are found, [n] each: the columns of `Samples`, ways, and points [n, 3]."""
+    """Buffers for samples: the columns of `Samples` and ways, [n] each, and points [n, 3]."""
 
     ray: np.ndarray
     s: np.ndarray
@@ -45,10 +46,10 @@ class _Met(NamedTuple):
 def sample_rays(
     grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_threads: int = 1
 ) -> PlacedSamples:
-    """`player.march.march.sample_rays`, compiled: same result to float32 rounding, whatever the number of
-    threads, and the samples' points as `Path.at` has them."""
+    """Find the samples of rays as `player.march.march.sample_rays` does, and their points as `Path.at` gives
+    them. The result is the same to float32 rounding, whatever the number of threads."""
     n_packets = -(-len(rays_o) // LANES)
-    size = max(-(-n_packets // n_threads), 1) * LANES  # whole packets, as one thread has them
+    size = max(-(-n_packets // n_threads), 1) * LANES  # whole packets, the same as on one thread
     firsts = range(0, max(len(rays_o), 1), size)
     rays = [(rays_o[first : first + size], rays_d[first : first + size]) for first in firsts]
     if len(rays) == 1:
@@ -64,7 +65,7 @@ def sample_rays(
 
 
 def _sample(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[_Met, np.ndarray, np.ndarray]:
-    """What n rays meet, their optical depths [n] and numbers of density samples [n]."""
+    """Return the samples of n rays, their optical depths [n] and numbers of density samples [n]."""
     lookup, steps, packets, most_samples = enter(grid, rays_o, rays_d)
     n_rays, room = len(rays_o), max(MOST_AT_ONCE, most_samples * LANES)
     samples, sums = scratch((3, most_samples, LANES), F32), scratch((SUMS, LANES), F32)
@@ -83,8 +84,8 @@ def _sample(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[_
 
 @compiled
 def _sample_packets(lookup, steps, packets, number, work, met, tau, counts):
-    """The samples with weight of the packets from `number` on, as long as there is room for those of another.
-    Returns their number, and that of the packet to go on with."""
+    """Write the samples with weight of the packets from `number` on to `met`, as long as there is room for
+    those of another packet. Returns the number of samples, and the number of the packet to go on with."""
     samples, sums, places, weights, placed = work
     n, most = 0, len(met.ray) - samples.shape[1] * LANES
     while number < len(packets) and n <= most:

@@ -1,1 +1,1 @@
-"""How files are opened, read and put in place: only regular files inside a folder, whole or not at all."""
+"""Read and write files: only regular files are read, and a file is written as a whole or not at all."""

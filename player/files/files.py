@@ -1,5 +1,5 @@
-"""Reading regular files alone, within a size that is stated; and writing so that the final name holds
-either the old content or the complete new one."""
+"""Read regular files only, up to a stated size; and write so that the final name always holds either the old
+content or the complete new one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KINDS = {
     stat.S_IFSOCK: "a socket",
 }
 _FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
-"""A pipe that nobody writes to is opened at once, and then refused, instead of waited for."""
+"""With these flags a pipe that nobody writes to is opened at once and then refused, not waited for."""
 
 
 def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> BinaryIO:
@@ -30,9 +30,9 @@ def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> B
 
     Args:
         path: the file; it may be a link.
-        what: what is expected there, for the message.
-        most: bytes.
-        inside: a folder that the file must lie in, once links are followed.
+        what: what the file is expected to be, for error messages.
+        most: the largest size allowed, in bytes.
+        inside: a folder that the file must lie in, once links are followed; None allows any place.
 
     Raises:
         FormatError: there is no such file, it is a folder, a pipe, a device or a socket, it is too large, it
@@ -44,10 +44,10 @@ def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> B
     """
     with _told(path, what):
         place = path if inside is None else _inside(path, inside)
-        _check_regular(path, what, place.stat())  # before it is opened, which a device may notice
+        _check_regular(path, what, place.stat())  # before opening, which may have effects on a device
         handle = os.open(place, _FLAGS)
         try:
-            size = _check_regular(path, what, os.fstat(handle))  # another file may be there by now
+            size = _check_regular(path, what, os.fstat(handle))  # it may be another file by now
             if size > most:
                 raise FormatError(f"{path}: size: expected at most {most} bytes for {what}, got {size}")
             return os.fdopen(handle, "rb")
@@ -57,13 +57,13 @@ def open_file(path: Path, what: str, most: int, inside: Path | None = None) -> B
 
 
 def read_bytes(path: Path, what: str, most: int, inside: Path | None = None) -> bytes:
-    """The content of a file that `open_file` opens, with its arguments. Raises FormatError."""
+    """Return the content of a file; arguments and errors are those of `open_file`."""
     with open_file(path, what, most, inside) as file, _told(path, what):
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def file_size(path: Path, what: str, inside: Path | None = None) -> int:
-    """Bytes of a regular file, which is not opened; arguments as `open_file`. Raises FormatError."""
+    """Return the size of a regular file in bytes, without opening it. Arguments and errors as `open_file`."""
     with _told(path, what):
         place = path if inside is None else _inside(path, inside)
         return _check_regular(path, what, place.stat())
@@ -71,7 +71,7 @@ def file_size(path: Path, what: str, inside: Path | None = None) -> int:
 
 @contextmanager
 def _told(path: Path, what: str) -> Iterator[None]:
-    """Failures of the system in the block become one FormatError."""
+    """Turn an error of the operating system in the block into a FormatError about `path`."""
     try:
         yield
     except FormatError:
@@ -83,7 +83,7 @@ def _told(path: Path, what: str) -> Iterator[None]:
 
 
 def _check_regular(path: Path, what: str, found: os.stat_result) -> int:
-    """The size of what was found, if it is a regular file."""
+    """Return the size of a regular file with the status `found`. Raises FormatError for anything else."""
     if not stat.S_ISREG(found.st_mode):
         got = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
         raise FormatError(f"{path}: cannot read: expected a file, {what}, got {got}")
@@ -91,7 +91,7 @@ def _check_regular(path: Path, what: str, found: os.stat_result) -> int:
 
 
 def _inside(path: Path, folder: Path) -> Path:
-    """The place of `path` once links are followed, which must be in `folder`."""
+    """Return the place of `path` once links are followed. Raises FormatError if it is not in `folder`."""
     place = path.resolve(strict=True)
     if not place.is_relative_to(folder.resolve()):
         raise FormatError(f"{path}: expected a file inside {folder}, got a link to {place}")
@@ -99,13 +99,12 @@ def _inside(path: Path, folder: Path) -> Path:
 
 
 def check_target(path: Path, force: bool = False, is_file: bool = False) -> None:
-    """Refuse a target that exists, unless `force`, or that cannot be written because it or its folder is
-    read-only; called before long work, so that nobody waits for a refusal.
+    """Raise OutputError if a target exists, unless `force`, or if it or its folder is read-only. This is
+    called before long work, so that nobody waits for an error that could have come at once.
 
-    `is_file`: whether a file is to be written, which a folder is never replaced by.
+    `is_file`: whether a file is to be written, which never replaces a folder.
 
-    What a process that was killed has left in its folder is finished or removed first
-    (`player.files.replace`).
+    First, what a killed process has left in the folder is finished or removed (`player.files.replace`).
 
     >>> check_target(Path("surely/not/there.png"))
     """
@@ -129,7 +128,7 @@ def check_target(path: Path, force: bool = False, is_file: bool = False) -> None
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` beside `path` and rename it into place.
+    """Write `data` to a temporary file beside `path` and rename this to `path`.
 
     Raises OutputError: full disk, read-only folder, ...
     """
@@ -137,12 +136,12 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_together(files: dict[Path, bytes]) -> None:
-    """Write files that belong together beside their places; when all are complete, move them there.
+    """Write files that belong together: first to a temporary folder, then move all to their places.
 
-    They are in one folder, and up to their first dots their names are the same: `a.obj`, `a.lod1.obj`.
+    They must be for the same folder, and have the same names up to the first dot: `a.obj`, `a.lod1.obj`.
 
-    A process that is killed while it moves them leaves some of the old and some of the new: the next one that
-    writes in this folder, or looks whether it may (`check_target`), moves the rest.
+    A process that is killed while it moves them leaves some of the old files and some of the new ones. The
+    next process that writes in this folder, or checks whether it may (`check_target`), moves the rest.
 
     Raises OutputError: full disk, read-only folder, ...
     """
@@ -165,7 +164,7 @@ def write_together(files: dict[Path, bytes]) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """The folder of `path` is there and held, and what the system refuses is an OutputError."""
+    """Create the folder of `path` and hold it (`held`); turn errors of the system into an OutputError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with held(path.parent):
@@ -192,8 +191,8 @@ def _write_one(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """A file of the same name in a temporary folder beside `path`, for a library that writes files itself; it
-    becomes `path` when the block ends well.
+    """Yield a path with the name of `path` in a temporary folder beside it, for a library that writes files
+    itself. The file becomes `path` when the block ends without an error.
 
     Raises OutputError: full disk, read-only folder, ...
     """
@@ -205,11 +204,11 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
-    """A temporary folder beside `path` that becomes `path` when the block ends well, and vanishes when it
-    does not.
+    """Yield a temporary folder beside `path`, which becomes `path` when the block ends without an error, and
+    is removed otherwise.
 
     With `force` a folder that exists is replaced when the new one is complete, in one step where the system
-    can (`player.files.replace`). Raises OutputError: `path` exists, full disk, read-only folder, ...
+    can do this (`player.files.replace`). Raises OutputError: `path` exists, full disk, read-only folder, ...
     """
     check_target(path, force)
     with _writing(path), _temporary_folder(path) as temporary:
@@ -220,7 +219,7 @@ def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _temporary_folder(path: Path) -> Iterator[Path]:
-    """A folder beside `path`; what then has its name is removed in the end."""
+    """Yield a new folder beside `path`; whatever has its name when the block ends is removed."""
     folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.parent))
     try:
         folder.chmod(0o777 & ~_umask())

@@ -1,4 +1,4 @@
-"""Pictures in 8 bits, and PNG and WebP files of them, which remember what they show."""
+"""8-bit pictures, and PNG and WebP files of them, whose metadata can say what was rendered."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEY = "vfr-play"
 
 
 def to_8_bit(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] as uint8, rounded to nearest; others are clipped.
+    """Convert values in [0, 1] to uint8, rounded to nearest; others are clipped.
 
     >>> to_8_bit(np.array([0.0, 0.5, 1.0, 7.0])).tolist()
     [0, 128, 255, 255]
@@ -30,7 +30,7 @@ def to_8_bit(values: np.ndarray) -> np.ndarray:
 
 
 def png_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
-    """PNG of [h, w, 3] or [h, w, 4] uint8; `key` is kept in it as text.
+    """Encode [h, w, 3] or [h, w, 4] uint8 as PNG; `key` is stored in it as text.
 
     >>> png_bytes(np.zeros((2, 3, 3), np.uint8))[:4]
     b'\\x89PNG'
@@ -44,7 +44,9 @@ def png_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
 
 
 def webp_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
-    """Lossless WebP of [h, w, 3] or [h, w, 4] uint8, at most 16383 pixels a side; `key` is kept in its XMP.
+    """Encode [h, w, 3] or [h, w, 4] uint8 as lossless WebP; `key` is stored in its XMP.
+
+    Raises OutputError: more than 16383 pixels a side.
 
     >>> webp_bytes(np.zeros((2, 3, 3), np.uint8))[8:12]
     b'WEBP'
@@ -53,7 +55,7 @@ def webp_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:
         raise OutputError(
             f"WebP: expected at most 16383 pixels a side, got {pixels.shape[1]}x{pixels.shape[0]}: write PNG"
         )
-    # exact: colours behind zero alpha stay as they are. method 2: a quarter of the time, 2 % larger.
+    # exact: keeps the colours where alpha is 0. method 2: takes a quarter of the time for 2 % more bytes.
     return _encode(
         pixels, "WEBP", lossless=True, exact=True, method=2, xmp=f"{KEY}={key}".encode() if key else b""
     )
@@ -63,17 +65,17 @@ ENCODERS = {".png": png_bytes, ".webp": webp_bytes}
 
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-"""What a picture may be, whatever its name is: Pillow would start Ghostscript for another."""
+"""Formats that a picture may have, whatever its name is: for others Pillow might start Ghostscript."""
 MAX_FILE_BYTES = 1 << 30
-"""Bytes of a picture's file: 178 million pixels, the most that Pillow opens, with six bytes each."""
+"""The most bytes of a picture's file: 178 million pixels, the most that Pillow opens, of six bytes each."""
 
 
 @contextmanager
 def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Image.Image]:
-    """A picture file, opened by Pillow, as a context manager.
+    """Yield a picture file opened by Pillow.
 
-    `formats`: Pillow's names of those that it may have. Raises FormatError: no such file, not a regular one,
-    too large, or no picture that can be read to its end, there or in the block.
+    `formats`: Pillow's names of the formats that it may have. Raises FormatError: no such file, not a regular
+    one, too large, or not a picture that can be read to its end, when it is opened or in the block.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -86,7 +88,7 @@ def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Ima
             raise FormatError(f"{path}: picture: expected {expected}, got something else") from None
         except (
             *(OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError),
-            MemoryError,  # a chunk may say that it has gigabytes, for which Pillow asks at once
+            MemoryError,  # a chunk may claim to have gigabytes, which Pillow allocates at once
         ) as error:
             if isinstance(error, VfrError):
                 raise
@@ -95,8 +97,8 @@ def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Ima
 
 
 def read_key(path: Path, size: tuple[int, int] | None = None) -> str | None:
-    """The key that a picture of `size` (width, height; None: any) was written with; None if there is none,
-    or no whole picture of that size."""
+    """Return the key that a picture of `size` (width, height; None: any) was written with; None if it has
+    none, or if there is no whole picture of that size."""
     try:
         with open_picture(path) as picture:
             if size is not None and picture.size != size:
@@ -114,7 +116,7 @@ def read_key(path: Path, size: tuple[int, int] | None = None) -> str | None:
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write a PNG; the name appears when the file is complete."""
+    """Write a PNG file, which appears under its name when it is complete."""
     write_bytes(path, png_bytes(pixels))
 
 

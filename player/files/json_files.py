@@ -1,4 +1,4 @@
-"""JSON from outside: read with a bound on its size, and what was found there in one short line."""
+"""Read JSON files from outside with bounds on their size, and quote what was found in one short line."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from player.errors import FormatError
 from player.files.files import read_bytes
 
 MAX_FILE_BYTES = 64 * 2**20
-"""Bytes of a JSON file, at most: enough for sixty thousand cameras of a kilobyte each."""
+"""The most bytes of a JSON file: enough for sixty thousand cameras of a kilobyte each."""
 MOST_VALUES = 8 << 20
-"""Values in a JSON file, at most: each takes a hundred bytes of memory or less, and a camera has thirty."""
+"""The most values in a JSON file: each takes a hundred bytes of memory or less, and a camera has thirty."""
 
 
 def read_json(path: str | Path, what: str) -> bytes:
-    """The bytes of a JSON file; `what` it should be is for the message.
+    """Return the bytes of a JSON file; `what` says in error messages what it is expected to be.
 
-    Raises FormatError: no such file, not a plain file, over 64 MB.
+    Raises FormatError: no such file, not a regular file, over 64 MiB.
     """
     return read_bytes(Path(path), what, MAX_FILE_BYTES)
 
 
 def parse_json(data: bytes, where: str) -> Any:
-    """What the bytes say, if it is at most MOST_VALUES values; NaN and Infinity are not JSON.
+    """Parse bytes as JSON.
 
-    Raises FormatError.
+    Raises FormatError: not JSON (NaN and Infinity are not), or more than about MOST_VALUES values.
 
     >>> parse_json(b"[1, NaN]", "numbers")
     Traceback (most recent call last):
@@ -43,7 +43,7 @@ def parse_json(data: bytes, where: str) -> Any:
 
 
 def as_float(value: Any) -> float | None:
-    """A finite number as float, None for anything else."""
+    """Return a finite number as float, and None for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -54,7 +54,7 @@ def as_float(value: Any) -> float | None:
 
 
 def brief(value: Any) -> str:
-    """What was found, in one short line of plain characters.
+    """Return a value that was found as one short line of ASCII characters, for messages.
 
     >>> brief("two\\nlines, \\x1e, \\u00fc"), brief([1, None])
     ('two lines, \\\\x1e, \\\\xfc', '[1, None]')

@@ -1,4 +1,4 @@
-"""The memory that a command may take: as much as was asked for, or a share of what there is."""
+"""The memory that a command may take: what the user allows, or a share of what the machine has."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pathlib import Path
 from player.errors import ConfigError
 
 SHARE = 0.5
-"""A share of the machine's memory, or of a lower limit of the process, where no other number is asked for:
-the rest is for the program itself, for pictures and for other programs."""
+"""The share of the machine's memory, or of a lower limit of the process, that is used where the user gives no
+number. The rest is for the program itself, for pictures and for other programs."""
 UNKNOWN = 4 << 30
-"""Bytes of memory that are assumed where the machine does not tell."""
+"""Bytes of memory that the machine is assumed to have where the system does not tell."""
 
 
 def allowed_bytes(max_memory: float | None = None) -> int:
-    """Bytes that a command may take.
+    """Return the bytes of memory that a command may take.
 
     Args:
-        max_memory: gigabytes that were asked for; None is a share of what this process can have.
+        max_memory: gigabytes that the user allows; None is a share (`SHARE`) of what this process can have.
 
-    Raises ConfigError: not more than 0.
+    Raises ConfigError: `max_memory` is not between 0 and 1e9.
 
     >>> allowed_bytes(1.5)
     1500000000
@@ -35,7 +35,7 @@ def allowed_bytes(max_memory: float | None = None) -> int:
 
 
 def check_memory(needed: int, allowed: int, where: str) -> None:
-    """Raise ConfigError if what `where` needs is more than what is allowed."""
+    """Raise ConfigError if `where`, which is named in the message, needs more bytes than are allowed."""
     if needed > allowed:
         raise ConfigError(
             f"{where}: memory: expected at most {allowed / 1e9:.3g} GB, got {needed / 1e9:.3g} GB or more "
@@ -44,10 +44,10 @@ def check_memory(needed: int, allowed: int, where: str) -> None:
 
 
 def give_back() -> None:
-    """Hand memory that is free in this process back to the machine.
+    """Hand freed memory of this process back to the machine.
 
-    glibc keeps what was freed for the thread that had asked for it: all pictures that threads have read,
-    where they were copied since. Other C libraries are left to themselves.
+    glibc keeps freed memory for the thread that allocated it: for example that of all pictures that threads
+    have read and that were copied since. With other C libraries nothing is done.
     """
     if sys.platform == "linux":
         import ctypes
@@ -86,7 +86,7 @@ def _windows_bytes() -> int:
 
 
 def _limits() -> list[int]:
-    """Limits of this process that are lower than the machine: of its address space, of its control groups."""
+    """Return the limits of this process, in bytes: that of its address space, those of its control groups."""
     limits = []
     with suppress(ImportError, OSError, ValueError):
         import resource
@@ -98,9 +98,10 @@ def _limits() -> list[int]:
 
 
 def _group_limits(groups: Path, root: Path) -> list[int]:
-    """What Linux's control groups say: of the group of this process and of those above it.
+    """Return the limits, in bytes, of this process's control group in Linux and of the groups above it.
 
-    `groups` has a line for each hierarchy, "0::/path" or "5:memory:/path"; a number is in a file, or "max".
+    The file `groups` has a line for each hierarchy, "0::/path" or "5:memory:/path". A group's file below
+    `root` holds its limit, a number or "max".
     """
     limits = []
     with suppress(OSError, ValueError):

@@ -1,21 +1,21 @@
-"""How what is complete gets its name, in one step, and what becomes of what a killed process leaves behind.
+"""Give complete files and folders their final names in one step, and clear up after killed processes.
 
 Everything is first written beside its place, as `.NAME.xxxxxxxx.part`. Then
 
 - a file is renamed: the system replaces an old one in one step;
-- a folder is exchanged with an old one in one step where the system and the disk can (Linux, macOS).
-  Elsewhere the old one is `.NAME.replaced` between two renames;
-- files that belong together are collected in one folder. When it is complete it is renamed to
+- a folder is exchanged with an old one in one step where the system and the disk can do this (Linux, macOS).
+  Elsewhere the old folder is called `.NAME.replaced` between two renames;
+- files that belong together are collected in one folder. When this is complete, it is renamed to
   `.NAME.together`, and the files are moved out of it to their places.
 
-`clear_up` finishes what was interrupted: it moves out what is together, gives an old folder its name back
-where there is no new one, and removes what else is left. It is called before anything is written into a
-folder, and where an asset is looked for and nothing is found.
+`clear_up` finishes what was interrupted: it moves files out of `.NAME.together`, gives an old folder its name
+back where there is no new one, and removes whatever else is left. It is called before anything is written
+into a folder, and where an asset is looked for and nothing is found.
 
 A temporary file may belong to a process that is still writing. Every process that has one holds a shared lock
-on the folder (flock), which the system takes away when the process ends, however it ends. Only who can have
-the folder alone removes what is left. Windows has no such lock, and some disks of other machines have none:
-there `.part` files stay until somebody removes them.
+on the folder (flock), which the system releases when the process ends, however it ends. Only a process that
+gets an exclusive lock removes what is left. Windows has no such lock, and some network disks have none: there
+`.part` files stay until somebody removes them.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from pathlib import Path
 from player.errors import OutputError
 
 PART = ".part"
-_PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # as tempfile makes them
+_PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # names as tempfile makes them
 _TOGETHER = re.compile(r"\.(.+)\.together", re.DOTALL)
 _REPLACED = re.compile(r"\.(.+)\.replaced", re.DOTALL)
-_NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # of a disk that cannot do this to a folder
+_NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # errors of a disk that cannot sync a folder
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux: fcntl.h, linux/fs.h
 _RENAME_SWAP = 2  # macOS: sys/stdio.h
 
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Nobody clears up in `folder` while the block writes there.
+    """Keep other processes from clearing up in `folder` while the block writes there.
 
-    What an earlier process left there is cleared up when this process first comes to the folder.
+    When this process first uses the folder, it clears up what earlier processes have left there.
     """
     _clear_up_once(folder.resolve())
     handle = _opened(folder)
@@ -60,17 +60,17 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def clear_up(folder: Path) -> None:
-    """Finish or remove what processes that were killed have left in `folder`, unless others write there."""
+    """Finish or remove what killed processes have left in `folder`, unless other processes write there."""
     handle = _opened(folder)
     try:
         alone = handle is not None and _lock(handle, alone=True)
         if alone is None:
             return
         paths = []
-        with suppress(OSError):  # no such folder, or one that is not ours to read
+        with suppress(OSError):  # no such folder, or no right to read it
             paths = sorted(folder.glob(".*"))
         for path in paths:
-            with suppress(OSError):  # not ours to change: whoever writes there is told
+            with suppress(OSError):  # no right to change it: writing there will raise the error
                 _clear_up(path, alone)
     finally:
         if handle is not None:
@@ -94,10 +94,10 @@ def _clear_up(path: Path, alone: bool) -> None:
 
 
 def put_folder(new: Path, path: Path) -> None:
-    """Give the folder `new` the name `path`. What had that name is removed, or has the name `new` afterwards;
-    the names are on the disk before anything is removed.
+    """Give the folder `new` the name `path`. A folder that had this name is removed, or is called `new`
+    afterwards. The new names are synced to the disk before anything is removed.
 
-    Raises OSError: the old one is still there. OutputError: it is under another name, which is said.
+    Raises OSError: the old folder still has its name. OutputError: it has the name that the message says.
     """
     if not os.path.lexists(path):
         new.replace(path)
@@ -128,7 +128,7 @@ def _restore(aside: Path, path: Path) -> None:
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Exchange what two names stand for in one step; False if that cannot be done here.
+    """Exchange the files or folders of two names in one step. Return False if that cannot be done here.
 
     >>> exchange(Path("surely/not"), Path("there"))
     False
@@ -146,14 +146,14 @@ def exchange(one: Path, other: Path) -> bool:
 
 
 def put_together(new: Path, name: str) -> None:
-    """Move the files in the folder `new` to the folder that it is in, all of them or none: once it has begun,
-    the next process that writes there ends it.
+    """Move the files in the folder `new` to the folder that contains it, all of them or none: if a process is
+    killed meanwhile, the next one that writes there finishes the moving.
 
     Args:
         new: a temporary folder, complete.
-        name: of one of the files.
+        name: the name of one of the files.
 
-    Raises OSError: nothing has changed, or, where a file is in use, some are still to be moved.
+    Raises OSError: nothing has changed, or, where a file is in use, some files are still to be moved.
     """
     together = new.with_name(f".{name}.together")
     for tries_left in reversed(range(10)):
@@ -163,17 +163,17 @@ def put_together(new: Path, name: str) -> None:
         except OSError:
             if not together.is_dir() or not tries_left:
                 raise
-            move_out(together)  # of another process that writes the same: its files, then ours
+            move_out(together)  # of another process that writes the same files: they come first
     sync(together.parent)
     move_out(together)
 
 
 def move_out(folder: Path) -> None:
-    """Move the files in `.NAME.together` to the folder that it is in, and remove it. Others may do so at the
-    same time.
+    """Move the files in the folder `.NAME.together` to the folder that contains it, and remove it. Other
+    processes may do the same at the same time.
 
-    A folder that somebody has unpacked may look like one: only files that begin like NAME, up to its first
-    dot, are moved.
+    A folder that somebody has unpacked may have such a name, too. Therefore only files whose names are the
+    same as NAME up to the first dot are moved.
     """
     together = _TOGETHER.fullmatch(folder.name)
     if together is None or folder.is_symlink() or not folder.is_dir():
@@ -187,7 +187,7 @@ def move_out(folder: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder with what is in it, as far as that is possible."""
+    """Remove a file, or a folder with its content, as far as that is possible."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -196,7 +196,7 @@ def remove(path: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk; Windows has no such thing for folders."""
+    """Wait until a file, or the names in a folder, are on the disk. For folders on Windows, do nothing."""
     is_folder = path.is_dir()
     handle = _opened(path) if is_folder else os.open(path, os.O_RDWR)
     if handle is None:
@@ -211,7 +211,7 @@ def sync(path: Path) -> None:
 
 
 def sync_all(folder: Path) -> None:
-    """`sync` for a folder and everything in it."""
+    """Call `sync` for a folder and everything in it."""
     for place, _, names in os.walk(folder):
         for name in names:
             sync(Path(place) / name)
@@ -219,14 +219,15 @@ def sync_all(folder: Path) -> None:
 
 
 def _opened(folder: Path) -> int | None:
-    """A handle of a folder that is there, where folders have such."""
+    """Return a file descriptor of a folder; None if it cannot be opened, or on Windows."""
     with suppress(OSError):
         return os.open(folder, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)) if os.name == "posix" else None
     return None
 
 
 def _lock(handle: int, alone: bool) -> bool | None:
-    """True: the folder is locked. False: there are no locks here. None: it was wanted `alone`, and is not."""
+    """Lock a folder, exclusively if `alone`. Return True if it is locked now, False if there are no locks
+    here, and None if an exclusive lock was asked for and another process holds a lock."""
     if sys.platform == "win32":
         return False
     import fcntl

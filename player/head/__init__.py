@@ -1,1 +1,1 @@
-"""The head: its one graph, the file that holds it, and how it is run."""
+"""The head: its graph, the file that holds it, and the code that runs it."""

@@ -1,8 +1,8 @@
-"""Activations and roundings of a layer's outputs, on vectors of numbers in registers. Compiled code alone
-imports this.
+"""Activations and roundings of a layer's outputs, on vectors of numbers in registers. Only compiled code
+imports this module.
 
-They are a pass of their own over numbers that are still in cache. Each takes dozens of operations that depend
-on one another, which the processor does for many vectors at once if these follow one another in a short loop.
+They run as a separate pass over numbers that are still in cache. Each takes dozens of operations that depend
+on one another; in a short loop over vectors, the processor overlaps those of many vectors.
 
     gelu(x) = x (1 + erf(x / sqrt 2)) / 2, erf by the rational function of Eigen: to 3e-7
     hard_swish(x) = x min(max(x / 6 + 1/2, 0), 1)
@@ -46,13 +46,13 @@ def _hard_swish(x: Lanes) -> Lanes:
 
 
 def _within(x: Lanes, most: float) -> Lanes:
-    """The numbers, held between -most and most; NaN stays NaN."""
+    """Clamp numbers to -most and most; NaN stays NaN."""
     x = choose(x < -most, x.like(-most), x)
     return choose(x > most, x.like(most), x)
 
 
 def _sigmoid(x: Lanes) -> Lanes:
-    """1 / (1 + exp(-x)); NaN stays NaN."""
+    """Return 1 / (1 + exp(-x)); NaN stays NaN."""
     y = (-x).most(-87).least(87)
     return choose(Lanes(x.b, x.b.fcmp_unordered("uno", x.value, x.value)), x, 1.0 / (y.exp() + 1))
 
@@ -65,9 +65,10 @@ def _polynomial(coefficients: tuple[float, ...], x: Lanes) -> Lanes:
 
 
 def _inverse(x: Lanes) -> Lanes:
-    """1 / x of ordinary numbers, in half the time of a division.
+    """Return 1 / x of ordinary numbers, in half the time of a division.
 
-    The bits give a guess that is 5 % wrong; each of three steps of Newton squares the relative error.
+    The bits give a guess that is 5 % wrong; each of three steps of Newton's method squares the relative
+    error.
     """
     bits = Lanes(x.b, x.b.bitcast(x.value, vector(INT)))
     guess = (0x7EF311C7 - bits).as_float()
@@ -91,11 +92,13 @@ def _in_place(function: Callable[[Lanes], Lanes]) -> Any:
 
 
 gelu_lanes: Any = _in_place(_gelu)
-"""gelu_lanes(memory, at): LANES numbers of `memory` [n] float32, from index `at` on, become their GELU."""
+"""gelu_lanes(memory, at): replace LANES numbers of `memory` [n] float32, from index `at` on, by their
+GELU."""
 hard_swish_lanes: Any = _in_place(_hard_swish)
-"""hard_swish_lanes(memory, at): LANES numbers of `memory`, from index `at` on, become their hard swish."""
+"""hard_swish_lanes(memory, at): replace LANES numbers of `memory`, from index `at` on, by their hard
+swish."""
 sigmoid_lanes: Any = _in_place(_sigmoid)
-"""sigmoid_lanes(memory, at): LANES numbers of `memory`, from index `at` on, become their sigmoid."""
+"""sigmoid_lanes(memory, at): replace LANES numbers of `memory`, from index `at` on, by their sigmoid."""
 
 
 def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
@@ -113,8 +116,9 @@ def _quantize(_: Any, codes: Any, memory: Any, out: Any, x: Any, zero: Any, per_
 
 
 quantize_lanes: Any = intrinsic(_quantize)
-"""quantize_lanes(codes, memory, out, x, zero, per_step): LANES numbers of `memory` from index `x` on become
-8-bit codes in `codes` [n] uint8 from index `out` on. `zero`: the code of 0; `per_step`: levels in a unit."""
+"""quantize_lanes(codes, memory, out, x, zero, per_step): write LANES numbers of `memory`, from index `x` on,
+as 8-bit codes to `codes` [n] uint8, from index `out` on. `zero`: the code of 0; `per_step`: levels per
+unit."""
 
 
 def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> Any:
@@ -131,11 +135,11 @@ def _round(_: Any, memory: Any, out: Any, x: Any, zero: Any, per_step: Any) -> A
 
 
 round_lanes: Any = intrinsic(_round)
-"""round_lanes(memory, out, x, zero, per_step): as `quantize_lanes`, but the codes less `zero` are written as
-floats, to `memory` from index `out` on."""
+"""round_lanes(memory, out, x, zero, per_step): like `quantize_lanes`, but write the codes minus `zero` as
+floats to `memory`, from index `out` on."""
 
 
 def _code(x: Lanes, zero: Any, per_step: Any) -> Lanes:
-    """The code of each number, 0 to 255, as a float."""
+    """Return the code of each number, 0 to 255, as a float."""
     shift = splat(x.b, x.b.sitofp(zero, FLOAT))
     return ((x * splat(x.b, per_step)).call("rint") + shift).most(0).least(255)

@@ -1,9 +1,10 @@
-"""A head in 8 bits, compiled by numba: the same graph that onnxruntime runs, in blocks whose numbers stay in
-cache.
+"""A head in 8 bits, compiled by numba: the same graph that onnxruntime runs, computed in blocks of pixels
+whose numbers stay in cache.
 
-A head as `exporters.head.onnx_head` writes it is a dozen small matrix products with an activation behind
-each. onnxruntime makes a pass over memory of every operation. Here all operations are done on a block of
-pixels (`player.head.dense_tiles`, `player.head.activations`), which takes four fifths of the time.
+A head as `exporters.head.onnx_head` writes it is a dozen small matrix products, each with an activation
+behind it. onnxruntime makes a pass over memory for every operation. Here all operations are done on one block
+of pixels before the next (`player.head.dense_tiles`, `player.head.activations`), which takes four fifths of
+the time of onnxruntime.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from player.scratch import check_scratch, scratch
 
 
 class CompiledHead:
-    """A head's program and what runs it; may be called from several threads at a time."""
+    """A head's program, ready to run. May be called from several threads at a time."""
 
     def __init__(self, program: Program) -> None:
         self._program = program
@@ -57,7 +58,7 @@ class CompiledHead:
         self._places = tuple(v.place for v in values), tuple(v.pitch for v in values)
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-        """Colours of pixels; arguments and result are those of `player.head.head.Head`."""
+        """Compute the colours of pixels; arguments and result are those of `player.head.head.Head`."""
         p = self._program
         n_channels = p.features.width
         assert features.shape == (len(dirs), n_channels) and dirs.shape[1:] == (3,)
@@ -111,7 +112,7 @@ def _fill(memory, at, pitch, rows, begin, n):
 
 @compiled
 def _dense(memory, weights, step, n):
-    """One layer of n pixels, tile by tile; what a tile has beyond n is written and never read."""
+    """Compute one layer for n pixels, tile by tile; what a tile has beyond n is written and never read."""
     x, x_pitch, w, start, start_pitch = step.x, step.x_pitch, step.w, step.start, step.start_pitch
     in_memory, scale, out, pitch, depth = step.starts_in_memory, step.scale, step.out, step.pitch, step.depth
     for first in range(0, pitch, WIDTH):
@@ -130,7 +131,7 @@ def _dense(memory, weights, step, n):
 
 @compiled
 def _dense_bytes(codes, memory, packed, starts, weights, step, n):
-    """One layer of n pixels whose inputs and weights are codes in bytes, tile by tile."""
+    """Compute one layer for n pixels, tile by tile, from inputs and weights that are codes in bytes."""
     x, w, start, scale, out, pitch = step.x, step.w, step.start, step.scale, step.out, step.pitch
     depth = step.depth
     tables = packed, starts, weights
@@ -170,7 +171,8 @@ def _multiply(memory, step, n):
 
 @compiled
 def _repeat(memory, step, n):
-    """Each number several times. A whole vector of it is written, whose end the next one overwrites."""
+    """Write each number several times. Whole vectors of copies are written; the next number overwrites the
+    excess."""
     x, out = step.x, step.out
     for _ in range(n):
         for i in range(step.depth):
@@ -188,8 +190,8 @@ def _add(memory, step, n):
 
 @compiled
 def _monomials(memory, pairs, step, n):
-    """The first monomial of all pixels, then the second, and so on: none is read just after it is written,
-    which would make each product wait for the one before."""
+    """Compute the first monomial for all pixels, then the second, and so on. So none is read just after it is
+    written, which would make each product wait for the one before."""
     dirs_pitch, pitch = step.x_pitch, step.pitch
     for i in range(len(pairs)):
         parent, axis, out = step.out + pairs[i, 0], step.x + pairs[i, 1], step.out + i

@@ -1,8 +1,8 @@
-"""Tiles of dense layers in registers, which `player.head.compiled` puts together.
+"""Tiles of dense layers, computed in registers. `player.head.compiled` puts them together.
 
 A tile is ROWS pixels by two vectors of LANES outputs, as much as the processor's registers hold, or by one
-where a layer ends with one; in float32, and in 8 bits where the processor multiplies bytes, which are four
-times as many a register. Compiled code alone imports this.
+vector at the end of a layer. Layers are in float32 or, where the processor multiplies bytes, in 8 bits: a
+register holds four times as many of these. Only compiled code imports this module.
 """
 
 from __future__ import annotations
@@ -32,32 +32,35 @@ from player.compiled.lanes import (
 from player.compiled.processor import multiplies_bytes, multiplies_shorts
 
 ROWS = 12 if LANES == 16 else 6
-"""Pixels of a tile. A processor has 32 registers of 16 numbers, or 16 of 8: two vectors of sums for each
-pixel leave some for inputs and weights."""
+"""Pixels of a tile. A processor has 32 registers of 16 numbers, or 16 of 8: beside the two vectors of sums
+for each pixel, some registers are left for inputs and weights."""
 WIDTH = 2 * LANES
 """Outputs of a tile of two vectors."""
 
 QUAD = 4
-"""Products of bytes that the processor adds up in one instruction."""
+"""Number of products of bytes that the processor adds up in one instruction."""
 MOST_BYTES = 256
-"""Inputs of a layer of bytes, at most, and bytes from a pixel to the next. The compiler knows this number,
-and needs no register for each row."""
+"""Most inputs of a layer in bytes, and the number of bytes from a pixel to the next. Since it is a constant,
+the compiler needs no register for the address of each row."""
 UNSCALED = -(1 << 40)
-"""A place of scales that says there are none, in every tile of a layer."""
+"""An index of scales that stands for no scales. It stays below 0 when the offset of a tile in its layer is
+added."""
 ADDS_QUADS = multiplies_bytes(QUAD * LANES)
-"""Whether the processor adds up QUAD products of bytes: Intel's do since 2019, AMD's since 2022 (VNNI)."""
+"""Whether the processor adds up QUAD products of bytes in one instruction (VNNI): Intel's do since 2019,
+AMD's since 2022."""
 ADDS_PAIRS = not ADDS_QUADS and multiplies_shorts(QUAD * LANES)
-"""Whether it adds up two at a time, in 16 bits, as all with AVX2 do: exact where the magnitudes of two
-neighbouring weights add up to `player.head.graph.PAIR_LIMIT` at most."""
+"""Whether the processor adds up two products of bytes at a time, in 16 bits, as all with AVX2 do. That is
+exact where the magnitudes of two neighbouring weights add up to `player.head.graph.PAIR_LIMIT` at most."""
 MULTIPLIES_BYTES = ADDS_QUADS or ADDS_PAIRS
 _DOT = f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
-"""The instruction that adds up QUADs by LLVM's name. Its operands are words of QUAD bytes, as LLVM had them
-up to version 21; later versions turn them into theirs."""
+"""LLVM's name of the instruction that adds up QUADs. Its operands are words of QUAD bytes, as in LLVM up to
+version 21; later versions convert them."""
 _PAIRS, _QUADS = {
     8: ("llvm.x86.avx2.pmadd.ub.sw", "llvm.x86.avx2.pmadd.wd"),
     16: ("llvm.x86.avx512.pmaddubs.w.512", "llvm.x86.avx512.pmaddw.d.512"),
 }[LANES]
-"""The instructions that multiply bytes and add up twos of them, and the same of 16 bits."""
+"""LLVM's names of the instructions that multiply bytes and add up each two neighbouring products, and that do
+the same to integers of 16 bits."""
 
 
 def _dense(n_vectors: int) -> Any:
@@ -92,22 +95,23 @@ def _dense(n_vectors: int) -> Any:
 
 
 dense_tile: Any = _dense(2)
-"""dense_tile(memory, weights, x, w, start, scale, out, depth): ROWS by WIDTH outputs of one layer.
+"""dense_tile(memory, weights, x, w, start, scale, out, depth): compute ROWS by WIDTH outputs of one layer.
 
 `memory` and `weights` are flat float32. `x`, `w` and `out` are (index of the first number, numbers from row
-to row), `w` in `weights`, the others in `memory`. `start`: the same of what the sums begin with, and whether
-that is in `memory` rather than in `weights`. `scale`: index in `weights` of WIDTH numbers that the sums are
-multiplied by, below 0 for none. `depth`: inputs of the layer.
+to row), `w` in `weights`, the others in `memory`. `start`: (index of the first number that the sums begin
+with, numbers from row to row, whether these are in `memory` rather than in `weights`). `scale`: index in
+`weights` of WIDTH numbers that the sums are multiplied by, below 0 for none. `depth`: number of inputs of the
+layer.
 
-Inputs and weights may be 8-bit codes that are floats: sums below 2^24 are then exact, as those of
+Inputs and weights may be 8-bit codes written as floats: sums below 2^24 are then exact, as those of
 `dense_bytes_tile` are.
 """
 dense_narrow_tile: Any = _dense(1)
-"""The same for ROWS by LANES outputs."""
+"""Like `dense_tile`, for ROWS by LANES outputs."""
 
 
 def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, Any], depth: Any) -> None:
-    """Add to `sums` the products of `depth` inputs of each row and their weights.
+    """Add to `sums` the products of the `depth` inputs of each row and their weights.
 
     `x` and `w` are (array, (index of the first number, numbers from row to row)).
     """
@@ -123,7 +127,8 @@ def _add_products(builder: Any, sums: _Sums, x: tuple[Any, Any], w: tuple[Any, A
 
 
 def _plus_products(total: Lanes, codes: Lanes, weights: Lanes) -> Lanes:
-    """LANES sums and what QUAD codes of bytes, unsigned, by as many weights, signed, add to each."""
+    """Return LANES sums, to each of which the products of QUAD codes (unsigned bytes) and as many weights
+    (signed bytes) are added."""
     b, lanes = total.b, vector(INT)
     if ADDS_QUADS:
         dot = cgutils.get_or_insert_function(b.module, ir.FunctionType(lanes, [lanes] * 3), _DOT)
@@ -143,7 +148,7 @@ def _dense_bytes(n_vectors: int) -> Any:
         packed, starts, scales = weights
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            if not MULTIPLIES_BYTES:  # no program has such a step; the compiler may know no such instruction
+            if not MULTIPLIES_BYTES:  # no program has this step, and the compiler may lack the instruction
                 return context.get_dummy_value()
             bytes_here, here = (address(context, builder, signature.args[n], arguments[n]) for n in (0, 1))
             parts = [builder.extract_value(arguments[2], index) for index in range(3)]
@@ -181,18 +186,18 @@ def _dense_bytes(n_vectors: int) -> Any:
 
 
 dense_bytes_tile: Any = _dense_bytes(2)
-"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): ROWS by WIDTH outputs of a layer of
-8-bit codes. It computes nothing unless MULTIPLIES_BYTES.
+"""dense_bytes_tile(codes, memory, weights, x, w, places, out, n_quads): compute ROWS by WIDTH outputs of a
+layer of 8-bit codes. It computes nothing unless MULTIPLIES_BYTES.
 
-`codes` are flat uint8, `memory` is flat float32. `weights` is (int8 codes: QUAD inputs of one output beside
-each other, LANES outputs after one another, n_quads times, and then the next LANES outputs; int32 that sums
-begin with; float32 that they are multiplied by). `x`: index of the first code of the first pixel, MOST_BYTES
-before the next pixel's. `w`: index of the tile's first code of a weight. `places`: indices of (what the sums
-begin with, what they are multiplied by). `out`: (index of the first output in `memory`, numbers from row to
-row).
+`codes` are flat uint8, `memory` is flat float32. `weights` is (int8 codes, int32 that sums begin with,
+float32 that sums are multiplied by). Its int8 codes have QUAD inputs of one output side by side, then those
+of the next output, for LANES outputs; that n_quads times; then the next LANES outputs. `x`: index of the
+first code of the first pixel; each next pixel is MOST_BYTES further on. `w`: index of the first code of the
+tile's weights. `places`: (index of what the sums begin with, index of what they are multiplied by). `out`:
+(index of the first output in `memory`, numbers from row to row).
 """
 dense_bytes_narrow_tile: Any = _dense_bytes(1)
-"""The same for ROWS by LANES outputs."""
+"""Like `dense_bytes_tile`, for ROWS by LANES outputs."""
 
 
 def _combined(combine: Callable[[Lanes, Lanes], Lanes]) -> Any:
@@ -211,12 +216,12 @@ def _combined(combine: Callable[[Lanes, Lanes], Lanes]) -> Any:
 
 
 multiply_lanes: Any = _combined(lambda a, b: a * b)
-"""multiply_lanes(memory, out, a, b): LANES numbers at `out` become the products of those at `a` and `b`.
+"""multiply_lanes(memory, out, a, b): write the products of LANES numbers at `a` and at `b` to `out`.
 
-The compiler does not do so by itself: it cannot know that the three do not overlap.
+The compiler does not vectorise this by itself: it cannot know that the three do not overlap.
 """
 add_lanes: Any = _combined(lambda a, b: a + b)
-"""The same with sums."""
+"""add_lanes(memory, out, a, b): the same with sums."""
 
 
 def _repeat(_: Any, memory: Any, out: Any, x: Any) -> Any:
@@ -230,11 +235,11 @@ def _repeat(_: Any, memory: Any, out: Any, x: Any) -> Any:
 
 
 repeat_lanes: Any = intrinsic(_repeat)
-"""repeat_lanes(memory, out, x): LANES numbers at `out` become the one at `x`."""
+"""repeat_lanes(memory, out, x): write the number at `x` to LANES places from `out` on."""
 
 
 class _Sums:
-    """ROWS by some vectors of sums, which a loop adds to."""
+    """The sums of a tile, ROWS by some vectors, which a loop adds to."""
 
     def __init__(self, builder: Any, element: Any, n_vectors: int) -> None:
         self.n_vectors = n_vectors
@@ -250,7 +255,7 @@ class _Sums:
         self._builder.store(value.value, self._places[row][number])
 
     def write(self, array: Any, out: tuple[Any, Any], scales: list[Lanes] | None = None) -> None:
-        """Write the sums to `array`, a row at a time, multiplied by the `scales` of a row's vectors.
+        """Write the sums to `array` row by row, multiplied by `scales`, one for each of a row's vectors.
 
         `out`: (index of the first number, numbers from row to row).
         """
@@ -268,10 +273,10 @@ def _pair(builder: Any, pair: Any) -> tuple[Any, Any]:
 
 
 def _scales(builder: Any, array: Any, at: Any, n_vectors: int) -> list[Lanes]:
-    """Vectors of numbers from the index `at` on."""
+    """Load vectors of numbers from the index `at` on."""
     return [load(builder, array, builder.add(at, LONG(number * LANES))) for number in range(n_vectors)]
 
 
 def _rows(builder: Any, array: Any, at: Any, pitch: Any) -> list[Any]:
-    """Addresses of ROWS rows, the first at the index `at`."""
+    """Return the addresses of ROWS rows, the first at the index `at`."""
     return [builder.gep(array, [builder.add(at, builder.mul(pitch, LONG(row)))]) for row in range(ROWS)]

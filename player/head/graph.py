@@ -1,25 +1,25 @@
-"""The one graph that a head has: its nodes, written by `exporters.head.onnx_head` and recognised here as a
-whole.
+"""The only graph that a head can have: its nodes, which `exporters.head.onnx_head` writes, and the reader
+that checks a file against them.
 
-With F the composited `features` of a pixel and d its unit direction (row vectors, y = x @ W + b):
+For a pixel with composited `features` F and unit direction d (row vectors, y = x @ W + b):
     h   = a(... a(F S0 + s0) ...)                            spatial layers
     e   = (h Wf + bf) * (m(d) C + c)                         spherical-harmonics encoding
     z   = a(h D_bottleneck + e D_sh + d0)                    first directional layer
     rgb = sigmoid(a(... a(z D1 + d1) ...) W + b)             more directional layers, output
 The activation a is gelu(x) = x (1 + erf(x / sqrt 2)) / 2, in its exact form, or hard_swish(x) = x min(max(x /
 6 + 1/2, 0), 1), which takes a seventh of the operations; it is the same in all layers of a head. m(d) are the
-monomials of x, y and z up to the order sh_degree - 1, without the constant, each a product of one of the
-order below and x, y or z; C and c are the coefficients of the spherical harmonics, each column as often as a
-basis has features.
+monomials of x, y and z up to the order sh_degree - 1, without the constant; each is the product of a monomial
+of the order below and x, y or z. C and c are the coefficients of the spherical harmonics; the column of a
+basis function is repeated for each feature that the function multiplies.
 
 In 8 bits, h, e and every z but the last are rounded to 256 levels, and the layers that take them multiply
 codes; in older heads e is not rounded. With q the codes of x, q = clip(rint(x / x_scale) + zero, 0, 255), and
-Q those of W,
+Q the codes of W,
     y = ((q - zero) Q + codes of b) * scale
-in integers. The `scale` [n_out] of an output is x_scale times that of its weights.
+in integers. The `scale` [n_out] of an output is x_scale times the scale of its weights.
 
-A player need not understand any other graph. What is compiled writes as many numbers as the sizes of these
-arrays say, and `read_head` is where they are checked.
+A player need not understand any other graph. Compiled code relies on the sizes of these arrays when it writes
+to memory; `read_head` checks them.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ MAX_WIDTH = 4096
 LARGEST_SUM = 2**31 - 1
 """Largest sum of products of codes: it is kept in an int32."""
 PAIR_LIMIT = 128
-"""Largest sum of the magnitudes of two neighbouring codes of weights, 2i and 2i + 1, of an output. Where a
-processor adds up two products at a time in 16 bits, 255 times as much still fits."""
+"""Largest sum of the magnitudes of two neighbouring weight codes, 2i and 2i + 1, of an output. Some
+processors add up two products at a time in 16 bits: 255 times this sum still fits."""
 
 Activation = Literal["gelu", "hard_swish"]
 
 
 @dataclass(frozen=True)
 class HeadForm:
-    """The nodes that a head's graph has: everything but the widths of its layers."""
+    """The parameters that determine the nodes of a head's graph: everything but the widths of its layers."""
 
     n_spatial: int
     n_directional: int
-    """Directional layers after the first."""
+    """Number of directional layers after the first."""
     sh_degree: int
-    """Bands of spherical harmonics."""
+    """Number of bands of spherical harmonics."""
     in_8_bits: bool
     activation: Activation
     rounds_encoded: bool
@@ -71,11 +71,11 @@ class Layer(NamedTuple):
     bias: np.ndarray
     """[n_out] float32, or int32 codes."""
     scale: np.ndarray | None = None
-    """[n_out] float32 that a sum of products of codes is multiplied by; None in float32."""
+    """[n_out] float32, the factors of the sums of products of codes; None in float32."""
 
 
 class Rounding(NamedTuple):
-    """How an activation is rounded to 8 bits."""
+    """The rounding of an activation to 8 bits."""
 
     scale: np.float32
     """Step from one level to the next."""
@@ -85,12 +85,12 @@ class Rounding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeadArrays:
-    """A head's numbers, checked: widths fit, and every number is finite."""
+    """A head's numbers, checked: the widths of its layers fit, and every number is finite."""
 
     form: HeadForm
     spatial: list[Layer]
     roundings: list[Rounding]
-    """Roundings of h, and of each z that another directional layer takes; none in float32."""
+    """Roundings of h, and of each z that another directional layer takes; empty in float32."""
     of_encoded: Rounding | None
     """Rounding of e, if it is rounded."""
     to_sh: Layer
@@ -103,23 +103,23 @@ class HeadArrays:
     directional: list[Layer]
     output: Layer
     n_parameters: int
-    """Numbers in all constants."""
+    """Count of the numbers in all constants."""
 
     @property
     def n_channels(self) -> int:
-        """Composited features that the head takes."""
+        """Number of composited features that the head takes."""
         return self.spatial[0].weight.shape[0]
 
     @property
     def may_saturate(self) -> bool:
-        """Whether sums of two products of codes may exceed 16 bits, which assets have that were written
-        before `PAIR_LIMIT` was kept."""
+        """Whether sums of two products of codes may exceed 16 bits. They may in assets that were written
+        before `PAIR_LIMIT` was introduced."""
         layers = [self.to_sh, self.bottleneck, self.from_sh, *self.directional]
         return any(pair_sums(a.weight).max(initial=0) > PAIR_LIMIT for a in layers if a.scale is not None)
 
 
 def pair_sums(weight: np.ndarray) -> np.ndarray:
-    """Sums of the magnitudes of the rows 2i and 2i + 1 of each column: [ceil(n_in / 2), n_out].
+    """Return the sums of the magnitudes of the rows 2i and 2i + 1 in each column: [ceil(n_in / 2), n_out].
 
     >>> pair_sums(np.array([[1, -128], [-3, 100], [5, 0]], np.int8)).tolist()
     [[4, 228], [5, 0]]
@@ -129,10 +129,10 @@ def pair_sums(weight: np.ndarray) -> np.ndarray:
 
 
 def monomials(order: int) -> tuple[list[tuple[int, int, int]], list[int], list[int]]:
-    """The monomials of one order.
+    """List the monomials of one order.
 
-    Returns, for each of them: its powers of x, y and z; the monomial of the order below, by its place there,
-    and the axis, 0 to 2, that it is the product of.
+    Returns for each monomial: its powers of x, y and z; and the two factors whose product it is, a monomial
+    of the order below (as its index there) and an axis, 0 to 2.
 
     >>> monomials(1)[0]
     [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
@@ -155,7 +155,7 @@ def monomials(order: int) -> tuple[list[tuple[int, int, int]], list[int], list[i
 
 
 def head_nodes(form: HeadForm) -> list[Node]:
-    """The nodes of a head, in the file's order."""
+    """Return the nodes of a head, in the file's order."""
     nodes: list[Node] = []
     rounded: set[str] = set()
 
@@ -209,7 +209,7 @@ def head_nodes(form: HeadForm) -> list[Node]:
     e = add("Mul", [f, harmonics()], "sh_encoded")
     z = dense("directional_0_bottleneck", h)
     e = in_codes(e, form.rounds_encoded)
-    if e in rounded:  # runtimes multiply codes where no sum in float32 is added
+    if e in rounded:  # runtimes multiply codes only where no float32 sum is added
         codes = [f"directional_0_sh_weight_{kind}" for kind in ("codes", "scale", "zero")]
         weight = add("DequantizeLinear", codes, "directional_0_sh_weight", axis=1)
         z = add("Add", [z, add("Gemm", [e, weight], "directional_0_sh")], "directional_0_linear")
@@ -223,16 +223,16 @@ def head_nodes(form: HeadForm) -> list[Node]:
 
 
 def head_ports(n_channels: int) -> tuple[list[Port], list[Port]]:
-    """Inputs and outputs of a head's graph."""
+    """Return the inputs and outputs of a head's graph."""
     return [Port("features", n_channels), Port("dirs", 3)], [Port("rgb", 3)]
 
 
 def read_head(data: bytes, where: str) -> HeadArrays:
-    """The numbers of a head that is an ONNX file.
+    """Read the numbers of a head from an ONNX file.
 
     Args:
         data: the file's bytes.
-        where: what to call the file in messages.
+        where: the name of the file for error messages.
 
     Raises:
         FormatError: the file holds anything but the graph of a head.
@@ -242,7 +242,7 @@ def read_head(data: bytes, where: str) -> HeadArrays:
 
 
 class _Reader:
-    """Takes the constants of a graph one by one, and looks that none is left."""
+    """Reader that takes the constants of a graph one by one, and checks that none is left."""
 
     def __init__(self, graph: Graph, where: str) -> None:
         self._graph, self._where = graph, where
@@ -291,7 +291,7 @@ class _Reader:
         )  # fmt: skip
 
     def _form(self) -> HeadForm:
-        """The form that the names of the constants tell, if the nodes are that form's."""
+        """Infer the form from the names of the constants, and check that the nodes are those of that form."""
         graph, names = self._graph, self._left
 
         def count(name: str, first: int, most: int) -> int:
@@ -315,7 +315,7 @@ class _Reader:
         return form
 
     def _take(self, name: str, kind: type, *shape: int | None) -> np.ndarray:
-        """A constant of a type and shape, None for any width."""
+        """Take a constant, and check its type and shape; None in `shape` allows any width."""
         array = self._left.pop(name, None)
         if array is None:
             raise self._wrong(name, "this constant", "none")
@@ -361,7 +361,7 @@ class _Reader:
     def _codes(
         self, name: str, n_in: int, n_out: int | None, rounding: Rounding
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A layer's codes of weights, and the scale of their products."""
+        """Take the codes of a layer's weights, and the scale of their products with input codes."""
         weight = self._take(f"{name}_weight_codes", np.int8, n_in, n_out)
         scale = self._scales(f"{name}_weight_scale", weight.shape[1])
         self._zeros(f"{name}_weight_zero", np.int8, weight.shape[1])
@@ -373,7 +373,7 @@ class _Reader:
             raise self._wrong(name, "zeros", "others")
 
     def _fitting(self, name: str, layer: Layer) -> Layer:
-        """The layer, if its sums of products fit into 32 bits."""
+        """Return the layer if its sums of products fit into 32 bits, else raise FormatError."""
         codes = np.abs(layer.weight.astype(np.int64)).sum(axis=0)
         if (np.abs(layer.bias.astype(np.int64)) + 255 * codes > LARGEST_SUM).any():
             raise self._wrong(name, "sums of products that fit into 32 bits", "larger ones")

@@ -1,7 +1,7 @@
-"""The head: from the composited features of a pixel and its direction to its colour, by compiled code or
-onnxruntime.
+"""The head: turns the composited features of a pixel and its direction into the pixel's colour, by compiled
+code or by onnxruntime.
 
-Either is imported when a head is opened that needs it, so that `vfr-play --help` answers at once.
+Each of these is imported only when a head that needs it is opened, so that `vfr-play --help` answers at once.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from player.files.files import read_bytes
 from player.head.graph import HeadArrays, read_head
 
 CHUNK = 2048
-"""Pixels a run: the activations of a 256 wide layer (2 MB) stay in the second-level cache, 25-45 % faster
-than at once."""
+"""Pixels per run: the activations of a layer of width 256 (2 MB) then stay in the second-level cache, which
+is 25-45 % faster than running all pixels at once."""
 
 Run = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -26,8 +26,8 @@ Run = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class Head:
     """An open head; may be called from several threads at a time.
 
-    Each call runs on its caller's thread: the player works on many tiles at once, so one thread a run
-    wastes none.
+    Each call runs on its caller's thread alone: the player works on many tiles at once, so that no core is
+    idle.
     """
 
     def __init__(self, path: Path, n_channels: int, compiled: bool = False) -> None:
@@ -35,9 +35,9 @@ class Head:
 
         Args:
             path: the file of the head.
-            n_channels: features of a pixel.
-            compiled: numba runs the head if it is in 8 bits (`player.head.compiled`). onnxruntime runs any
-                other, and a head in float32 faster.
+            n_channels: number of features of a pixel.
+            compiled: let numba run the head if it is in 8 bits (`player.head.compiled`). onnxruntime runs a
+                head in float32, faster than numba would.
 
         Raises:
             FormatError: as `read_head_file`.
@@ -47,7 +47,7 @@ class Head:
         self._run = _compile(arrays) if compiled and arrays.form.in_8_bits else _open_session(data, arrays)
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-        """Colours of n pixels.
+        """Compute the colours of n pixels.
 
         Args:
             features: [n, n_channels] float32 composited features.
@@ -57,7 +57,7 @@ class Head:
             rgb: [n, 3] float32, 0..1, in the manifest's colour space.
 
         Raises:
-            FormatError: a colour is not finite: weights are so large that float32 does not hold a sum.
+            FormatError: a colour is not finite, because weights are so large that a sum overflows float32.
         """
         rgb = np.empty((len(features), 3), np.float32)
         for start in range(0, len(features), CHUNK):
@@ -69,7 +69,7 @@ class Head:
 
 
 def read_head_file(path: Path, n_channels: int) -> tuple[bytes, HeadArrays]:
-    """An asset's head, as bytes and as checked numbers.
+    """Read an asset's head, as bytes and as checked numbers.
 
     Raises:
         FormatError: the file is not the graph of a head that takes `n_channels` features.
@@ -96,7 +96,7 @@ def _open_session(data: bytes, arrays: HeadArrays) -> Run:
     options.inter_op_num_threads = 1
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    if arrays.may_saturate:  # products of bytes that fit into 16 bits on every processor, more slowly
+    if arrays.may_saturate:  # slower products of bytes, which fit into 16 bits on every processor
         options.add_session_config_entry("session.x64quantprecision", "1")
     options.log_severity_level = 3
     session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])

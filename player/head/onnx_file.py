@@ -1,8 +1,8 @@
-"""An ONNX file as a graph of nodes and constants, read without the packages onnx and protobuf.
+"""Reader of ONNX files as graphs of nodes and constants, without the packages onnx and protobuf.
 
-Only what a head of ours holds is read, and anything else is refused: a field that no head has, a field that
-comes twice where the format counts it once, a constant whose bytes are not as many as its shape says. So
-there is one way to understand a file, and onnxruntime, which is given the same bytes, understands it in the
+Only what heads of this project hold is read. Anything else is refused: a field that no head has, a field that
+occurs twice where the format allows it once, a constant whose number of bytes does not match its shape. So a
+file can be understood in only one way, and onnxruntime, which is given the same bytes, understands it in the
 same way. Field numbers are those of onnx.proto.
 """
 
@@ -17,12 +17,13 @@ import numpy as np
 from player.errors import FormatError
 
 FLOAT, UINT8, INT8, INT32 = 1, 2, 3, 6
-"""TensorProto's numbers of the types that are read."""
+"""TensorProto's numbers for the data types that are read."""
 _TYPES = {FLOAT: "<f4", UINT8: "u1", INT8: "i1", INT32: "<i4"}
 
 
 class _Field(NamedTuple):
-    """One field of a message: `kind` is int, bytes, str, or the fields of a message of its own by number."""
+    """One field of a protobuf message. `kind` is int, bytes, str or, for a nested message, a dict of its
+    fields by number."""
 
     name: str
     kind: Any
@@ -72,7 +73,7 @@ class Node(NamedTuple):
     inputs: tuple[str, ...]
     output: str
     attributes: dict[str, Any]
-    """Integers and texts by name."""
+    """Integers and strings by name."""
 
 
 class Port(NamedTuple):
@@ -84,7 +85,7 @@ class Port(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Nodes in the file's order, constants by name, inputs and outputs."""
+    """A graph: nodes in the file's order, constants by name, inputs and outputs."""
 
     nodes: list[Node]
     constants: dict[str, np.ndarray]
@@ -95,14 +96,14 @@ class Graph:
 
 
 def read_graph(data: bytes, where: str) -> Graph:
-    """The graph of an ONNX file.
+    """Read the graph of an ONNX file.
 
     Args:
         data: the file's bytes.
-        where: what to call the file in messages.
+        where: the name of the file for error messages.
 
     Raises:
-        FormatError: the bytes are no ONNX file, or one that holds what no head of ours does.
+        FormatError: the bytes are no ONNX file, or hold something that no head of this project does.
     """
     model = _message(data, _MODEL, where)
     graph = model.get("graph", _message(b"", _GRAPH, where))
@@ -162,7 +163,8 @@ def _port(message: dict[str, Any], where: str) -> Port:
 
 
 def _message(data: bytes, fields: dict[int, _Field], where: str) -> dict[str, Any]:
-    """The fields of a protobuf message by name: repeated ones as lists, others where they are there."""
+    """Decode the fields of a protobuf message by name: repeated fields as lists, the others if they are
+    present."""
     values: dict[str, Any] = {field.name: [] for field in fields.values() if field.repeated}
     at = 0
     while at < len(data):
@@ -199,8 +201,8 @@ def _content(piece: bytes, kind: Any, where: str) -> Any:
 
 
 def _varint(data: bytes, at: int, where: str) -> tuple[int, int]:
-    """An integer of at most 64 bits, seven in a byte, and where it ends. It has to be as short as it can be:
-    protobuf reads a length of at most five bytes, whatever it says."""
+    """Read an integer of at most 64 bits, seven in a byte; returns it and the index behind it. Its encoding
+    must be the shortest: protobuf reads at most five bytes for a length, whatever they say."""
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(data):

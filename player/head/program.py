@@ -1,10 +1,11 @@
-"""From the numbers of a head in 8 bits to a program: the instructions that `player.head.compiled` runs.
+"""Compiler from the numbers of a head in 8 bits to a program: the instructions that `player.head.compiled`
+runs.
 
-Every value of the head is a table in memory of BLOCK pixels by its width, padded to whole vectors. All places
-and sizes follow from the widths that `player.head.graph` has checked. What is rounded to 8 bits is kept in
-bytes where the processor multiplies those (`player.head.dense_tiles`). Elsewhere codes are kept as floats:
-sums of their products are the same integers, added up more slowly. So are those of a head whose weights are
-so large that two products do not fit into 16 bits, where the processor adds them up so.
+Every value of the head is a table in memory: BLOCK pixels by its width, padded to whole vectors. All indices
+and sizes follow from the widths that `player.head.graph` has checked. Values that are rounded to 8 bits are
+kept in bytes where the processor multiplies bytes (`player.head.dense_tiles`). Elsewhere their codes are kept
+as floats: sums of products are then the same integers, added up more slowly. Codes are also kept as floats
+where the processor adds up two products in 16 bits, and the weights are so large that these do not fit.
 """
 
 from __future__ import annotations
@@ -20,83 +21,89 @@ from player.head.dense_tiles import ADDS_PAIRS, LANES, MOST_BYTES, MULTIPLIES_BY
 from player.head.graph import PAIR_LIMIT, HeadArrays, Layer, Rounding, monomials, pair_sums
 
 BLOCK = 4 * ROWS
-"""Pixels at a time: all the numbers of a 64 wide head are then 150 kB."""
+"""Pixels that are processed at a time: all the numbers of a head of width 64 then take 150 kB."""
 DENSE, DENSE_BYTES, MULTIPLY, ADD, REPEAT, MONOMIALS, QUANTIZE, ROUND = range(8)
-"""Kinds of steps."""
+"""The kinds of steps."""
 
 
 class Value(NamedTuple):
     """A table of BLOCK pixels in memory."""
 
     place: int
-    """Index of its first number."""
+    """Index of the table's first number."""
     pitch: int
     """Numbers from a pixel to the next."""
     width: int
-    """Numbers of a pixel that count; the others are padding."""
+    """Numbers of a pixel that are used; the others, up to `pitch`, are padding."""
     in_bytes: bool = False
-    """Whether it is among the bytes, not the floats."""
+    """Whether the table is in the memory of bytes, not in that of floats."""
 
 
 class Step(NamedTuple):
-    """One instruction: from the table at `x` to the table at `out`. Places are indices of first numbers."""
+    """One instruction, which reads the table at `x` and writes the table at `out`. Places are indices of
+    first numbers."""
 
     kind: int
     x: int = 0
     x_pitch: int = 0
     depth: int = 0
-    """DENSE: inputs of the layer. DENSE_BYTES: QUADs of inputs. REPEAT: numbers of a pixel."""
+    """DENSE: number of inputs of the layer. DENSE_BYTES: number of QUADs of inputs. REPEAT: numbers of a
+    pixel."""
     w: int = 0
     """Place of the layer's weights."""
     copies: int = 1
-    """REPEAT: how often each number is written."""
+    """REPEAT: number of times that each number is written."""
     start: int = 0
-    """Place of what the layer's sums begin with."""
+    """Place of the numbers that the layer's sums begin with."""
     start_pitch: int = 0
-    """Numbers from that of a pixel to that of the next; 0 where all pixels begin alike."""
+    """Distance, in numbers, between what the sums of neighbouring pixels begin with; 0 if all begin with the
+    same numbers."""
     starts_in_memory: int = 0
-    """1 where the sums begin with a table in memory, 0 where with a bias among the weights."""
+    """1 if the sums begin with a table in memory, 0 if they begin with a bias among the weights."""
     scale: int = 0
-    """Place of what the layer's sums are multiplied by, or UNSCALED. QUANTIZE, ROUND: of levels in a unit."""
+    """Place of the factors of the layer's sums, or UNSCALED. QUANTIZE, ROUND: place of the number of levels
+    per unit."""
     zero: int = 0
     """QUANTIZE, ROUND: the code of 0."""
     out: int = 0
-    """MULTIPLY, ADD: place of the table that `x` is multiplied with or added to. MULTIPLY: rows of `x` may be
-    shorter, and begin again."""
+    """Place of the result. MULTIPLY, ADD: the table there is multiplied by `x`, or `x` is added to it.
+    MULTIPLY: rows of `x` may be shorter than those of the table; they are then repeated."""
     pitch: int = 0
     activation: int = LINEAR
 
 
 STEP = np.dtype([(name, np.int64) for name in Step._fields])
-"""A `Step` as compiled code reads it."""
+"""The dtype of a `Step` for compiled code."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """Instructions, what they read, and where the head's inputs and its output are in memory."""
+    """Instructions, the constants that they read, and the places of the head's inputs and output in
+    memory."""
 
     steps: np.ndarray
     """[n_steps] STEP."""
     weights: np.ndarray
     """[n] float32 weights, biases and scales."""
     packed: np.ndarray
-    """[n] int8 weights as `dense_bytes_tile` takes them."""
+    """[n] int8 weights, in the order in which `dense_bytes_tile` takes them."""
     starts: np.ndarray
-    """[n] int32 that the sums of `dense_bytes_tile` begin with."""
+    """[n] int32, the numbers that the sums of `dense_bytes_tile` begin with."""
     pairs: np.ndarray
-    """[n_monomials, 2] int64: the monomial, -1 for 1, and the axis, 0 to 2, that each is the product of."""
+    """[n_monomials, 2] int64: the two factors of each monomial, an earlier monomial (-1 for 1) and an axis, 0
+    to 2."""
     n_floats: int
-    """Numbers of memory that the tables in floats take."""
+    """Numbers that all tables in floats take."""
     n_bytes: int
-    """Bytes that the tables in bytes take."""
+    """Bytes that all tables in bytes take."""
     features: Value
     dirs: Value
     rgb: Value
-    """Whose sigmoid is the colour."""
+    """The table whose sigmoid is the colour."""
 
 
 def program_of(head: HeadArrays, in_bytes: bool = MULTIPLIES_BYTES) -> Program:
-    """The program of a head in 8 bits. `in_bytes`: whether the processor multiplies bytes."""
+    """Compile the program of a head in 8 bits. `in_bytes`: whether the processor multiplies bytes."""
     return _Compiler(head, in_bytes and not (ADDS_PAIRS and head.may_saturate)).program()
 
 
@@ -146,7 +153,7 @@ class _Compiler:
         return value
 
     def _dense(self, x: Value, layer: Layer, activation: int = LINEAR, start: Value | None = None) -> Value:
-        """A layer of `x` in float32; its sums begin with the bias, or with the rows of `start`."""
+        """Add a layer of `x` in float32. Its sums begin with the bias, or with the rows of `start`."""
         width = layer.weight.shape[1]
         out = self._floats(width)
         self._steps.append(Step(
@@ -158,8 +165,8 @@ class _Compiler:
         return out
 
     def _dense_rounded(self, x: Value, layer: Layer, rounding: Rounding, activation: int = LINEAR) -> Value:
-        """A layer of the codes `x`. The code of 0 has been taken off codes in floats; sums of codes in bytes
-        begin without what it adds to them."""
+        """Add a layer of the codes `x`. Codes in floats are stored minus the code of 0. With codes in bytes,
+        the sums begin with the bias minus what the code of 0 adds to them."""
         codes, bias, width = layer.weight, layer.bias, layer.weight.shape[1]
         assert layer.scale is not None
         out, scale = self._floats(width), self._weights.add(layer.scale[None])
@@ -183,8 +190,8 @@ class _Compiler:
         return out
 
     def _add_encoded(self, z: Value, encoded: Value, order: np.ndarray) -> Value:
-        """The first directional layer: the activation of z and what comes of the encoded features, which lie
-        in an `order`."""
+        """Add the first directional layer, up to its activation: `z` holds what comes of h; what comes of the
+        encoded features, which are in an `order`, is added."""
         head, layer = self._head, self._head.from_sh
         layer = layer._replace(weight=layer.weight[order])
         if head.of_encoded is None:
@@ -196,13 +203,14 @@ class _Compiler:
         return z
 
     def _fits(self, order: np.ndarray) -> bool:
-        """Whether the encoded features may be multiplied in an `order`, which makes others neighbours."""
+        """Return whether the encoded features may be multiplied in an `order`: it makes other weights
+        neighbours, whose sums of magnitudes must not exceed PAIR_LIMIT where the processor adds up pairs."""
         layer = self._head.from_sh
         pairs_count = self._in_bytes and ADDS_PAIRS and layer.scale is not None
         return not pairs_count or pair_sums(layer.weight[order]).max(initial=0) <= PAIR_LIMIT
 
     def _harmonics(self, dirs: Value, layer: Layer, copies: int) -> Value:
-        """The spherical harmonics of directions, each so often."""
+        """Add the spherical harmonics of directions, each repeated `copies` times."""
         terms = self._floats(len(layer.weight))
         self._steps.append(
             Step(MONOMIALS, x=dirs.place, x_pitch=dirs.pitch, out=terms.place, pitch=terms.pitch)
@@ -211,7 +219,7 @@ class _Compiler:
         if copies == 1:
             return sh
         out = self._floats(copies * sh.width)
-        self._n_floats += _padded(copies)  # whole vectors are written, beyond the last number too
+        self._n_floats += _padded(copies)  # the last whole vector may reach beyond the last number
         self._steps.append(Step(
             REPEAT, x=sh.place, x_pitch=sh.pitch, depth=sh.width, copies=copies, out=out.place,
             pitch=out.pitch,
@@ -219,7 +227,7 @@ class _Compiler:
         return out
 
     def _rounded(self, x: Value, rounding: Rounding) -> Value:
-        """`x` as codes: in bytes, or in floats from which the code of 0 is taken off."""
+        """Add the rounding of `x` to codes: in bytes, or in floats minus the code of 0."""
         if self._in_bytes and x.width <= MOST_BYTES:
             out = Value(self._n_bytes, MOST_BYTES, x.width, in_bytes=True)
             self._n_bytes += BLOCK * MOST_BYTES
@@ -234,12 +242,13 @@ class _Compiler:
 
 
 def _orders(harmonics: Layer) -> Iterator[tuple[np.ndarray, Layer, int]]:
-    """Orders of the encoded features, the fastest first, each with the harmonics that they are multiplied by
-    and how often each of these is to be repeated for that.
+    """Yield orders of the encoded features, the fastest first. With each come the harmonics that the features
+    are multiplied by, and how often each harmonic is to be repeated for that.
 
-    Each harmonic is found once if all have as many features. Where they fill whole vectors, those of the
-    features can be all of them again and again. Else the features of a harmonic are beside one another. Last,
-    each feature has its own, in the order of the file.
+    If all harmonics have the same number of features, each harmonic is computed only once. If the harmonics
+    then fill whole vectors, the first order puts one feature of every harmonic after another, so that the row
+    of harmonics is simply used again and again. The next order puts the features of a harmonic side by side.
+    The last is the order of the file, in which each feature has a harmonic of its own.
     """
     columns = np.vstack([harmonics.bias, harmonics.weight])
     distinct, which = np.unique(columns, axis=1, return_inverse=True)
@@ -255,14 +264,15 @@ def _orders(harmonics: Layer) -> Iterator[tuple[np.ndarray, Layer, int]]:
 
 
 def _pairs(order: int) -> list[tuple[int, int]]:
-    """The monomial, by its place among all from order 1 on, and the axis that each of an order multiplies."""
+    """Return, for each monomial of an order, its two factors: an earlier monomial, as its index among all
+    from order 1 on (-1 for 1), and an axis."""
     _, parents, axes = monomials(order)
     below = sum(k * (k + 1) // 2 for k in range(2, order))  # monomials of the orders before the one below
     return [(below + parent if order > 1 else -1, axis) for parent, axis in zip(parents, axes, strict=True)]
 
 
 class _Constants:
-    """Tables of one type after one another, their rows padded with zeros to whole vectors."""
+    """Tables of one type, stored one after the other, with rows padded with zeros to whole vectors."""
 
     def __init__(self, kind: Any) -> None:
         self._kind = kind
@@ -270,7 +280,7 @@ class _Constants:
         self._size = 0
 
     def add(self, rows: np.ndarray) -> int:
-        """Append the rows [n_rows, width]; returns the place of the first number."""
+        """Append the rows [n_rows, width]; returns the index of the first number."""
         padded = np.zeros((len(rows), _padded(rows.shape[1])), self._kind)
         padded[:, : rows.shape[1]] = rows
         self._parts.append(padded.reshape(-1))

@@ -1,5 +1,5 @@
-"""Whether what compiled heads are made of computes what numpy does: tiles of layers in float32 and in 8 bits,
-activations, roundings. `player.proof` asks; compiled code alone imports this."""
+"""Check that the parts of compiled heads compute what numpy does: tiles of layers in float32 and in 8 bits,
+activations, roundings. `player.proof` calls it. Only compiled code imports this module."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from player.head.graph import PAIR_LIMIT
 
 F32 = np.float32
 DEPTH = 24
-"""Inputs of the layer."""
+"""Number of inputs of the layer that is checked."""
 
 
 def wrong() -> str | None:
-    """What is wrong, in words; None if nothing is."""
+    """Describe in words what is wrong; None if nothing is."""
     numbers = np.random.default_rng(0)
     x = numbers.uniform(-1, 1, (ROWS, DEPTH)).astype(F32)
     w = numbers.uniform(-1, 1, (DEPTH, WIDTH)).astype(F32)
@@ -73,7 +73,7 @@ def _wrong_bytes(numbers: np.random.Generator) -> str | None:
 
 @compiled
 def _floats(memory, weights, depth):
-    """A layer by a wide tile, and behind it once more by narrow ones."""
+    """Compute a layer by a wide tile and, behind it in memory, once more by narrow tiles."""
     x, scales, wide = (0, depth), (depth + 1) * WIDTH, ROWS * depth
     narrow = wide + ROWS * WIDTH
     dense_tile(memory, weights, x, (0, WIDTH), (depth * WIDTH, 0, 0), scales, (wide, WIDTH), depth)
@@ -94,7 +94,7 @@ def _follow(gelu, swish, sigmoid, codes, x, per_step):
 
 @compiled
 def _bytes(codes, memory, packed, starts, scales, n_quads):
-    """A layer by a wide tile, and behind it once more by narrow ones."""
+    """Compute a layer by a wide tile and, behind it in memory, once more by narrow tiles."""
     tables, narrow = (packed, starts, scales), ROWS * WIDTH
     dense_bytes_tile(codes, memory, tables, 0, 0, (0, 0), (0, WIDTH), n_quads)
     for i in range(0, WIDTH, LANES):

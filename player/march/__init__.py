@@ -1,1 +1,1 @@
-"""The march of a ray, in numpy: the specification, and what runs where numba is not installed."""
+"""Ray marching in numpy: the specification, and what runs where numba is not installed."""

@@ -1,9 +1,9 @@
-"""Which pixels of a picture can meet a live cell at all, and between which distances.
+"""Bounds for each block of pixels: whether its rays can meet a live cell at all, and between which distances.
 
-The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick in which rays look is projected; a block
-keeps the least and the greatest distance of the bricks whose projection touches it. Rays of a block without
-bricks are never made, the others start at the near bound. The bounds are conservative, so that pictures do
-not depend on them.
+The picture is cut into blocks of BLOCK x BLOCK pixels. Every brick in which rays look for live cells is
+projected into the picture. A block keeps the least and the greatest distance of the bricks whose projections
+touch it. No rays are made for a block without bricks; all other rays start at their block's near bound. The
+bounds are conservative, so that pictures do not depend on them.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ MARGIN_PX = 0.01
 
 
 class Bricks(NamedTuple):
-    """n bricks of one size as a camera sees them: its x is right, its y up, and it looks along -z."""
+    """n bricks of one size in camera coordinates: x points right, y up, and the camera looks along -z."""
 
     firsts: np.ndarray
-    """[n, 3] float64, the lowest corner of each, model units."""
+    """[n, 3] float64, the lowest corner of each brick."""
     steps: np.ndarray
-    """[3, 3] float64: what a brick is along the x, y and z of the grid."""
+    """[3, 3] float64: the edges of a brick along the x, y and z axes of the grid, one edge a row."""
     units: tuple[float, float]
-    """Model units in a unit of the camera's, along the direction that has the fewest and along that with the
-    most: 1 but for what a camera's turn, which is checked to a thousandth, is off."""
+    """Model units per unit of camera coordinates, along the direction with the fewest and along that with the
+    most. Both are 1 but for the error of the camera's rotation, which is checked to a thousandth."""
 
 
 def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
-    """The bricks in which rays look for live cells; the camera is in the model frame."""
+    """Return the bricks in which rays look for live cells, as `camera` sees them; it is in the model
+    frame."""
     edge = BRICK / grid.cells_per_unit.astype(np.float64)
     w2c = np.linalg.inv(camera.c2w)
     steps = (w2c[:3, :3] * edge).T
@@ -46,15 +47,15 @@ def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
 
 
 def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of t for each block of the picture.
+    """Find bounds of t for the rays of each block of the picture.
 
     Args:
         grid: the sparse grid.
         camera: in the model frame.
 
     Returns:
-        near: [rows, columns] float32, model units; inf where no brick projects.
-        far: [rows, columns] float32, -inf there.
+        near: [rows, columns] float32, model units; inf for a block that no brick projects into.
+        far: [rows, columns] float32, model units; -inf for such a block.
     """
     shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
     near, far = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
@@ -66,7 +67,7 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     depths = -(first[:, 2] + corners[:, 2, None])  # [8, n]
     ahead, behind = (depths > 1e-6 * radius).all(axis=0), (depths < 0).all(axis=0)
     around = np.flatnonzero(~ahead & ~behind)
-    if len(around):  # the camera is in or beside such a brick: it may be anywhere in the picture
+    if len(around):  # the camera is in or beside these bricks: they may be anywhere in the picture
         near[:], far[:] = starts[around].min(), ends[around].max()
     shown = np.flatnonzero(ahead)
     x = camera.cx + camera.fx * (first[shown, 0] + corners[:, 0, None]) / depths[:, shown]
@@ -78,8 +79,9 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
 
 
 def _range(x: np.ndarray, n_blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first block [n], and the one after the last, whose pixel centres can lie between the least and the
-    greatest of eight coordinates, `x` [8, n] pixels."""
+    """Find the blocks along one axis of the picture whose pixel centres can lie between the least and the
+    greatest of eight coordinates, `x` [8, n] pixels. Returns the first such block [n] and the one after the
+    last [n]."""
     low = np.floor((x.min(axis=0) - 0.5 - MARGIN_PX) / BLOCK)
     high = np.floor((x.max(axis=0) - 0.5 + MARGIN_PX) / BLOCK) + 1
     return np.clip(low, 0, n_blocks).astype(np.int64), np.clip(high, 0, n_blocks).astype(np.int64)

@@ -1,7 +1,7 @@
 """Rays through a box: where they enter it, and the lattice of samples on them.
 
-A place on a ray is s, the distance behind the entry in model units. The middles of a ray's base steps are at
-`s_i = (i + 1/2) step`, wherever it enters.
+A position on a ray is given by s, the distance from the entry point in model units. The middle of base step i
+is at `s_i = (i + 1/2) step`, wherever the ray enters.
 """
 
 from __future__ import annotations
@@ -13,19 +13,21 @@ import numpy as np
 from player.asset.grid import SparseGrid
 
 SKIP_MARGIN = np.float32(0.01)
-"""Cells by which a jump stays inside what is known to be empty: a hundred times the rounding of a grid
-coordinate."""
+"""Cells by which a jump ends inside the region that is known to be empty: a hundred times the rounding error
+of a grid coordinate."""
 
 
 ONE = np.array(1, np.int32)
-"""A sample that stands for one base step."""
+"""The size of a sample that stands for one base step."""
 
 Bounds = tuple[np.ndarray, np.ndarray]
-"""`near` and `far`, [n] float32: t of n rays outside which the caller knows that there is no live cell."""
+"""`near` and `far`, [n] float32: for each of n rays, the t outside which the caller knows that there is no
+live cell."""
 
 
 class BoxPath(NamedTuple):
-    """n rays from where they enter the box; the methods are those that `player.march.path` describes."""
+    """The path of n rays through the box, from where they enter it; `player.march.path` describes the
+    methods."""
 
     t: np.ndarray
     """[n] float32, t of the entry, model units."""
@@ -55,7 +57,7 @@ class BoxPath(NamedTuple):
         face = np.where(direction > 0, ahead, behind).astype(np.float32)
         s = (face - self.point[:, ray]) / np.where(still, np.float32(1), direction)
         s[still] = np.inf
-        # a place within the margin of a face that the ray nearly runs along is far behind it
+        # s is far below 0 where the point is within the margin of a face that the ray is nearly parallel to
         left = np.clip(s.min(axis=0), np.float32(0), np.float32(1e6)) / self.step - np.float32(0.5)
         return np.maximum(i, np.floor(np.minimum(left, np.float32(1e9))).astype(np.int32)) + 1
 
@@ -78,15 +80,15 @@ def enter_box(
     rays_d: np.ndarray,
     bounds: Bounds | None = None,
 ) -> BoxPath:
-    """Rays to grid coordinates, each moved to where it enters the box (slabs; t >= 0).
+    """Find where rays enter the box (slab method; t >= 0), in grid coordinates.
 
-    A ray parallel to a face is inside that slab, faces included, or misses.
+    A ray that is parallel to a face is inside that slab, faces included, or misses the box.
 
     Args:
         grid: the sparse grid.
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
-        bounds: where live cells can be, if that is known.
+        bounds: bounds of t between which live cells can be, if they are known.
     """
     size = np.float32(grid.resolution)
     t_in = np.zeros(len(rays_o), np.float32)
@@ -102,7 +104,7 @@ def enter_box(
         t_in = np.where(parallel, t_in, np.maximum(t_in, np.minimum(a, b)))
         t_out = np.where(parallel, t_out, np.minimum(t_out, np.maximum(a, b)))
         t_out[outside] = -np.inf
-    with np.errstate(over="ignore", invalid="ignore"):  # rays that miss; nobody asks where, or by how much
+    with np.errstate(over="ignore", invalid="ignore"):  # for rays that miss: their values are not used
         point = np.clip(point + t_in * direction, np.float32(0), size)
         length = np.minimum(t_out - t_in, np.float32(grid.most_samples - 1) * grid.step)
     first = np.zeros(len(rays_o), np.int32)
@@ -110,6 +112,6 @@ def enter_box(
         near, far = bounds
         ahead = np.maximum(near - t_in, 0) / grid.step - np.float32(0.5)
         first = np.maximum(np.floor(np.minimum(ahead, np.float32(1e9))), 0).astype(np.int32)
-        first &= -grid.most_steps  # a step that the march comes by, wherever it begins
+        first &= -grid.most_steps  # a step that every march visits, wherever it begins
         length = np.minimum(length, far - t_in)
     return BoxPath(t_in, first, length, point, direction, grid.step)

@@ -1,9 +1,9 @@
-"""All of space in a ball: the contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10).
+"""Contraction of all of space into a ball, as in mip-NeRF 360 (Barron et al. 2022, eq. 10).
 
-Letters: c(x) = x inside the unit ball, (2 - 1/r) x / r outside, with r = |x|; at its border both are x, and
-so is the slope along x. Points come as x = v / h with a divisor h >= 0, so that infinity in the direction v
-is h = 0 and nothing overflows on the way there: with q = |v|, c(x) = v / h where q <= h, else (2 - h/q) v /
-q. A contracted point is never turned back.
+Notation: c(x) = x inside the unit ball, (2 - 1/r) x / r outside, with r = |x|. At r = 1 the two formulas
+agree, and so do their slopes along x. Points are given as x = v / h with a divisor h >= 0: h = 0 is infinity
+in the direction v, and nothing overflows on the way there. With q = |v|, c(x) = v / h where q <= h, else (2 -
+h/q) v / q. The inverse of c is never needed.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import numpy as np
 
 
 def contract(points: np.ndarray, divisor: np.ndarray | float = 1.0) -> np.ndarray:
-    """Where points are in contracted space.
+    """Contract points.
 
     Args:
         points: [..., 3] float32 or float64, any size; a coordinate may be infinite.
-        divisor: [...] >= 0, what the points are to be divided by; 0 is infinitely far away in the direction
-            of the point, which must not be 0 then.
+        divisor: [...] >= 0, the numbers that the points are to be divided by. 0 means infinitely far away in
+            the direction of the point, which must not be 0 itself then.
 
     Returns:
-        [..., 3] in the type of `points`, inside the ball of radius 2.
+        [..., 3] contracted points in the dtype of `points`, inside the ball of radius 2.
 
     >>> contract(np.array([[0.5, 0, 0], [0, 4, 0], [0, 0, -np.inf]])).tolist()
     [[0.5, 0.0, 0.0], [0.0, 1.75, 0.0], [0.0, 0.0, -2.0]]
@@ -31,23 +31,24 @@ def contract(points: np.ndarray, divisor: np.ndarray | float = 1.0) -> np.ndarra
     h = np.where(endless, 0, divisor).astype(points.dtype)
     largest = np.maximum(
         np.abs(v).max(axis=-1), h
-    )  # divided by it first: the square of 1e30 is beyond float32
+    )  # v and h are divided by it first: the square of 1e30 is beyond float32
     largest = np.where(largest > 0, largest, 1)
     v, h = v / largest[..., None], h / largest
     return v * contraction_scale(np.sqrt(np.sum(v * v, axis=-1)), h)[..., None]
 
 
 def contraction_scale(norm: np.ndarray, divisor: np.ndarray) -> np.ndarray:
-    """The factor [...] by which v is multiplied, from q = |v| and the divisor h, [...] and not both 0."""
+    """Return the factor [...] by which v is multiplied to contract v / h, from q = |v| and the divisor h,
+    both [...] and not both 0."""
     inside = norm <= divisor
     q, h = np.where(inside, 1, norm).astype(norm.dtype), np.where(inside, divisor, 1).astype(norm.dtype)
     return np.where(inside, 1 / h, (2 - divisor / q) / q)
 
 
 def pull_back(gradients: np.ndarray, v: np.ndarray, divisor: np.ndarray) -> np.ndarray:
-    """Gradients in contracted space as gradients in space: the transposed Jacobian of c times each.
+    """Turn gradients in contracted space into gradients in space: the transposed Jacobian of c times each.
 
-    Outside, c stretches by (2 - 1/r) / r across x and by 1/r^2 along it.
+    Outside the unit ball, c scales by (2 - 1/r) / r across the direction of x and by 1/r^2 along it.
 
     Args:
         gradients: [3, n] with respect to c(x).

@@ -1,13 +1,14 @@
-"""Where along a ray to fetch features: k places instead of one at every sample.
+"""Choice of where along a ray features are fetched (looked up): at k positions instead of at every sample.
 
-Letters: a ray has m samples at s_i with weights w_i and opacity A. Its weights are cut into k bins of equal
-mass; a sample may be split between bins. A bin is fetched at the centroid of its mass, with the weight A /
-k, so that the weights still add up to A and opacity does not depend on k. A ray with m <= k samples uses
-the samples themselves, exactly.
+Notation: a ray has m samples at s_i with weights w_i, and opacity A. Its weights are cut into k bins of equal
+mass; a sample may be split between bins. Features are fetched once for each bin, at the centroid of its mass
+and with the weight A / k, so that the weights still add up to A and opacity does not depend on k. On a ray
+with m <= k samples, features are fetched at exactly these samples.
 
-Features are trilinear over the corners that are stored, divided by their share of the interpolation
-weights. A bin that straddles a gap may have its centroid where nothing is stored: if that share is below
-MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of equals), which lies in a live cell.
+Features are interpolated trilinearly over the corners that are stored, and divided by the sum of the
+interpolation weights of these corners. A bin that straddles a gap may have its centroid where nothing is
+stored: if that sum is below MIN_TOTAL, the bin is fetched at its heaviest sample instead (the first of
+equals), which lies in a live cell.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from player.asset.grid import CELLS_OF_LEVELS, SparseGrid, brick_number, corner_
 from player.march.path import Path
 
 MIN_TOTAL = np.float32(1e-3)
-"""Least share of stored corners with which a place counts as stored."""
+"""Least sum of the interpolation weights of stored corners with which a point counts as stored."""
 
 BLOCK = 4096
-"""Fetches at a time: what they gather stays in the second-level cache."""
+"""Fetches that are processed at a time: the rows that they gather stay in the second-level cache."""
 
 
 class Samples(NamedTuple):
@@ -33,8 +34,8 @@ class Samples(NamedTuple):
     ray: np.ndarray
     """[n_samples] int64, the ray of each sample."""
     s: np.ndarray
-    """[n_samples] places on the rays: in a box distances from the entry, model units; in contracted space
-    angles."""
+    """[n_samples] positions on the rays: distances from the entry in a box, model units; angles in contracted
+    space."""
     weights: np.ndarray
     """[n_samples] float32, compositing weights."""
 
@@ -49,19 +50,20 @@ class Bins(NamedTuple):
     first: np.ndarray
     """[n * k] int64, the first sample with mass in the bin."""
     last: np.ndarray
-    """[n * k] int64, the last one."""
+    """[n * k] int64, the last sample with mass in the bin."""
     start: np.ndarray
     """[n * k] float64, mass of the ray before the bin, 0..1."""
     mass: np.ndarray
-    """[n_samples] float64, mass of the ray up to and with each sample, 0..1."""
+    """[n_samples] float64, mass of the ray up to and including each sample, 0..1."""
     k: int
-    """Bins a ray; each has the mass 1 / k."""
+    """Bins per ray; each has the mass 1 / k."""
 
 
 def fetch_features(
     grid: SparseGrid, path: Path, samples: Samples, opacity: np.ndarray, hits: np.ndarray, k: int
 ) -> np.ndarray:
-    """Sum of weight times feature over the fetches of each ray in `hits`: [n_hits, n_channels] float32.
+    """Return the sum of weight times feature over the fetches of each ray in `hits`: [n_hits, n_channels]
+    float32.
 
     Args:
         grid: the sparse grid.
@@ -69,7 +71,7 @@ def fetch_features(
         samples: all samples with weight.
         opacity: [n] float32 of all rays.
         hits: [n_hits] rays to fetch for, ascending.
-        k: fetches a ray; 0 fetches at every sample.
+        k: fetches per ray; 0 fetches at every sample.
     """
     rows = np.full(len(opacity), -1, np.int64)
     rows[hits] = np.arange(len(hits))
@@ -93,8 +95,8 @@ def fetch_features(
 def equal_mass_bins(samples: Samples, k: int) -> Bins:
     """Cut the weights of each ray into k bins of equal mass; every ray has more than k samples.
 
-    Cumulative mass is scaled to 1 a ray, so that `rank + mass` rises over all rays and one search finds
-    every cut.
+    The cumulative mass of each ray is scaled to end at 1, so that `rank + mass` rises over all rays and one
+    search finds every cut.
 
     >>> samples = Samples(np.zeros(3, int), np.float32([1, 2, 4]), np.float32([0.25, 0.25, 0.25]))
     >>> equal_mass_bins(samples, 2).s.round(3).tolist()
@@ -127,10 +129,10 @@ def equal_mass_bins(samples: Samples, k: int) -> Bins:
 
 
 def _cumulative(values: np.ndarray, starts: np.ndarray, rank: np.ndarray) -> np.ndarray:
-    """Sums of values 0..1 along each ray, the sample itself included.
+    """Return running sums of values 0..1 along each ray, the sample itself included.
 
-    In integers of 2^-50, whose sums are exact even where they wrap around: a ray's sums must not depend on
-    the rays before it.
+    Values are summed as integer multiples of 2^-50, whose sums are exact even where they wrap around: a ray's
+    sums must not depend on the rays before it.
     """
     whole = np.rint(values * 2.0**50).astype(np.int64)
     running = np.cumsum(whole)
@@ -138,7 +140,8 @@ def _cumulative(values: np.ndarray, starts: np.ndarray, rank: np.ndarray) -> np.
 
 
 def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
-    """[n] the sample with most of its mass in each of the bins `which` [n]; the first of equals.
+    """Return, for each of the bins `which` [n], the sample [n] that has the most mass inside it; the first of
+    equals.
 
     >>> samples = Samples(np.zeros(3, int), np.float32([1, 2, 4]), np.float32([0.3, 0.4, 0.3]))
     >>> heaviest(equal_mass_bins(samples, 2), np.array([0, 1])).tolist()
@@ -158,12 +161,13 @@ def heaviest(bins: Bins, which: np.ndarray) -> np.ndarray:
 
 
 def _add(grid: SparseGrid, path: Path, fetches: Samples, rows: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Add each fetch to the row of its ray; returns the indices of those where too little is stored."""
+    """Add each fetch to its ray's row of `out`; returns the indices of the fetches where too little is
+    stored."""
     gaps = []
     firsts = np.flatnonzero(np.diff(fetches.ray, prepend=-1))
     cuts = np.searchsorted(
         firsts, np.arange(0, len(fetches.ray), BLOCK)
-    )  # no ray is cut: sums keep their order
+    )  # no ray is cut, so that its sum keeps its order
     edges = np.unique(np.append(firsts[cuts[cuts < len(firsts)]], len(fetches.ray)))
     for start, stop in itertools.pairwise(edges):
         ray, s, weights = (column[start:stop] for column in fetches)
@@ -178,11 +182,11 @@ def _add(grid: SparseGrid, path: Path, fetches: Samples, rows: np.ndarray, out: 
 
 
 def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The features that are stored around points, interpolated.
+    """Interpolate the features that are stored around points.
 
     Args:
         grid: the sparse grid.
-        g: [3, n] float32, cells of the densities' grid.
+        g: [3, n] float32, the points, in cells of the densities' grid.
 
     Returns:
         values: [n, n_channels] float32, the sum of the codes at the corners that are stored, each times its

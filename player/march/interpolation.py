@@ -1,22 +1,22 @@
-"""Which pixels are marched, and what the others become: the reuse of neighbours in one picture.
+"""Interpolation of pixels between marched neighbours of the same picture.
 
-A picture of quality `exact` marches every pixel. Any other marches a lattice of pixels first, which are
-`spacing` apart in both directions, and fills it up in stages. The new pixels of a stage are in the middle of
-squares of four known ones: of upright squares first, then of the diamonds that these leave, and so on at half
-the spacing.
+A picture of quality `exact` marches every pixel. Any other quality first marches a lattice of pixels that are
+`spacing` apart in both directions, then fills the picture up in stages. Each new pixel of a stage is in the
+middle of a square of four known pixels: of upright squares first, then of the diamonds that these leave, and
+so on at half the spacing.
 
     o . o      o . o      o e o
     . . .  ->  . c .  ->  e c e      o known first, c of the next stage, e of the one after it
     o . o      o . o      o e o
 
-Where the four agree, the pixel becomes their mean; where they do not, or where fewer than four are in the
-picture, it is marched. Four agree if nothing differs by more than `Agreement` allows: colour over what is
-behind it, opacity and depth. What lies between the pixels of the lattice, and is met by none of them, is not
-seen. So that an upright or level line between them leaves a trace, an object's pictures march the diagonal of
-each block, too: it meets every row and column.
+Where the four known pixels agree, the new pixel becomes their mean. Where they do not, or where some of them
+are outside the picture, it is marched. Four pixels agree if their colours (over what is behind), opacities
+and depths differ by no more than `Agreement` allows. A detail between the pixels of the lattice that none of
+them meets is missed. To catch vertical and horizontal lines between them, pictures of an object also march
+the diagonal of each block, which meets every row and column.
 
-A pixel depends on nothing but pixels of earlier stages, so that a picture depends neither on threads nor on
-tasks nor on the picture before it.
+A pixel depends only on pixels of earlier stages. So a picture does not depend on threads, on tasks or on the
+picture before it.
 """
 
 from __future__ import annotations
@@ -36,29 +36,32 @@ OPAQUE_DEPTH: dict[Quality, np.float32] = {
     "high": np.float32(np.log(25)),
     "fast": np.float32(np.log(10)),
 }
-"""The optical depth at which the rays of a picture stop (`player.march.march.march`)."""
+"""The optical depth at which rays stop, for pictures of each quality (`player.march.march.march`)."""
 OF_FIRST_HALVING = 0.6
-"""Share of the levels by which pixels may differ that are four apart."""
+"""Factor on the levels by which pixels may differ, in the first halving of a lattice of every fourth
+pixel."""
 
 
 class Agreement(NamedTuple):
-    """By how much four pixels may differ of which a fifth becomes the mean."""
+    """Limits on the differences between four pixels whose mean another pixel may become."""
 
     colour: np.float32
-    """In each channel, 0..1, over what is behind; over black if that is transparent."""
+    """Largest difference in each channel, 0..1, of colours over the background; over black if it is
+    transparent."""
     opacity: np.float32
     depth: np.float32
-    """As a share of the nearest one's depth. Pixels that are all fainter than `opacity` may lie anywhere."""
+    """Largest difference of depths, as a share of the nearest pixel's depth. Pixels that are all fainter than
+    `opacity` may be at any depths."""
 
 
 class Stage(NamedTuple):
-    """Pixels that are found at the same time."""
+    """One stage of a picture: pixels that are found at the same time."""
 
     within: np.ndarray
     """[m, 2] int64 row and column of these pixels in each block."""
     neighbours: np.ndarray
-    """[4, 2] int64 rows and columns from a pixel to those it may become the mean of; [0, 2] where all pixels
-    are marched."""
+    """[4, 2] int64 offsets (row, column) from a pixel to the four whose mean it may become; [0, 2] where all
+    pixels are marched."""
     agreement: Agreement
 
 
@@ -68,15 +71,15 @@ _NONE = np.zeros((0, 2), np.int64)
 
 @lru_cache(maxsize=64)
 def stages(levels: float, contracted: bool = False) -> tuple[Stage, ...]:
-    """The stages of a picture, in their order.
+    """Return the stages of a picture, in their order.
 
     Args:
-        levels: by how many 8-bit levels four pixels may differ of which another becomes the mean; with 0, as
-            in exact pictures, all pixels are marched. Those of the first halving of a wide lattice must be
-            nearer.
-        contracted: whether it shows all of space. The pictures of a capture are smooth over several pixels,
-            and a lattice of every fourth pays. An object's seldom are: of a wider lattice than every second
-            pixel's, rays that lie far apart cost more time than there are fewer of them.
+        levels: 8-bit levels by which four pixels may differ for another to become their mean. With 0, as in
+            exact pictures, all pixels are marched. In the first halving of a wide lattice the limit is lower.
+        contracted: whether the picture shows all of space. Pictures of a capture are smooth over several
+            pixels, so that a lattice of every fourth pixel pays. An object's seldom are: with a lattice wider
+            than every second pixel, the rays share so little that they cost more time than their smaller
+            number saves.
 
     >>> [len(stage.within) for stage in stages(0)], [len(stage.within) for stage in stages(40)]
     ([64], [20, 12, 32])
@@ -91,8 +94,9 @@ def stages(levels: float, contracted: bool = False) -> tuple[Stage, ...]:
 
 
 def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = False) -> tuple[Stage, ...]:
-    """The stages from a lattice of a `spacing`, a power of two up to BLOCK; the agreements are those of each
-    halving of it. `probed`: whether pixels on the diagonals of blocks are marched with the lattice."""
+    """Return the stages that begin with a lattice of `spacing` pixels, a power of two up to BLOCK.
+    `agreements`: the limits in each halving of the spacing. `probed`: whether pixels on the diagonals of
+    blocks are marched with the lattice."""
     row, column = EVERY.T
     probes = (row == column) & probed
     lattice = (row % spacing == 0) & (column % spacing == 0)
@@ -109,24 +113,25 @@ def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = Fal
 
 
 def _agreement(levels: float) -> Agreement:
-    """Colours and opacities within so many 8-bit levels."""
+    """Return limits of so many 8-bit levels on colours and opacities, and of a tenth on depths."""
     return Agreement(np.float32(levels / 255), np.float32(levels / 255), np.float32(0.1))
 
 
 def interpolate(
     planes: Planes, size: tuple[int, int], pixels: Pixels, stage: Stage, transparent: bool
 ) -> np.ndarray:
-    """Write what becomes the mean of its neighbours into the planes of a picture.
+    """Interpolate the pixels of a stage whose neighbours agree, and write them into the planes of a picture.
 
     Args:
-        planes: of the whole picture.
-        size: its width and height.
-        pixels: those of a stage.
-        stage: which one it is.
-        transparent: whether colours in `planes` are straight, with nothing behind them.
+        planes: arrays of the whole picture.
+        size: width and height of the picture.
+        pixels: the pixels of the stage that are to be found.
+        stage: the stage that they belong to.
+        transparent: whether there is no background, and colours in `planes` are straight (not multiplied by
+            opacity).
 
     Returns:
-        [n_rest] int64 which of `pixels` are to be marched.
+        [n_rest] int64, indices of those of `pixels` that are to be marched.
     """
     if not len(stage.neighbours):
         return np.arange(len(pixels.rows))
@@ -154,10 +159,10 @@ def interpolate(
 
 
 def _spread(values: np.ndarray) -> np.ndarray:
-    """Between the least and the greatest of four [4, ...]."""
+    """Return the difference between the greatest and the least of four values [4, ...]."""
     return values.max(axis=0) - values.min(axis=0)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """The mean of four [4, ...]."""
+    """Return the mean of four values [4, ...]."""
     return ((values[0] + values[1]) + (values[2] + values[3])) * np.float32(0.25)

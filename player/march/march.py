@@ -1,6 +1,7 @@
-"""The march through the sparse grid, in numpy: the statement of what every player computes.
+"""The march through the sparse grid, in numpy: the definition of what every player computes.
 
-Letters: (o, d) a ray in the model frame, d of unit length; tau the optical depth so far; A the opacity.
+Notation: (o, d) is a ray in the model frame, d of unit length; tau is the optical depth so far; A is the
+opacity.
 
 1. The path of a ray (`player.march.path`) is cut into base steps n = 0, 1, ... In a box a step is a distance
    dt: the ray enters the box at t_in (0 if it starts inside) and leaves at t_out, and the middle of step n is
@@ -9,19 +10,20 @@ Letters: (o, d) a ray in the model frame, d of unit length; tau the optical dept
    Where no level has a brick at the middle of step n, the march goes on with step n + 1. Otherwise a sample
    stands for the steps n to n + m - 1, where m is the largest power of two that divides n and is at most
    `level_steps` of the finest level that has a brick there; the sample is at the middle of these steps, and
-   the march goes on with step n + m. Which way l_i in model units sample i stands for, the path says.
+   the march goes on with step n + m. The path also gives the length l_i of ray, in model units, that sample i
+   stands for.
 2. A sample in a cell that is not live contributes nothing. Otherwise sigma is decoded from the interpolated
    code (`player.asset.density`), and `alpha = -expm1(-sigma l_i)`, `w = exp(-tau) alpha`, `tau += sigma l_i`.
-   The march stops after the sample with `exp(-tau) < 1e-3`. `A = 1 - exp(-tau)`. The depth is t at the mean
-   place of the weights: in contracted space, whose places are angles, a thousandth of the sky shining past a
-   leaf does not move the leaf.
-3. Features are fetched at k places only (`player.march.fetches`), and the head runs once on their
+   The march stops after the sample with `exp(-tau) < 1e-3`. `A = 1 - exp(-tau)`. The depth is t at the
+   weighted mean of the samples' positions s. In contracted space these are angles, so that a thousandth of
+   the sky shining past a leaf does not move the leaf.
+3. Features are fetched at k positions only (`player.march.fetches`), and the head runs once, on their
    weighted sum.
 
-What decides which cell a sample is in is float32 and in grid coordinates (cells). In a box it is the entry
-point e, clamped into the box, and `g = e + s d` with `s = (i + 1/2) dt`; in contracted space the ray's p, w
-d, cos(phi_0) and sin(phi_0), the lattice's table of cos(s_i) and sin(s_i), and what `ContractedPath` does
-with them. `player.compiled.packets` does the same operations in the same order.
+The cell of a sample is found from grid coordinates (cells) in float32, by operations that
+`player.compiled.packets` does in the same order. In a box, these coordinates are `g = e + s d`, with the
+entry point e, clamped into the box, and `s = (i + 1/2) dt`. In contracted space, `ContractedPath` computes
+them from the ray's p, w d, cos(phi_0) and sin(phi_0) and from the lattice's table of cos(s_i) and sin(s_i).
 """
 
 from __future__ import annotations
@@ -39,28 +41,28 @@ OPAQUE_DEPTH = float(-np.log(1e-3))
 """The optical depth at which a ray stops, where a thousandth of the light is left: a quarter of an 8-bit
 level."""
 MAX_TAU = np.float32(OPAQUE_DEPTH)
-"""OPAQUE_DEPTH as marches compare it."""
+"""OPAQUE_DEPTH in float32, as marches compare with it."""
 
 MIN_OPACITY = np.float32(1 / 512)
 """Rays below this opacity are not shaded: they could not change an 8-bit value by more than half a
 level."""
 
 CHUNK = np.arange(8, dtype=np.int32)
-"""Base steps that a ray evaluates at a time near a surface, counted from the first: fewer calls of numpy, few
-samples in vain."""
+"""Numbers, from 0 on, of the base steps that a ray evaluates at a time near a surface: enough for few calls
+of numpy, and few enough that not many samples are evaluated in vain."""
 
 
 class MarchResult(NamedTuple):
-    """What a march returns for n rays, n_hits of which have an opacity over MIN_OPACITY."""
+    """The result of a march of n rays, n_hits of which have an opacity over MIN_OPACITY."""
 
     opacity: np.ndarray
     """[n] float32, 0..1."""
     depth: np.ndarray
-    """[n] float32, t at the mean place of the weights, model units; 0 where nothing was met."""
+    """[n] float32, t at the weighted mean position of the samples, model units; 0 where nothing was met."""
     n_density_samples: np.ndarray
     """[n] int32, density samples taken in live cells."""
     hits: np.ndarray
-    """[n_hits] int64, the rays that have features, ascending."""
+    """[n_hits] int64, indices of the rays that have features, ascending."""
     features: np.ndarray
     """[n_hits, n_channels] float32, in units of the codes."""
 
@@ -79,8 +81,8 @@ def march(
         grid: the sparse grid.
         rays_o: [n, 3] float32 origins, model frame.
         rays_d: [n, 3] float32 unit directions, model frame.
-        n_fetches: k, feature fetches a ray; 0 fetches at every sample.
-        bounds: where live cells of a box can be, if that is known.
+        n_fetches: k, feature lookups per ray; 0 looks features up at every sample.
+        bounds: bounds of t between which live cells of a box can be, if they are known.
         opaque_depth: the optical depth at which rays stop. If that is below MAX_TAU, the sample that passes
             it counts as opaque, so that what is left of the light is not lost.
     """
@@ -99,13 +101,13 @@ def march(
 
 
 class SampledRays(NamedTuple):
-    """n rays and what they meet."""
+    """n rays and their samples."""
 
     path: Path
     samples: Samples
     """All samples with weight."""
     ways: np.ndarray
-    """[n_samples] float32, the model units that each of them stands for."""
+    """[n_samples] float32, the length of ray, in model units, that each sample stands for."""
     tau: np.ndarray
     """[n] float32, optical depth."""
     n_density_samples: np.ndarray
@@ -119,9 +121,10 @@ def sample_rays(
     bounds: Bounds | None = None,
     opaque_depth: np.float32 = MAX_TAU,
 ) -> SampledRays:
-    """The samples of rays; the arguments are those of `march`.
+    """Find the samples of rays; the arguments are those of `march`.
 
-    All rays are marched in step: one in no brick jumps, one in a brick takes a chunk of its samples.
+    All rays are marched together. In each round, a ray in no brick jumps, and a ray in a brick takes a chunk
+    of its samples.
     """
     path = path_of(grid, rays_o, rays_d, bounds)
     tau = np.zeros(len(rays_o), np.float32)
@@ -141,10 +144,10 @@ def sample_rays(
             brick, reach = cells[:, empty] >> 3, (-entries[empty] & MAX_DISTANCE) - 1
             there = path.jump(ray[empty], i[empty], g[:, empty], brick, reach)
             after = i[empty] + group_size(grid, i[empty], entries[empty])
-            busy[empty] = after > there  # its middle may be in a live cell
+            busy[empty] = after > there  # the sample's middle may be in a live cell
             i[empty] = np.where(
                 busy[empty], i[empty], np.maximum(there & -grid.most_steps, after)
-            )  # a step that the march comes by
+            )  # a step that every march visits
         busy = np.flatnonzero(busy)
         if len(busy):
             chunk = _chunk(grid, path, ray[busy], i[busy])
@@ -153,26 +156,27 @@ def sample_rays(
 
 
 class Chunk(NamedTuple):
-    """Samples of n rays that may be in live cells, one ray's after the other's, in the order of the march."""
+    """Samples of n rays that may be in live cells, ray after ray, in the order of the march."""
 
     row: np.ndarray
-    """[n_samples] int64: which of the rays."""
+    """[n_samples] int64: the ray of each sample, as an index into the n rays."""
     column: np.ndarray
-    """[n_samples] int64: which sample of a ray, below len(CHUNK)."""
+    """[n_samples] int64: the base step with which each sample begins, as an index into CHUNK."""
     i: np.ndarray
-    """[n_samples] int32: the base step with which each begins."""
+    """[n_samples] int32: the number of this base step on the sample's ray."""
     size: np.ndarray
-    """[n_samples] int32: for how many base steps each stands; one number if all are alike."""
+    """[n_samples] int32: the number of base steps that each sample stands for; a single number if all are
+    alike."""
     s: np.ndarray
-    """[n_samples] float32: places on the rays."""
+    """[n_samples] float32: positions on the rays."""
     found: Found
-    """What is there."""
+    """The cells that the samples are in."""
     after: np.ndarray
-    """[n] int32: the base step to go on with."""
+    """[n] int32: the base step with which each ray goes on after the chunk."""
 
 
 def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chunk:
-    """The samples that begin in the base steps from `i` [n] on, of which there is a brick in the first."""
+    """Find the samples that begin in the len(CHUNK) base steps of each ray from `i` [n] on."""
     steps = i[:, None] + CHUNK
     s, g = path.sample(steps), path.place(ray[:, None], steps)
     found, after = grid.find(g), i + len(CHUNK)
@@ -194,22 +198,22 @@ def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chun
 
 
 def group_size(grid: SparseGrid, i: np.ndarray, entries: np.ndarray) -> np.ndarray:
-    """For how many base steps the samples stand that begin with steps `i`, in whose middles the table has
-    `entries`: the largest power of two that is at most the level's and divides i; 1 where there is no
-    brick."""
+    """Return the number of base steps that samples stand for which begin with steps `i`, where the table has
+    `entries` at the middles of these steps. It is the largest power of two that divides i and is at most the
+    level's `level_steps`; 1 where there is no brick."""
     most = grid.steps_at(entries)
     return np.where(i == 0, most, np.minimum(most, i & -i)).astype(np.int32)
 
 
 class Taken(NamedTuple):
-    """Samples that were taken, in live cells."""
+    """Samples in live cells that were taken."""
 
     ray: np.ndarray
     """[n_samples] int64."""
     s: np.ndarray
-    """[n_samples] places on the rays."""
+    """[n_samples] positions on the rays."""
     way: np.ndarray
-    """[n_samples] float32, model units that the sample stands for."""
+    """[n_samples] float32, the length of ray, in model units, that the sample stands for."""
     optical: np.ndarray
     """[n_samples] float32, the sample's optical depth."""
     before: np.ndarray
@@ -224,8 +228,9 @@ def _take(
     tau: np.ndarray,
     opaque_depth: np.float32,
 ) -> Taken:
-    """Take the samples of a chunk of the rays `ray` [n] in live cells, up to the one that passes
-    `opaque_depth`, which counts as opaque if that is below MAX_TAU; `tau` [n_rays] is updated."""
+    """Take those samples of a chunk of the rays `ray` [n] that are in live cells, up to the sample that
+    passes `opaque_depth`. That sample counts as opaque if `opaque_depth` is below MAX_TAU. `tau` [n_rays] is
+    updated."""
     at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
     row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
     size = chunk.size[at] if chunk.size.ndim else chunk.size
@@ -244,17 +249,17 @@ def _take(
     if opaque_depth < MAX_TAU:
         last = after > opaque_depth
         after[last] = optical[last] = np.inf
-    tau[ray[row]] = after  # in order, so that the last sample of each ray stays
+    tau[ray[row]] = after  # in order: the value of each ray's last sample stays
     return Taken(ray[row], s[kept], way[kept], optical, before[kept])
 
 
 def trilinear(density: np.ndarray, corner: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Codes [n] between the corners of cells: along z, then y, then x.
+    """Interpolate codes [n] in cells trilinearly: along z, then y, then x.
 
     Args:
         density: codes of bricks with an apron.
-        corner: [n] where in it the lowest corner of each cell is.
-        fraction: [3, n] float32 places in the cells, 0..1.
+        corner: [n] index into `density` of the lowest corner of each cell.
+        fraction: [3, n] float32 positions in the cells, 0..1.
     """
 
     def lerp(a: np.ndarray, b: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -269,15 +274,16 @@ def trilinear(density: np.ndarray, corner: np.ndarray, fraction: np.ndarray) -> 
 
 
 def _weigh(chunks: list[Taken], tau: np.ndarray) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:
-    """The samples of all chunks, sorted by ray, with their weights; those without weight are dropped. Returns
-    with them their ways, tau, and for each ray the number of samples taken."""
+    """Join the samples of all chunks, sorted by ray, and compute their weights; samples without weight are
+    dropped. Returns the samples, the lengths that they stand for, tau, and the number of samples taken on
+    each ray."""
     n_rays = len(tau)
     if not chunks:
         none = np.zeros(0, np.float32)
         return Samples(none.astype(np.int64), none, none), none, tau, np.zeros(n_rays, np.int32)
     ray, s, ways, optical, before = (np.concatenate(column) for column in zip(*chunks, strict=True))
     counts = np.bincount(ray, minlength=n_rays).astype(np.int32)
-    small = ray.astype(np.uint16) if n_rays <= 1 << 16 else ray  # 16 bits are sorted by radix
+    small = ray.astype(np.uint16) if n_rays <= 1 << 16 else ray  # numpy sorts 16 bits by radix
     order = np.argsort(small, kind="stable")
     weights = (np.exp(-before) * -np.expm1(-optical))[order]
     samples = Samples(ray[order], s[order], weights)

@@ -1,10 +1,11 @@
-"""The normal that a pixel sees: the density gradient, composited like a feature.
+"""Normals of pixels: gradients of the density, composited like a feature.
 
-Letters: samples x_i with weights w_i as in `player.march.march`; sigma, the density. A pixel's normal is `N =
-normalise(- sum w_i grad log sigma(x_i))`: it points where density falls. The logarithm of the density is
-linear in the interpolated code (`player.asset.density`), so that the gradient is that of the trilinear code
-in the sample's cell; in contracted space it is pulled back to the model frame. It is summed before it is
-normalised: where the code is flat, inside a solid, there is no direction, and none is added.
+Notation: x_i are samples with weights w_i as in `player.march.march`; sigma is the density. A pixel's normal
+is `N = normalise(- sum w_i grad log sigma(x_i))`: it points where density falls. The logarithm of the density
+is linear in the interpolated code (`player.asset.density`), so that its gradient is proportional to that of
+the trilinear code in the sample's cell. In contracted space the gradient is pulled back to the model frame.
+Gradients are summed before the sum is normalised: where the code is flat, inside a solid, the gradient is 0
+and adds no direction.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def composited_normals(
     rays_d: np.ndarray,
     bounds: Bounds | None = None,
 ) -> np.ndarray:
-    """Normals of rays, in the model frame. The samples are collected again, by the numpy march.
+    """Compute normals of rays, in the model frame. The numpy march runs once more to collect the samples.
 
     Args:
         grid: the sparse grid.
@@ -43,10 +44,11 @@ def composited_normals(
 
 
 def code_gradient(grid: SparseGrid, g: np.ndarray) -> np.ndarray:
-    """Gradient [3, n] float32 of the interpolated density code, codes a cell; 0 outside of live cells.
+    """Return the gradient [3, n] float32 of the interpolated density code, in codes per cell; 0 outside of
+    live cells.
 
     `g` [3, n] float32: grid coordinates (cells). Samples of the march lie in live cells, but in contracted
-    space their places, found again, may be rounded to beyond the faces.
+    space their coordinates are computed anew here, and rounding may move them beyond the faces.
     """
     found = grid.find(g)
     at = found.corners

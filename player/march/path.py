@@ -1,20 +1,23 @@
-"""The path of rays through a grid: the one difference between an object's box and contracted space.
+"""The path of rays through a grid: the only part of the march in which an object's box and contracted space
+differ.
 
-A path holds n rays. On each lies a lattice of base steps that depends on the ray alone, so that skipping what
-is empty never changes a picture; a place on a ray is a number s >= 0 that rises along it. A path has `first`
-[n], the first base step of each ray to look at, `length` [n], the s at which each ray ends, and these
-methods, where `ray` are numbers of rays, `i` numbers of base steps and `s` places, of shapes that broadcast:
+A path holds n rays. On each lies a lattice of base steps that depends on the ray alone, so that skipping
+empty space never changes a picture. A position on a ray is a number s >= 0 that rises along the ray. A path
+has `first` [n], the first base step of each ray to look at, `length` [n], the s at which each ray ends, and
+the methods below. Their arguments `ray` are indices of rays, `i` numbers of base steps and `s` positions, of
+shapes that broadcast:
 
-- `sample(i, size)`: s of samples: the middles of `size` base steps, a power of two that divides i, from i on.
-- `place(ray, i, size)`: [3, ...] grid coordinates (cells) of these.
-- `jump(ray, i, g, brick, reach)`: [n] the base step to look at next, after step i, whose middle is at g
-  [3, n] in the brick `brick` [3, n] of the finest level, where all bricks within `reach` [n] of that are
-  empty. The middles of all steps between them are in no brick.
-- `way(ray, i, size)`: the model units that these samples stand for.
-- `at(ray, s)`: [3, n] grid coordinates of any places [n].
-- `distances(ray, s)`: [n] t of these, model units.
-- `pulled_back(gradients, ray, s)`: [3, n] gradients along the grid's axes, per model unit, as gradients in
-  the model frame.
+- `sample(i, size)`: s of samples. Each is in the middle of the `size` base steps from i on; `size` is a power
+  of two that divides i.
+- `place(ray, i, size)`: [3, ...] grid coordinates (cells) of these samples.
+- `jump(ray, i, g, brick, reach)`: [n] the base step to look at next after step i. The middle of step i is at
+  g [3, n], in the brick `brick` [3, n] of the finest level, and all bricks within `reach` [n] of that brick
+  are empty. The middles of all steps in between are in no brick.
+- `way(ray, i, size)`: the length of ray, in model units, that these samples stand for.
+- `at(ray, s)`: [3, n] grid coordinates of any positions [n].
+- `distances(ray, s)`: [n] t of these positions, model units.
+- `pulled_back(gradients, ray, s)`: [3, n] gradients in the model frame, from gradients along the grid's axes,
+  per model unit.
 """
 
 from __future__ import annotations
@@ -34,8 +37,8 @@ def path_of(
     rays_d: np.ndarray,
     bounds: Bounds | None = None,
 ) -> Path:
-    """The path of rays through a grid of either kind; the arguments are those of `enter_box`. In contracted
-    space, around which nothing is empty, bounds are ignored."""
+    """Make the path of rays through a grid of either kind; the arguments are those of `enter_box`. Bounds are
+    ignored in contracted space, because there is no empty space around it."""
     if grid.contracted:
         return enter_space(grid, rays_o, rays_d)
     return enter_box(grid, rays_o, rays_d, bounds)

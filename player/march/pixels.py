@@ -1,4 +1,4 @@
-"""What surrounds the march: the pixels of blocks, their rays, and what was found into the frame; in numpy."""
+"""The work around the march, in numpy: pixels of blocks to rays, and results into the frame."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ class Pixels(NamedTuple):
     rows: np.ndarray
     """[n] int64."""
     blocks: np.ndarray
-    """[n] int64, the block that each is in."""
+    """[n] int64, the block that each pixel is in."""
 
     def only(self, which: np.ndarray) -> Pixels:
-        """Those that `which` chooses, as an index into an array."""
+        """Return the pixels that `which`, an index into an array, chooses."""
         return Pixels(self.columns[which], self.rows[which], self.blocks[which])
 
 
 def z_curve(n: int) -> np.ndarray:
-    """[n * n, 2] row and column of the pixels of a square of n by n, n a power of two, along a Z curve.
+    """Return row and column [n * n, 2] of the pixels of a square of n by n, n a power of two, along a Z curve
+    (Morton order).
 
-    Each quarter of the way is a quarter of the square: pixels that are marched together lie close together
-    in both directions, and meet nearly the same bricks.
+    Each quarter of the curve covers a quarter of the square. So pixels that are marched together lie close
+    together in both directions, and meet nearly the same bricks.
 
     >>> z_curve(4)[:8].tolist()
     [[0, 0], [0, 1], [1, 0], [1, 1], [0, 2], [0, 3], [1, 2], [1, 3]]
@@ -42,14 +43,14 @@ def z_curve(n: int) -> np.ndarray:
 
 
 EVERY = z_curve(BLOCK)
-"""[64, 2] row and column in a block of each of its pixels."""
+"""[64, 2] row and column, within a block, of each of its pixels."""
 
 
 def pixels_of_blocks(camera: Camera, blocks: np.ndarray, per_row: int, within: np.ndarray = EVERY) -> Pixels:
-    """The pixels in some blocks, block after block; what sticks out of the picture is left away.
+    """List the pixels in some blocks, block after block; pixels outside the picture are left out.
 
     Args:
-        camera: says how large the picture is.
+        camera: gives the size of the picture.
         blocks: [n_blocks] numbers of blocks, row by row.
         per_row: blocks in a row of the picture.
         within: [m, 2] row and column of the pixels in each block.
@@ -65,7 +66,8 @@ def pixels_of_blocks(camera: Camera, blocks: np.ndarray, per_row: int, within: n
 def rays_of_pixels(
     camera: Camera, columns: np.ndarray, rows: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through pixel centres, as `Camera.rays` defines them, for pixels in any order; from `start` on."""
+    """Make rays through pixel centres, as `Camera.rays` defines them, for pixels in any order. The rays begin
+    at the distance `start`, model units, from the camera."""
     x = (columns + (0.5 - camera.cx)) / camera.fx
     y = (rows + (0.5 - camera.cy)) / -camera.fy
     rotation = camera.c2w[:3, :3]
@@ -81,7 +83,7 @@ def rays_of_pixels(
 
 
 class Planes(NamedTuple):
-    """What is written of the n pixels of a picture."""
+    """The arrays of a picture of n pixels, into which results are written."""
 
     rgb: np.ndarray
     """[n, 3] float32."""
@@ -102,12 +104,12 @@ def write_pixels(
     start: float,
     scale: float,
 ) -> None:
-    """Write what the march and the head have found for some pixels.
+    """Write the results of the march and of the head for some pixels.
 
     Args:
-        planes: of the whole picture.
-        index: [n_rays] which pixels.
-        result: of the march.
+        planes: arrays of the whole picture.
+        index: [n_rays] the pixel of each ray, as an index into the planes.
+        result: the result of the march of these rays.
         rgb: [n_hits, 3] the head's colours.
         behind: the background's colour; None leaves colours as the head gives them.
         start: distance from the camera to the rays' origins, model units.

@@ -1,4 +1,4 @@
-"""What a camera sees of a grid: blocks of pixels that may meet something, and the rays of their pixels."""
+"""What a camera sees of a grid: the blocks of pixels that may meet a brick, and the rays of their pixels."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from player.march.box import Bounds
 from player.march.pixels import EVERY, Pixels, pixels_of_blocks, rays_of_pixels
 
 FAR_AWAY = 64.0
-"""Camera distance, in half diagonals of the box, from which rays start beside the box: their float32
-origins would be too coarse at the camera, by a sixteenth of a pixel of 8192 here and by everything at 1e8
-units."""
+"""Camera distance, in half diagonals of the box, beyond which rays start beside the box. If they started at
+the camera, their float32 origins would be too coarse: at this distance by a sixteenth of a pixel in a picture
+of 8192 pixels, at 1e8 units by more than the whole box."""
 
 
 BlockBounds = Callable[[SparseGrid, Camera], tuple[np.ndarray, np.ndarray]]
 
 
 class View(NamedTuple):
-    """What a camera, in the model frame, may see of the grid."""
+    """The part of the grid that a camera, in the model frame, may see."""
 
     grid: SparseGrid
     camera: Camera
     start: float
-    """Way along each ray, model units, that is known to be empty: 0 unless the camera is far away."""
+    """Distance along each ray, model units, that is known to be empty: 0 unless the camera is far away."""
     blocks: np.ndarray
-    """[n] the blocks of pixels that may meet a brick."""
+    """[n] numbers of the blocks of pixels that may meet a brick."""
     near: np.ndarray
     far: np.ndarray
-    """[rows, columns] float32 bounds of t for each block, from `start` on."""
+    """[rows, columns] float32 bounds of t for each block, measured from `start`."""
 
     @classmethod
     def of(cls, grid: SparseGrid, camera: Camera, bounds_of: BlockBounds = block_bounds) -> View:
-        """What `camera` may see; `bounds_of` may be a faster way to find the bounds."""
+        """Find what `camera` may see; `bounds_of` may be a faster function for the bounds."""
         if grid.contracted:  # all of space: every pixel may meet something, from the camera on
             shape = (-(-camera.height // BLOCK), -(-camera.width // BLOCK))
             every = np.arange(shape[0] * shape[1])
@@ -50,22 +50,23 @@ class View(NamedTuple):
         radius = float(np.linalg.norm(size)) / 2
         distance = float(np.linalg.norm(camera.c2w[:3, 3] - (grid.aabb_min + size / 2)))
         start = distance - radius if distance > FAR_AWAY * radius else 0.0
-        if start:  # the bounds are as coarse there as the origins
+        if start:  # this far away, the bounds would be as coarse as the origins
             near, far = np.where(seen, np.float32(0), near), np.where(seen, np.float32(np.inf), far)
         return cls(grid, camera, start, np.flatnonzero(seen), near, far)
 
     def pixels(self, blocks: np.ndarray, within: np.ndarray = EVERY) -> Pixels:
-        """The pixels `within` (see `pixels_of_blocks`) some blocks."""
+        """List the pixels `within` some blocks (see `pixels_of_blocks`)."""
         return pixels_of_blocks(self.camera, blocks, self.near.shape[1], within)
 
     def index(self, pixels: Pixels) -> np.ndarray:
-        """[n] int64, which numbers of the picture's planes are those of some pixels."""
+        """Return the indices [n] int64 of some pixels in the picture's planes."""
         return pixels.rows * self.camera.width + pixels.columns
 
     def rays(
         self, pixels: Pixels, directions: Callable[..., np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray, Bounds]:
-        """Each pixel's origin, direction and bounds; `directions` may be a faster way to find directions."""
+        """Make the rays of pixels: their origins, directions and bounds. `directions` may be a faster
+        function for the directions."""
         if directions is None or self.start:
             rays_o, rays_d = rays_of_pixels(self.camera, pixels.columns, pixels.rows, self.start)
         else:

@@ -1,7 +1,4 @@
-"""How much graphics memory the page of an asset takes: the textures that `grid.js` and `textures.js` make.
-
-Letters: nb, nf bricks along an axis of the densities' and of the features' grid; n bricks of a kind.
-"""
+"""The graphics memory that an asset's page takes for the textures that `grid.js` and `textures.js` make."""
 
 from __future__ import annotations
 
@@ -11,26 +8,28 @@ from player.asset.asset import Asset
 from player.errors import FormatError
 
 DENSITY_BRICK = (8, 8, 10)
-"""Texels of a brick of densities: 8 x 8 columns of four vertices each, and which cells are live."""
+"""Texels of a brick of densities: 8 x 8 columns of ten. Each has the codes of four vertices, except the last
+of a column, which tells which cells of the column are live."""
 COLUMN_BRICK = (9, 8, 1)
-"""Texels of a brick that finds rows of features, of four numbers of 32 bits."""
+"""Texels, of four numbers of 32 bits each, of a brick that gives the rows of features."""
 MOST_LAYERS = 25
-"""Bricks above each other in a texture."""
+"""Most bricks on top of each other in a texture."""
 MOST_BRICKS = MOST_LAYERS * 256**2
 WIDTH = 2048
-"""Texels of a line of features, at most."""
+"""Most texels of a line of features."""
 LINES_A_LAYER = 256
 MOST_LAYERS_OF_FEATURES = 256
 MOST_ROWS = 2**24
 TILE = 256
-"""Pixels along a side of what is drawn at a time."""
+"""Pixels along a side of a tile, the part of the picture that is drawn at a time."""
 MOST_CHANNELS = 40
-"""Channels that a page can draw: eight in a draw buffer, and one buffer is for the opacity. WebGL2 promises
-four buffers, graphics cards have eight, and the renderer of Chromium for machines without one has six."""
+"""Most channels that a page can draw: eight per draw buffer, with one buffer for the opacity. WebGL2
+guarantees four buffers, graphics cards have eight, and the renderer of Chromium for machines without a card
+has six."""
 
 
 def gpu_bytes(asset: Asset) -> int:
-    """Bytes of graphics memory that the asset's textures take, and what a tile of the picture takes.
+    """Return the bytes of graphics memory that the asset's textures and a tile of the picture take.
 
     Raises FormatError: one of its arrays is larger than any texture.
     """
@@ -44,7 +43,8 @@ def gpu_bytes(asset: Asset) -> int:
 
 
 def block_texels(n: int, brick: tuple[int, int, int]) -> int:
-    """Texels of a texture of `n` bricks, MOST_LAYERS above each other at most, and as wide as it is high.
+    """Return the number of texels of a texture of `n` bricks, with at most MOST_LAYERS on top of each other
+    and as many along its width as along its height.
 
     >>> block_texels(0, (8, 8, 10)), block_texels(25, (8, 8, 10)), block_texels(26, (8, 8, 10))
     (640, 16000, 17920)
@@ -56,8 +56,8 @@ def block_texels(n: int, brick: tuple[int, int, int]) -> int:
 
 
 def feature_bytes(n: int, n_channels: int) -> int:
-    """Bytes of a texture of `n` rows of features: four channels a texel, and in a line as many rows as fit,
-    a power of two.
+    """Return the bytes of a texture of `n` rows of features: four channels per texel, and as many rows in a
+    line as fit, a power of two.
 
     >>> feature_bytes(0, 12), feature_bytes(512 * 256 + 1, 12) == 2 * 512 * 256 * 12
     (6144, True)

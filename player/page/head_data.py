@@ -1,9 +1,10 @@
-"""A head as a page has it: `head.json`, which says what there is, and `head.bin`, the numbers.
+"""A head in the form that a page reads: `head.json`, which describes its layers, and `head.bin`, their
+numbers.
 
-A layer in the JSON is {"n_in", "n_out", "weight", "bias", "scale"}, the last three {"type": "float32", "int8"
-or "int32", "first": its first byte in `head.bin`, a multiple of 4} or null; the names of layers are those of
-`player.head.graph.HeadArrays`. `monomials` are [parent, axis]: each is the product of an earlier one, -1 for
-1, and a component of the direction.
+A layer in the JSON is {"n_in", "n_out", "weight", "bias", "scale"}. The last three are null or {"type":
+"float32", "int8" or "int32", "first": the index of the first byte in `head.bin`, a multiple of 4}. The names
+of layers are those of `player.head.graph.HeadArrays`. `monomials` are pairs [parent, axis]: each monomial is
+the product of an earlier one (-1 for 1) and a component of the direction.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class _Numbers:
 
 
 def head_data(head: HeadArrays) -> HeadData:
-    """The files of a head."""
+    """Make the files of a head."""
     numbers = _Numbers()
     description = {
         "sh_degree": head.form.sh_degree,
@@ -72,8 +73,8 @@ def _rounding(rounding: Rounding) -> dict[str, float | int]:
 
 
 def monomial_products(sh_degree: int) -> list[tuple[int, int]]:
-    """For each monomial of the orders 1 to `sh_degree` - 1: its parent's place in this list, -1 for 1, and
-    the axis, 0 to 2, that it is the product of.
+    """Return, for each monomial of the orders 1 to `sh_degree` - 1, its two factors: the index of its parent
+    in this list (-1 for 1) and an axis, 0 to 2.
 
     >>> monomial_products(3)[:5]
     [(-1, 0), (-1, 1), (-1, 2), (0, 0), (1, 0)]

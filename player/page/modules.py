@@ -1,15 +1,15 @@
 """The JavaScript modules of the page, joined into one script.
 
-A web page that is opened from a disk may not load modules from files. So the modules of `player/page/web`
-keep to a small part of the language, from which one script can be made by looking at lines alone:
+A web page that is opened from a disk may not load modules from files. So the modules of `player/page/web` use
+only a small part of the language, so that they can be joined line by line, without a parser:
 
 - an import begins a line and reads `import { a, b as c } from "./name.js";`;
 - an export begins a line and is `export` before `function`, `async function`, `class` or `const` and a name;
 - imports have no circle, and nothing awaits outside of a function.
 
-Each module becomes a function that returns its exports, and is called when it is first asked for. So names
-that a module does not export are its own, and one script can begin with either of two modules: the page's
-`main.js`, and `worker.js` in a worker that is made of the same text.
+Each module becomes a function that returns its exports, and that is called when the module is first asked
+for. So names that a module does not export stay its own, and one script can begin with either of two modules:
+the page's `main.js`, or `worker.js` in a worker that is made from the same text.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ const load = (name) => (loaded[name] ??= modules[name]());
 
 
 def joined(sources: Mapping[str, str], page: str = "main.js", worker: str = "worker.js") -> str:
-    """One script of the modules that `page` and `worker` need.
+    """Join the modules that `page` and `worker` need to one script.
 
     Args:
         sources: the text of each module, by its file's name.
@@ -39,7 +39,7 @@ def joined(sources: Mapping[str, str], page: str = "main.js", worker: str = "wor
         worker: the module that runs in a worker.
 
     Raises:
-        FormatError: a module that is not there, a circle, an import or export of another form.
+        FormatError: a module is missing, imports have a circle, or an import or export has another form.
 
     >>> sources = {"main.js": 'import { two as b } from "./two.js";\\nconsole.log(b);\\n',
     ...            "two.js": "export const two = 2;\\n", "worker.js": "postMessage(1);\\n"}
@@ -68,7 +68,7 @@ def joined(sources: Mapping[str, str], page: str = "main.js", worker: str = "wor
 
 
 def _order(sources: Mapping[str, str], entries: tuple[str, ...]) -> list[str]:
-    """The modules that the entries need, each behind those that it imports."""
+    """List the modules that the entries need, each after those that it imports."""
     order: list[str] = []
 
     def visit(name: str, path: tuple[str, ...]) -> None:
@@ -87,7 +87,7 @@ def _order(sources: Mapping[str, str], entries: tuple[str, ...]) -> list[str]:
 
 
 def _as_function(source: str, name: str) -> str:
-    """A module's text as the body of a function that returns what it exports."""
+    """Turn a module's text into the body of a function that returns the module's exports."""
     exported = [match[2] for match in _EXPORT.finditer(source)]
 
     def import_line(match: re.Match[str]) -> str:
@@ -102,11 +102,11 @@ def _as_function(source: str, name: str) -> str:
 
 
 def without_comments(source: str) -> str:
-    """A module or a shader without comments, without indents and without empty lines.
+    """Return a module or a shader without comments, indents and empty lines.
 
     Comments are `// ...` lines, ` // ...` at the end of a line if no quote is in it, and `/* ... */` that
-    begins and ends lines of its own; templates and strings of several lines keep what they hold only if none
-    of their lines has what looks like one.
+    begins and ends lines of its own. A template or string of several lines keeps its content only if none of
+    its lines looks like a comment.
 
     >>> without_comments("// What it is.\\nconst a = 1; // one\\n\\n  /* more\\n  text */\\n  f(a);\\n")
     'const a = 1;\\nf(a);\\n'

@@ -14,12 +14,12 @@ class Inline:
     """A page that a notebook (Jupyter and others) shows below a cell; made by `inline`."""
 
     content: bytes = field(repr=False)
-    """The page, HTML."""
+    """The page, as HTML."""
     height: int
-    """Pixels."""
+    """Height of the frame in pixels."""
 
     def _repr_html_(self) -> str:
-        """The page in a frame that can reach nothing of the notebook."""
+        """Return the page in a frame that cannot reach anything of the notebook."""
         text = html.escape(self.content.decode("ascii"))
         style = f"width: 100%; height: {self.height}px; border: 0"
         allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen"'
@@ -27,7 +27,7 @@ class Inline:
 
 
 def inline(asset: Asset, height: int = 480) -> Inline:
-    """The page of an asset, for a notebook to show below the cell that ends with it.
+    """Make the page of an asset, which a notebook shows below a cell whose last value it is.
 
     Args:
         asset: an open asset, all of its parts.

@@ -1,23 +1,24 @@
 """An asset as one HTML file that plays it in any browser, or as a folder for a web server.
 
 Both have the same modules, shaders, styles and data (`player/page/web`, and for the data
-`player.page.scene_files`). The file has them inside: the modules as one script (`player.page.modules`),
-packed by zlib, and the data, both as text (`player.page.text_bytes`). All of it is ASCII, so that no charset
-that a server claims can change it.
+`player.page.scene_files`). The one file contains the modules, joined to one script (`player.page.modules`)
+and compressed by zlib, and the data. Both are stored as text (`player.page.text_bytes`). The file is ASCII
+throughout, so that it reads the same whatever charset a server claims.
 
 Files of `player/page/web`:
 
-- `*.js` are ES modules that keep to the rules of `player.page.modules`: `main.js` begins, `worker.js`
-  decodes; `boot.js` unpacks the script of the one file and runs it.
-- `*.glsl` are shaders. They come as the module `shaders.js`, which is written here:
-  `import { shaders } from "./shaders.js";`, then `shaders["march.glsl"]`.
+- `*.js` are ES modules that keep to the rules of `player.page.modules`: `main.js` starts the page,
+  `worker.js` decodes the data, and `boot.js` unpacks the script of the one file and runs it.
+- `*.glsl` are shaders. They are joined to the module `shaders.js`, which is written here: `import { shaders }
+  from "./shaders.js";`, then `shaders["march.glsl"]`.
 - `style.css` is the style.
-- `index.html` is the page. `{{title}}` in it becomes text, `{{poster}}` an address for `src`; `{{policy}}`,
-  `{{style}}`, `{{data}}` and `{{script}}` become whole elements.
+- `index.html` is the page. `{{title}}` in it is replaced by text, `{{poster}}` by an address for `src`, and
+  `{{policy}}`, `{{style}}`, `{{data}}` and `{{script}}` by whole elements.
 
-In the file, each file of the data is an element `<script type="text/plain" data-file="NAME">`, the manifest
-as it is and the others as text. The script is the element with the id `script`, whose text is also what its
-worker runs. What begins comes before the data, so that it can tell where these are cut short.
+In the one file, each file of the data is an element `<script type="text/plain" data-file="NAME">`, the
+manifest as it is and the others as text. The compressed script is the element with the id `viewer`. `boot.js`
+unpacks it to an element with the id `script`, whose text the worker runs as well. The scripts come before the
+data, so that they can tell where the data are cut short.
 """
 
 from __future__ import annotations
@@ -53,27 +54,27 @@ _POLICY = (
 
 
 class WebPage(NamedTuple):
-    """What an asset's page consists of."""
+    """The files of an asset's page, and how much memory they take."""
 
     files: dict[str, bytes]
     """Content by name: `index.html` alone for one file."""
     viewer_bytes: int
-    """Bytes of all but the scene's data and the poster."""
+    """Bytes of everything but the scene's data and the poster."""
     gpu_bytes: int
-    """Graphics memory that it will take."""
+    """Bytes of graphics memory that the page will take."""
 
 
 def page(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> bytes:
-    """One HTML file, ASCII, which asks for nothing beside itself.
+    """Make one HTML file, in ASCII, which loads nothing else.
 
     Args:
         asset: an open asset, all of its parts.
         title: the page's title; the name of the asset's folder if None.
-        max_gpu_mb: megabytes of graphics memory that it may take.
+        max_gpu_mb: megabytes of graphics memory that the page may take.
 
     Raises:
-        ConfigError: it takes more graphics memory, has more channels than browsers can draw, or was opened
-            with fewer parts.
+        ConfigError: the page takes more graphics memory, or the asset has more channels than browsers can
+            draw, or was opened without some of its parts.
         FormatError: a file of the asset is broken, or a part is missing.
 
     >>> page(Asset.open("out/"))[:15]
@@ -83,7 +84,7 @@ def page(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -
 
 
 def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
-    """As `page`, with what there is to say about it."""
+    """Make the same file as `page`; returns it with its sizes."""
     n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
     sources = web_files()
     style, script = _escaped_style(sources[STYLE] + _behind(asset)), page_script(sources)
@@ -111,8 +112,8 @@ def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = M
 
 
 def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
-    """The files of a folder for a web server. The page, `index.html`, shows something after the first part.
-    Arguments and errors as `page`.
+    """Make the files of a folder for a web server. Its page, `index.html`, shows the scene as soon as the
+    first part is loaded. Arguments and errors are those of `page`.
 
     >>> files = page_of_many_files(Asset.open("out/")).files
     >>> {"index.html", "main.js", "part_0.bin"} <= set(files)
@@ -137,7 +138,7 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int =
 
 
 def is_site_file(name: str) -> bool:
-    """Whether `page_of_many_files` writes a file of that name.
+    """Return whether `page_of_many_files` writes a file of that name.
 
     >>> is_site_file("main.js"), is_site_file("part_3.bin"), is_site_file("mine.js")
     (True, True, False)
@@ -163,7 +164,7 @@ def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
 
 
 def _behind(asset: Asset) -> str:
-    """A rule of style: beside the poster there is the scene's background."""
+    """Return a CSS rule that shows the scene's background beside the poster."""
     red, green, blue = (round(255 * value) for value in asset.manifest.background)
     return f"#stage {{ background: rgb({red}, {green}, {blue}); }}\n"
 
@@ -173,7 +174,7 @@ def _title(asset: Asset, title: str | None) -> str:
 
 
 def web_files() -> dict[str, str]:
-    """The modules, styles and the page itself by file name, without comments, with the shaders as
+    """Read the modules, the style and the page itself, by file name, without comments and with the shaders as
     `shaders.js`."""
     folder = resources.files("player.page") / "web"
     files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
@@ -184,7 +185,7 @@ def web_files() -> dict[str, str]:
 
 
 def data_elements(files: Mapping[str, bytes]) -> bytes:
-    """The elements of a page that hold the files of `scene_files`."""
+    """Make the elements of a page that hold the files of `scene_files`."""
     texts = {
         name: data.replace(b"<", b"\\u003c") if name == MANIFEST else text_of_bytes(data)
         for name, data in files.items()
@@ -200,7 +201,7 @@ def _stripped(name: str, text: str) -> str:
 
 
 def page_script(files: Mapping[str, str], begin: str = "main.js", worker: str = "worker.js") -> str:
-    """The one script of a page, in ASCII, of those modules among `web_files` that it needs."""
+    """Join those modules of `web_files` that a page needs to one script, in ASCII."""
     script = joined(files, begin, worker)
     script = re.sub(r"</(?=script)", r"<\\/", script, flags=re.IGNORECASE).replace("<!--", r"<\!--")
     units = script.encode("utf-16-le")
@@ -217,7 +218,7 @@ def _ascii_html(text: str) -> bytes:
 
 
 def _hash(text: str) -> str:
-    """As a Content-Security-Policy names an element by its text."""
+    """Return the hash by which a Content-Security-Policy names an element with this text."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
@@ -226,5 +227,5 @@ def _policy_element(policy: str) -> str:
 
 
 def _filled(index: str, values: Mapping[str, str]) -> str:
-    """The page with each `{{name}}` filled in; what is filled in is not looked at again."""
+    """Fill in each `{{name}}` of the page; what is filled in is not searched again."""
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], index)

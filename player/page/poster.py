@@ -1,4 +1,4 @@
-"""The picture that a page shows before anything else, and where nothing else can be shown."""
+"""The poster: the picture that a page shows before anything else, and where nothing else can be shown."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from player.page.rest import rest_camera
 from player.render import Renderer
 
 LONGEST = 800
-"""Pixels of the longer side, at most."""
+"""Most pixels of the longer side."""
 QUALITY = 85
 
 
 def poster_bytes(asset: Asset) -> bytes:
-    """A JPEG of what the page begins with, over the asset's background.
+    """Render a JPEG of the view that the page begins with, over the asset's background.
 
     >>> poster_bytes(Asset.open("out/"))[:3]
     b'\\xff\\xd8\\xff'

@@ -10,13 +10,14 @@ import numpy as np
 from player.cameras.camera import Camera, focus_point, orbit, world_up
 
 ON_ONE_SIDE = 0.2
-"""Length of the mean of the cameras' directions, seen from above, from which on they are not all around."""
+"""Length of the mean of the cameras' directions from what they look at, seen from above, beyond which they
+count as standing on one side."""
 
 
 def rest_camera(cameras: Sequence[Camera]) -> Camera:
-    """A level camera at the median distance and elevation of `cameras` from what they look at, in the middle
-    of their turn around it; beside the first where they stand all around. The lens is the first one's, with
-    its axis in the middle of the picture.
+    """Return a level camera at the median distance and elevation of `cameras` from what they look at. Its
+    direction from there is the mean of theirs if they stand on one side; it is beside the first camera if
+    they stand all around. The lens is the first camera's, with its axis in the middle of the picture.
 
     Raises FormatError for no cameras.
     """

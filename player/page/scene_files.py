@@ -1,4 +1,4 @@
-"""The data of a page: the files that its loader asks for, by name.
+"""The data of a page: the files that its loader asks for.
 
 | file | content |
 |---|---|
@@ -7,7 +7,7 @@
 | `head.json`, `head.bin` | the head (`player.page.head_data`) |
 | `part_0.bin`, ... | the asset's own parts |
 
-An asset of version 3 has its densities and features written as the parts of a pyramid of one level, which
+The densities and features of an asset of version 3 are written as the parts of a pyramid of one level, which
 holds the same values.
 """
 
@@ -29,10 +29,10 @@ MANIFEST = NAME
 
 
 def scene_files(asset: Asset) -> dict[str, bytes]:
-    """The data of a page, in the order in which they are asked for.
+    """Make the data of a page, in the order in which its files are asked for.
 
-    Raises FormatError: a file of the asset is broken, or a part is missing; ConfigError: it was opened with
-    fewer parts.
+    Raises FormatError: a file of the asset is broken, or a part is missing; ConfigError: the asset was opened
+    without some of its parts.
 
     >>> list(scene_files(Asset.open("out/")))
     ['manifest.json', 'cameras.json', 'head.json', 'head.bin', 'part_0.bin']

@@ -1,9 +1,10 @@
-"""Bytes as text of an HTML page: seven characters for six bytes, a sixth more.
+"""Encoding of bytes as text in an HTML page: seven characters for six bytes, a sixth more.
 
-Six bytes, the first the lowest, are a number below 2^48, which is below 116^7: its seven digits, the lowest
-first, are seven characters of `ALPHABET`. It has ASCII characters alone, so that the text is the same in
-every charset that a page may be taken for, and none to which HTML, JavaScript or the line ends of text files
-give a meaning. The last bytes are filled up with zeros to six; how many count is for the reader to know.
+Six bytes, the lowest first, are a number below 2^48, which is less than 116^7. Its seven digits in base 116,
+the lowest first, are written as seven characters of `ALPHABET`. The alphabet has only ASCII characters, so
+that the text is the same in every charset that a page may be taken for. It has none that HTML, JavaScript or
+the line ends of text files give a meaning to. The last group of bytes is padded with zeros to six; the reader
+must know the number of bytes.
 """
 
 from __future__ import annotations
@@ -11,18 +12,18 @@ from __future__ import annotations
 import numpy as np
 
 _LEFT_OUT = b"\x00\n\r\x0b\x0c\x1a\x1b\"&'<\x7f"
-"""Line ends and spaces that a reader may change, ends of files and of elements, and what entities are made
-with."""
+"""Characters that are left out of the alphabet: line ends and spaces that a reader may change, ends of files
+and of elements, quotes, and the first character of entities."""
 ALPHABET = bytes(code for code in range(128) if code not in _LEFT_OUT)
 BASE = len(ALPHABET)
-"""116."""
+"""Number of characters in the alphabet: 116."""
 N_BYTES, N_CHARACTERS = 6, 7
 _AT_ONCE = 1 << 18
-"""Groups that are turned into text at a time: some megabytes."""
+"""Groups of bytes that are turned into text at a time, which takes some megabytes."""
 
 
 def text_of_bytes(data: bytes) -> bytes:
-    """ASCII text for any bytes.
+    """Encode any bytes as ASCII text.
 
     >>> text_of_bytes(b"\\x00\\x00\\x00\\x00\\x00\\x00\\x01")
     b'\\x01\\x01\\x01\\x01\\x01\\x01\\x01\\x02\\x01\\x01\\x01\\x01\\x01\\x01'
@@ -42,7 +43,8 @@ def text_of_bytes(data: bytes) -> bytes:
 
 
 def bytes_of_text(text: bytes) -> bytes:
-    """Undo `text_of_bytes`, but for the zeros behind the last byte. Raises ValueError for other text."""
+    """Decode the text of `text_of_bytes`; zeros that pad the last bytes stay. Raises ValueError for other
+    text."""
     digits = np.frombuffer(text, np.uint8).reshape(-1, N_CHARACTERS)
     places = np.full(256, BASE, np.uint64)
     places[list(ALPHABET)] = np.arange(BASE)

@@ -1,4 +1,4 @@
-"""Assets of a viewer that grow while they are shown."""
+"""Reading further parts of assets while the viewer shows the first ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from player.terminal import printable
 
 
 class Growing:
-    """A thread that reads on, while the windows show what there is already."""
+    """A thread that reads further parts of assets, while the windows show what is read already."""
 
     def __init__(
         self,
@@ -20,11 +20,11 @@ class Growing:
         changed: Callable[[], object],
         say: Callable[[str], object],
     ) -> None:
-        """Start to read.
+        """Start the thread.
 
         Args:
-            growing: what shows an asset, and the same asset with more and more of its parts; one asset after
-                the other.
+            growing: for each asset, the renderer that shows it, and an iterator that yields the same asset
+                with more and more of its parts. The assets are read one after the other.
             changed: called whenever there is more to see.
             say: called with a line for each asset of which some parts cannot be read.
         """
@@ -34,7 +34,7 @@ class Growing:
         self._thread.start()
 
     def stop(self) -> None:
-        """Read no further part. The one that is being read is not waited for."""
+        """Stop reading after the part that is being read, without waiting for it."""
         self._stopped.set()
 
     def _run(self) -> None:
@@ -52,6 +52,6 @@ class Growing:
 
 
 def tell_what_is_missing(asset: Asset, say: Callable[[str], object]) -> None:
-    """Say in a line why an asset is not whole, if it is not."""
+    """Say in a line what is missing, if an asset is not whole."""
     if asset.missing is not None:
         say(f"warning: {printable(asset.missing)}")

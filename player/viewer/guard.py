@@ -1,12 +1,12 @@
-"""Who may connect to the viewer, and how much of what a client sends is read.
+"""Checks of who may connect to the viewer, and limits on what a client may send.
 
-Any page that a browser has open can send requests to an address of this machine, and by a name that it lets
-point here (DNS rebinding) it can even read the answers. A browser says in the header Host which name it
-was given, and in Origin which page asks: both are checked before anything else happens. What comes in
-after that is bounded in length, in number and in rate, and read by `player.viewer.messages`.
+Any page that is open in a browser can send requests to an address of this machine. If it makes a name of its
+own point here (DNS rebinding), it can even read the answers. A browser tells in the header Host which name it
+was given, and in Origin which page asks: both are checked before anything else happens. What comes in after
+that is limited in length, number and rate, and read by `player.viewer.messages`.
 
-viser has no setting for any of this. It calls `websockets.asyncio.server.serve`, so that is where the checks
-are put in while it starts; where it does not, nothing is served.
+viser has no setting for any of this. It calls `websockets.asyncio.server.serve`, so the checks are inserted
+there while viser starts. If a version of viser does not call that, nothing is served.
 """
 
 from __future__ import annotations
@@ -34,22 +34,24 @@ from player.viewer.pages import NO_PAGES, PAGE_SECONDS, Pages
 
 MOST_CLIENTS = 24
 MOST_SOCKETS = 128
-"""Open connections, with those that have not yet asked for anything."""
+"""Most open connections, including those that have not sent a request yet."""
 CAMERA_SECONDS = 1 / 60
-"""Seconds between two moves of a camera, at least: of the messages in between the newest counts."""
+"""Least time in seconds between two moves of a camera that are passed on; of the messages in between, only
+the newest counts."""
 RATE = 200.0
-"""Messages of one client that are read in a second; a window that is dragged about sends 50."""
+"""Messages of one client that are read per second; a window whose view is being dragged sends 50."""
 OPEN_SECONDS = 10.0
-"""Seconds in which a request has to be there, and in which its answer, but for a page, has to be taken."""
+"""Seconds within which a client must send its request, and within which it must take the answer unless that
+is a page."""
 FIRST_SECONDS = 60.0
-"""Seconds after which a client that has not told its camera is dropped."""
+"""Seconds after which a client that has not sent its camera is dropped."""
 MOST_FRAGMENTS = 16
-"""Parts that a message may come in."""
+"""Most fragments that a message may come in."""
 MOST_PINGS = 20
-"""Pings of a connection in PING_SECONDS; browsers send none."""
+"""Most pings of a connection within PING_SECONDS; browsers send none."""
 PING_SECONDS = 20.0
 MOST_UNREAD_BYTES = 64 << 20
-"""Bytes of answers that a client may leave unread."""
+"""Most bytes of answers that a client may leave unread."""
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -61,8 +63,8 @@ class Guard:
     """The rules of one server, and its open connections."""
 
     def __init__(self, host: str, version: str, pages: Pages = NO_PAGES) -> None:
-        """`host`: the address that is served at. `version`: viser's, which its pages have to have as well.
-        `pages`: what is served beside them."""
+        """`host`: the address to serve at. `version`: viser's version, which its pages must have as well.
+        `pages`: the assets' pages, which are served beside the viewer's."""
         self._host = host.lower()
         self.version = version
         self.pages = pages
@@ -71,7 +73,8 @@ class Guard:
         self.installed = False
 
     def serve_options(self, answer: Callable[..., Any]) -> dict[str, Any]:
-        """Settings of `websockets.asyncio.server.serve`; `answer` answers the requests that are let in."""
+        """Return settings for `websockets.asyncio.server.serve`; `answer` answers the requests that are let
+        in."""
 
         def admit(connection: GuardedConnection, request: Request) -> Any:
             refused = self.refusal(request.path, request.headers)
@@ -90,12 +93,12 @@ class Guard:
             "create_connection": lambda *args, **kwargs: GuardedConnection(self, *args, **kwargs),
             "max_size": MAX_BYTES,
             "compression": None,
-            "open_timeout": PAGE_SECONDS,  # a connection itself waits less long for all else
+            "open_timeout": PAGE_SECONDS,  # for pages; GuardedConnection waits less long for all else
             "logger": _logger(),
         }
 
     def refusal(self, path: str, headers: Headers) -> tuple[int, str] | None:
-        """Status and reason for which a request is refused; None if it is let in."""
+        """Return the status and the reason with which a request is refused; None if it is let in."""
         host = _only(headers, "Host")
         name = None if host is None else _name(host)
         if host is None or name is None or not self.answers_to(name):
@@ -121,10 +124,10 @@ class Guard:
         return None
 
     def answers_to(self, name: str) -> bool:
-        """Whether a browser that asks for this name means us.
+        """Return whether a request for the host `name` is meant for this server.
 
-        A name is what a foreign page can let point here; an address is not, so where others than this
-        machine may look, any address will do.
+        A foreign page can make a name of its own point here, but not an address. So where other machines may
+        connect, any address is accepted, as is the name of this machine.
         """
         if name in (*LOOPBACK, self._host):
             return True
@@ -132,13 +135,13 @@ class Guard:
 
 
 class GuardedConnection(ServerConnection):
-    """A connection that hands on messages which have been checked, and not too many of them."""
+    """A connection that passes on only checked messages, and not too many of them."""
 
     def __init__(self, guard: Guard, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._guard = guard
         self.controls: dict[str, Check] = {}
-        """The checks of values that the client sends, by the names that its controls have in messages."""
+        """The checks of the values that the client sends, by the names of its controls in messages."""
         self.n_sending = 0
         """Messages that are on their way to the client."""
         self._ready: list[bytes] = []
@@ -161,7 +164,8 @@ class GuardedConnection(ServerConnection):
         super().connection_lost(exc)
 
     async def handshake(self, *args: Any, **kwargs: Any) -> None:
-        """Answer the connection's first request: a page is sent here, all else as websockets does."""
+        """Answer the connection's first request: an asset's page is sent here, all else is answered by
+        websockets."""
         waited = (self.request_rcvd, self.connection_lost_waiter)
         await asyncio.wait(waited, timeout=OPEN_SECONDS, return_when=asyncio.FIRST_COMPLETED)
         request, guard = self.request, self._guard
@@ -194,9 +198,10 @@ class GuardedConnection(ServerConnection):
             self.n_sending -= 1
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Wait for the next message that passes its check, written anew.
+        """Wait for the next message that passes its check; returns it encoded anew.
 
-        Of messages about the camera the newest is returned, CAMERA_SECONDS after the one before.
+        Of messages about the camera, only the newest is returned, no sooner than CAMERA_SECONDS after the one
+        before.
         """
         CONNECTION.set(self)
         now = self.loop.time
@@ -223,7 +228,7 @@ class GuardedConnection(ServerConnection):
             if is_camera:
                 self._camera, self._first_due = data, float("inf")
                 continue
-            if self._camera is not None:  # what was pressed means the view as it is by now
+            if self._camera is not None:  # a pressed control refers to the newest view
                 self._ready.append(self._newest_camera(now()))
             self._ready.append(data)
 
@@ -243,7 +248,8 @@ class GuardedConnection(ServerConnection):
 
 @contextmanager
 def every_connection_checked(guard: Guard) -> Iterator[None]:
-    """While a viser server starts: every connection to it is a GuardedConnection, or MissingExtraError."""
+    """Make every connection to a viser server that starts in the `with` block a GuardedConnection. Raises
+    MissingExtraError if this version of viser does not allow that."""
     from viser import _gui_handles, _messages
 
     wanted = {
@@ -279,7 +285,7 @@ def _unknown_viser(version: str) -> MissingExtraError:
 
 
 def _logger() -> logging.Logger:
-    """The logger of websockets' server, without the messages that every client can cause."""
+    """Return a logger for websockets' server that drops the messages which any client can cause."""
     logger = logging.getLogger("websockets.server.vfr-play")
     logger.addFilter(
         lambda record: not record.getMessage().startswith(("opening handshake failed", "connection rej"))
@@ -293,7 +299,7 @@ def _only(headers: Headers, name: str) -> str | None:
 
 
 def _name(host: str) -> str | None:
-    """The name in a Host header, in lower case; None if there is none.
+    """Return the name in a Host header, in lower case; None if there is none.
 
     >>> _name("localhost:8080"), _name("[::1]:8080"), _name("[::1]"), _name("a:b"), _name("")
     ('localhost', '::1', '::1', None, None)

@@ -14,10 +14,10 @@ _MAP = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253
 
 
 def layer_picture(frame: Frame, layer: str) -> np.ndarray:
-    """[h, w, 3] uint8 of one of LAYERS; the frame has a background.
+    """Return the picture [h, w, 3] uint8 of one of LAYERS; the frame must have a background.
 
-    Depth runs from yellow, near, to blue; samples from blue, none, to yellow, most; normals are x, y, z as
-    red, green and blue, in the world frame; opacity is grey.
+    Depth runs from yellow (near) to blue; samples run from blue (none) to yellow (most); normals are x, y, z
+    as red, green and blue, in the world frame; opacity is grey.
 
     >>> zeros = np.zeros((1, 2), np.float32)
     >>> frame = Frame(np.ones((1, 2, 3)), np.float32([[0, 1]]), zeros, zeros, (1.0, 1.0, 1.0))
@@ -39,12 +39,12 @@ def layer_picture(frame: Frame, layer: str) -> np.ndarray:
 
 
 def coloured(values: np.ndarray) -> np.ndarray:
-    """Values 0..1 [...] to colours [..., 3], 0..1."""
+    """Map values 0..1 [...] to colours [..., 3], 0..1."""
     at = np.linspace(0, 1, len(_MAP))
     return np.stack([np.interp(values, at, _MAP[:, channel]) for channel in range(3)], axis=-1)
 
 
 def _spread(depth: np.ndarray, met: np.ndarray) -> np.ndarray:
-    """Depth as 0..1, from the nearest hundredth of the pixels that met something to the farthest."""
+    """Scale depth to 0..1, from the nearest hundredth of the pixels that met something to the farthest."""
     near, far = np.percentile(depth[met], [1, 99]) if met.any() else (0.0, 1.0)
     return np.clip((depth - near) / max(far - near, 1e-12), 0, 1)

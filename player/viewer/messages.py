@@ -1,7 +1,8 @@
-"""What a browser may say to the viewer: where its camera is, and what one of its own controls was set to.
+"""The messages that a browser may send to the viewer: where its camera is, and what one of its own controls
+was set to.
 
-Every message is read with a strict schema, and what goes on to viser is written anew from what was read:
-viser itself would set any attribute of a control that a client names, and calculate with any number.
+Every message is decoded with a strict schema, and encoded anew before it goes on to viser. viser itself would
+set any attribute of a control that a client names, and calculate with any number.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 MAX_BYTES = 4096
-"""Bytes of a message, at most; a browser's has some 250."""
+"""Most bytes of a message; a browser's has some 250."""
 
 FAR = 1e9
 """Largest coordinate of a camera, world units; float32 rays from further away are too coarse."""
@@ -56,7 +57,8 @@ _decoder = msgspec.msgpack.Decoder(_Camera | _Update)
 
 
 def cleaned(raw: bytes | str, controls: Mapping[str, Check]) -> tuple[bool, bytes] | None:
-    """A message as viser may see it, and whether it tells the camera; None if it is to be ignored.
+    """Check a message. Returns whether it is about the camera, and the message encoded for viser; None if it
+    is to be ignored.
 
     `controls`: the checks of values for the client's controls, by the names that these have in messages.
 
@@ -84,11 +86,11 @@ def cleaned(raw: bytes | str, controls: Mapping[str, Check]) -> tuple[bool, byte
 
 
 def _is_camera(camera: _Camera) -> bool:
-    """Whether a picture can be rendered for it, and viser can calculate with it."""
+    """Return whether a picture can be rendered for a camera, and viser can calculate with it."""
     places = (*camera.position, *camera.look_at)
     numbers = (*camera.wxyz, *camera.up_direction, camera.near, camera.far)
     return (
-        all(abs(value) <= FAR for value in places)  # NaN is not
+        all(abs(value) <= FAR for value in places)  # False for NaN
         and all(map(math.isfinite, numbers))
         and 1e-3 <= camera.fov <= 3.1
         and abs(math.hypot(*camera.wxyz) - 1) <= 1e-2
@@ -101,7 +103,8 @@ def _is_camera(camera: _Camera) -> bool:
 
 
 def within(bounds: Callable[[], tuple[float, float]], whole: bool) -> Check:
-    """The check of a slider: the nearest number between its bounds, which are asked for each time."""
+    """Make the check of a slider: it takes the nearest number between its bounds, which are asked for each
+    time."""
 
     def check(value: Any) -> float | None:
         if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
@@ -114,17 +117,17 @@ def within(bounds: Callable[[], tuple[float, float]], whole: bool) -> Check:
 
 
 def one_of(options: Sequence[str]) -> Check:
-    """The check of a dropdown: it takes one of its options."""
+    """Make the check of a dropdown: it takes one of its options."""
     return lambda value: value if isinstance(value, str) and value in options else None
 
 
 def colour(value: Any) -> list[int] | None:
-    """The check of a colour: it takes a list of three bytes."""
+    """Check a colour: a list of three numbers, each taken as the nearest byte."""
     take = within(lambda: (0, 255), whole=True)
     levels = [take(part) for part in value] if isinstance(value, list) else []
     return None if len(levels) != 3 or None in levels else levels
 
 
 def pressed(value: Any) -> bool | None:
-    """The check of a button."""
+    """Check a button: it takes True alone."""
     return True if value is True else None

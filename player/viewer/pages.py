@@ -1,8 +1,8 @@
-"""The page of an asset beside the viewer. The visitor's own machine draws it, so that this one has nothing to
-do but to send it.
+"""Pages of assets, served beside the viewer. A page is rendered by the visitor's own machine, so that this
+one only has to send it.
 
-A page is made when it is first asked for, once, and sent in small pieces as fast as each visitor takes them,
-so that it is in memory once, whoever asks. One that cannot be made is tried again when it is next asked for.
+A page is made once, when it is first asked for, and sent in small pieces as fast as each visitor takes them.
+So it is in memory only once, however many ask. If it cannot be made, the next request tries again.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 PATH = "/page"
 MOST_DOWNLOADS = 32
-"""Visitors who are sent a page at a time."""
+"""Most visitors that pages are sent to at the same time."""
 PAGE_SECONDS = 900.0
-"""Time in which a page has to be made and taken; a slow visitor is not waited for without end."""
+"""Seconds within which a page must be made and taken: a slow visitor is not waited for without end."""
 PIECE = 1 << 17
-"""Bytes that are handed over at a time."""
+"""Bytes that are handed to a connection at a time."""
 
 
 class Answer(NamedTuple):
-    """What a visitor is sent."""
+    """A response to a visitor."""
 
     status: str
     """Status and reason, for example "200 OK"."""
@@ -40,13 +40,15 @@ class Pages:
     """The pages of some assets: that of the first at PATH, those of the others at PATH/1, PATH/2, ..."""
 
     def __init__(self, makers: Sequence[Callable[[], bytes]]) -> None:
-        """`makers`: each makes the page of one asset, or raises VfrError where that has none."""
+        """`makers`: functions, each of which makes the page of one asset, or raises VfrError if that is not
+        possible."""
         self._makers = {page_path(index): maker for index, maker in enumerate(makers)}
         self._made: dict[str, asyncio.Future[bytes]] = {}
         self._downloads: set[asyncio.Task[Any]] = set()
 
     def close(self) -> None:
-        """End the downloads that are under way, from any thread: a server waits for them when it stops."""
+        """Cancel the downloads that are under way, because a server waits for them when it stops. May be
+        called from any thread."""
         for task in list(self._downloads):
             task.get_loop().call_soon_threadsafe(task.cancel)
 
@@ -71,15 +73,15 @@ class Pages:
         if path not in self._made:
             self._made[path] = asyncio.ensure_future(self._make(path))
         try:
-            # whoever asked first may go: the others still wait for it
+            # shielded: the first visitor may leave, while the others still wait for it
             body = await asyncio.shield(self._made[path])
         except VfrError as error:
             return _refused(printable(str(error)))
         return Answer("200 OK", "text/html; charset=utf-8", body)
 
     async def _make(self, path: str) -> bytes:
-        """Make a page. One that cannot be made is forgotten, so that whoever asks next has it tried again: an
-        asset may be whole by then."""
+        """Make a page. A failure is forgotten, so that the next request tries again: the asset may be whole
+        by then."""
         try:
             return await asyncio.to_thread(self._makers[path])
         except BaseException:
@@ -91,7 +93,7 @@ NO_PAGES = Pages(())
 
 
 def page_path(index: int) -> str:
-    """Where the page of an asset is, by its place in the list of assets.
+    """Return the path in the address of an asset's page, from the asset's index in the list of assets.
 
     >>> page_path(0), page_path(2)
     ('/page', '/page/2')
@@ -104,7 +106,7 @@ def _refused(why: str) -> Answer:
 
 
 async def _send(connection: ServerConnection, answer: Answer) -> None:
-    """Send an answer, no more of it at a time than the visitor takes."""
+    """Send an answer, as fast as the visitor takes it."""
     lines = [
         f"HTTP/1.1 {answer.status}",
         f"Content-Type: {answer.kind}",

@@ -1,4 +1,4 @@
-"""The viewer at an address of this machine."""
+"""The viewer, served at an address of this machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PORTS = 100
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """How `player.serve` shows assets. Raises ConfigError for a transparent background."""
+    """Settings of `player.serve`. Raises ConfigError for a transparent background."""
 
     host: str = "127.0.0.1"
     """Address to serve at; as it is, this machine alone is let in."""
@@ -61,12 +61,12 @@ def serve(
     settings: ServeSettings = ServeSettings(),
     say: Callable[[str], object] = lambda text: None,
 ) -> Iterator[str]:
-    """Serve the viewer as long as a `with` block runs, which is given its address.
+    """Serve the viewer while a `with` block runs; the block is given its address.
 
     Args:
-        assets: one or more assets, to switch between; the cameras are those of the first. Each is open, or
-            what `Asset.growing` returns: it is shown as soon as its first part is read, and sharper with
-            each of the others.
+        assets: one or more assets, to switch between; the cameras are those of the first. Each is an open
+            asset, or what `Asset.growing` returns: it is shown as soon as its first part is read, and more
+            sharply with each further part.
         settings: where it is served, and how pictures are rendered.
         say: called with each line that a person should know before long work begins.
 
@@ -92,7 +92,7 @@ def serve(
 
         prove(say)
     with ExitStack() as stack, warnings.catch_warnings():
-        # what viser says where a client goes while something is sent to it
+        # viser's warning when a client leaves while something is sent to it
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         renderers = [
             stack.enter_context(Renderer(first, settings.threads, settings.march)) for first in firsts
@@ -127,7 +127,7 @@ def serve(
 
 
 def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGES) -> Any:
-    """viser's server, with `player.viewer.guard` before every connection, and pages beside it.
+    """Start viser's server, with `player.viewer.guard` before every connection, and `pages` beside it.
 
     Raises MissingExtraError for a viser that cannot be guarded.
     """
@@ -137,7 +137,7 @@ def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGE
 
     server = None
     try:
-        # its banner: ours is the one line that scripts read
+        # without its banner: scripts read the one line that vfr-play prints
         with (
             every_connection_checked(Guard(host, viser.__version__, pages)),
             redirect_stdout(io.StringIO()),
@@ -151,7 +151,7 @@ def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGE
 
 
 def _page(folder: Path) -> bytes:
-    """The page of an asset with all of its parts, whichever of them the viewer has read by now."""
+    """Make the page of an asset with all of its parts, even those that the viewer has not read yet."""
     from player.page.page import page
 
     return page(Asset.open(folder))
@@ -162,7 +162,7 @@ def open_windows(
 ) -> dict[int, Window]:
     """Give every client of a guarded server a window, and end it when the client is gone.
 
-    Returns the open windows by the client's number. Cameras are those of the first asset.
+    Returns the open windows by the clients' numbers. The cameras are those of the first asset.
     """
     from player.viewer.guard import CONNECTION
 
@@ -179,7 +179,7 @@ def open_windows(
     whole = threading.Lock()
 
     @server.on_client_connect
-    async def _(client: Any) -> None:  # awaited where its connection is known; a plain function is not
+    async def _(client: Any) -> None:  # a coroutine, since CONNECTION is not set for plain functions
         client.camera.fov = fov
         window = Window(client, CONNECTION.get(), renderers, trained, focus, chosen, whole)
         windows[client.client_id] = window
@@ -195,9 +195,10 @@ def open_windows(
 
 
 def free_port(host: str, asked: int | None) -> int:
-    """The port that was asked for, or the first free one from PORT on.
+    """Return the port that was asked for, or the first free one from PORT on.
 
-    It is tried here, because the server would look for another port without end. Raises ConfigError.
+    Ports are tried here, because the server would look for another port without end. Raises ConfigError if
+    none is free.
     """
     reason = ""
     for port in [asked] if asked is not None else range(PORT, PORT + PORTS):
@@ -225,7 +226,7 @@ def _need_viser(asset: Asset) -> None:
 
 
 def _shown(host: str) -> str:
-    """The host in an address by which a browser on this machine reaches it."""
+    """Return the host for an address by which a browser on this machine reaches the viewer."""
     if host in ("0.0.0.0", "::"):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host

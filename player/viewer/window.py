@@ -31,23 +31,24 @@ if TYPE_CHECKING:
 
 PATH_FPS = 30
 STRIP_PIXELS = 50_000
-"""The whole picture is rendered in strips of about so many pixels: between two of them it can be given up."""
+"""About the number of pixels of a strip. A full-size picture is rendered in strips, so that it can be given
+up between two of them."""
 MOST_PIXELS = 3840 * 2160
-"""Pixels of the largest whole picture, whatever size a window says it has."""
+"""Most pixels of a full-size picture, whatever size a window says it has."""
 MOST_SIDE = 8192
-"""Pixels of a window's width or height that are believed."""
+"""Largest width or height in pixels that a window is believed to have."""
 MOST_VIEWS = 200
-"""Views that a recorded path may have."""
+"""Most views of a recorded path."""
 HANDED_OVER_SECONDS = 0.2
-"""Seconds after which viser has given a file to the connection."""
+"""Seconds after which viser has handed a file to the connection."""
 
 
 QUALITIES = ("fast while moving", "exact", "high", "fast")
-"""What the control offers; the first is followed by exact pictures when the camera stands still."""
+"""The options of the quality control. With the first, pictures are exact when the camera stands still."""
 
 
 class Chosen(NamedTuple):
-    """What the command line says of pictures; None leaves it to the asset and to the viewer."""
+    """The choices of the command line for pictures; None leaves a choice to the asset or the viewer."""
 
     samples: int | None
     quality: Quality | None
@@ -55,7 +56,8 @@ class Chosen(NamedTuple):
 
 
 class Window:
-    """What one client sees; `start` begins, `close` ends it, also when the client is gone."""
+    """The window of one client. `start` begins rendering, and `close` ends it, also when the client is
+    gone."""
 
     def __init__(
         self,
@@ -67,7 +69,8 @@ class Window:
         chosen: Chosen,
         whole: threading.Lock,
     ) -> None:
-        """`whole` is held by the one window that makes a whole picture: memory is needed for one alone."""
+        """`whole`: a lock for rendering a full-size picture. Only one window holds it at a time, so that
+        memory is needed for one such picture alone."""
         self._client = client
         self._connection = connection
         self._whole = whole
@@ -94,7 +97,7 @@ class Window:
         client.camera.on_update(lambda _: self.touch())
 
     def start(self) -> None:
-        """Begin to render."""
+        """Begin rendering."""
         self._thread.start()
 
     def close(self) -> None:
@@ -104,7 +107,7 @@ class Window:
             self._changed.notify()
 
     def touch(self) -> None:
-        """Something has changed: the picture on the screen is out of date."""
+        """Note that something has changed, so that the picture on the screen is out of date."""
         with self._changed:
             self._version += 1
             self._moved = time.monotonic()
@@ -180,7 +183,7 @@ class Window:
             self._takes(button, pressed)
 
     def _takes(self, control: Any, check: Check) -> None:
-        """Let the client set a control, to what the check makes of it."""
+        """Let the client set a control, to values that the check returns."""
         self._connection.controls[control._impl.uuid] = check
 
     def _switch(self) -> None:
@@ -251,7 +254,7 @@ class Window:
     # --- pictures ---
 
     def _camera(self) -> Camera:
-        """The camera of the window as it is now, in the world frame, with no more pixels than allowed."""
+        """Return the window's camera as it is now, in the world frame, with no more pixels than allowed."""
         seen = self._client.camera
         c2w = np.eye(4)
         c2w[:3, :3] = rotation_matrix(seen.wxyz / np.linalg.norm(seen.wxyz))
@@ -281,7 +284,7 @@ class Window:
                 self._sharpen(version)
             except VfrError as error:
                 self._state.value = printable(str(error))
-            except Exception:  # a bug: it is told, and does not end the window
+            except Exception:  # a bug: it is reported, and does not end the window
                 threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
                 self._state.value = "failed: the terminal of vfr-play says why"
 
@@ -301,8 +304,8 @@ class Window:
         self._send(picture, 75, f"{small.width}x{small.height}, {seconds * 1000:.0f} ms")
 
     def _sharpen(self, version: int) -> None:
-        """Once the camera has stood still for a moment, show a picture that half a second allows, then the
-        whole one; both are given up as soon as something changes."""
+        """Once the camera has stood still for a moment, show a picture as large as half a second allows, then
+        one of full size. Both are given up as soon as something changes."""
         if self._wait(version, STILL_SECONDS) or self._closed:
             return
         camera = self._camera()
@@ -322,16 +325,17 @@ class Window:
             self._send(picture, 95, f"{width}x{height}, {seconds * 1000:.0f} ms")
 
     def _have_turn(self, version: int) -> bool:
-        """Wait until no other window makes a whole picture; False if something changed meanwhile."""
+        """Wait until no other window renders a full-size picture; returns False if something changed
+        meanwhile."""
         while not self._whole.acquire(timeout=0.05):
             if self._closed or self._version != version:
                 return False
         return True
 
     def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
-        """[h, w, 3] uint8 of the chosen layer, or None if something changed meanwhile."""
+        """Render the chosen layer [h, w, 3] uint8 in strips; returns None if something changed meanwhile."""
         layer = self._layer.value
-        rows = max(1, STRIP_PIXELS // camera.width // BLOCK) * BLOCK  # whole blocks: the pattern goes on
+        rows = max(1, STRIP_PIXELS // camera.width // BLOCK) * BLOCK  # whole blocks: the lattice continues
         frames = []
         for top in range(0, camera.height, rows):
             if self._closed or self._version != version:
@@ -346,12 +350,13 @@ class Window:
 
 
 def _link(index: int) -> str:
-    """A line with the address of an asset's page."""
+    """Return a line with the link to an asset's page."""
     return f"[The same on this device's own GPU]({page_path(index)})"
 
 
 def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
-    """Renderers by the names of their assets' folders, or by the paths where two names are the same."""
+    """Return renderers by the names of their assets' folders, or by the folders' paths if two names are the
+    same."""
     folders = [renderer.asset.folder.resolve() for renderer in renderers]
     names = [printable(folder.name) for folder in folders]
     if len(set(names)) < len(names):
@@ -360,7 +365,7 @@ def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
 
 
 def _joined(frames: Sequence[Frame], layer: str) -> Frame:
-    """One frame of strips, the uppermost first; its normals are found if `layer` shows them."""
+    """Join strips, the uppermost first, to one frame; its normals are computed if `layer` shows them."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(frame, name) for frame in frames])

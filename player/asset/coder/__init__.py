@@ -1,1 +1,1 @@
-"""The entropy coder of the asset format: small integers in few bytes, and back."""
+"""The entropy coder of the asset format: encodes small integers in few bytes, and decodes them."""

@@ -1,5 +1,5 @@
-"""Encodes and decodes a channel's symbols in numpy, all lanes at a time. `player.asset.coder.compiled` is its
-twin."""
+"""Encode and decode a channel's symbols in numpy, all lanes at a time. `player.asset.coder.compiled` has the
+same functions as compiled code."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def encode_channel(states: np.ndarray, counts: np.ndarray, first: np.ndarray) ->
     """Encode the symbols of a channel, the last one first.
 
     Args:
-        states: [n_lanes] uint32, changed.
-        counts: [n] uint32 places of the symbol at each position, in the order of coding.
-        first: [n] uint32 where they begin.
+        states: [n_lanes] uint32, changed in place.
+        counts: [n] uint32: number of places of each symbol in its table, in the order of coding.
+        first: [n] uint32: the first place of each symbol.
 
     Returns:
-        [n_words] uint16 in the order in which they are read.
+        [n_words] uint16 words, in the order in which the decoder reads them.
     """
     n_lanes, words = len(states), []
     for begin in reversed(range(0, len(counts), n_lanes)):
@@ -54,19 +54,19 @@ def decode_channel(
     classes: np.ndarray,
     neighbours: np.ndarray,
 ) -> tuple[np.ndarray, int]:
-    """The symbols of a channel.
+    """Decode the symbols of a channel.
 
     Args:
-        words: [n_words + n_lanes] uint32, below 2^16; behind the last word there may be anything.
-        at: how many of them are taken.
-        states: [n_lanes] uint32, changed.
+        words: [n_words + n_lanes] uint32, below 2^16; the entries behind the last word may be anything.
+        at: number of words that have been taken before.
+        states: [n_lanes] uint32, changed in place.
         lookup: the tables.
         of_context: [n_classes, 81] uint8: the table of each context.
         classes: [n] uint8 in the order of coding.
-        neighbours: [3, n] uint32 rows, in the order of coding; n for one that is not there.
+        neighbours: [3, n] uint32 rows, in the order of coding; n for a neighbour that does not exist.
 
     Returns:
-        [n] int16 symbols by row; how many words are taken now, or -1 if there are too few.
+        [n] int16 symbols by row; and the number of words taken now, or -1 if there are too few.
     """
     n, n_lanes = len(classes), len(states)
     n_words, lanes = len(words) - n_lanes, Lanes(n, n_lanes)

@@ -1,16 +1,17 @@
-"""An entropy coder for small integers: interleaved rANS, decoded in many lanes that go forward in step.
+"""An entropy coder for small integers: interleaved rANS, decoded in many lanes that advance together.
 
 A *block* has n rows and some channels. Its symbols are coded channel by channel, and within a channel in
-the order of `player.asset.coder.lanes`. Each lane has a state x of 32 bits, from 2^16 on, which it keeps from
+the order of `player.asset.coder.lanes`. Each lane has a 32-bit state x, at least 2^16, which it keeps from
 one channel to the next. The symbol's context chooses a table (`player.asset.coder.tables`), in which each
-symbol has `count` of the 4096 places, from `first` on. A lane decodes so:
+symbol has `count` of the 4096 places, beginning with the place `first`. A lane decodes a symbol so:
 
-    place = x & 4095, the symbol is whose place it is
+    place = x & 4095; the symbol is the one that has this place
     x = count (x >> 12) + place - first
     if x < 2^16: x = x 2^16 + the next 16-bit word
 
-All lanes take their words from one stream: in a step, the lanes that need one in their order. In the end each
-state is 2^16 again and all words are taken, which is checked, and which hardly any damage passes.
+All lanes take words from one stream: in each step, the lanes that need a word take one in the order of lanes.
+At the end each state is 2^16 again and all words are taken. The decoder checks this, which detects nearly all
+damage.
 
 A block's bytes, all numbers little-endian:
 
@@ -18,7 +19,7 @@ A block's bytes, all numbers little-endian:
     n_packed bytes: the tables
     uint32 [n_lanes]: the states with which decoding begins, each at least 2^16
     uint16 [n_words]: the words
-    uint8 [...]: for each symbol -63 or 63, in the order of channels and rows, how much it is beyond, 0 to 192
+    uint8 [...]: for each symbol -63 or 63, by channel and row, how much further from 0 it is, 0 to 192
 
 A block of no rows or no channels has no bytes.
 """
@@ -52,25 +53,25 @@ LOW = 1 << 16
 
 _HEADER = struct.Struct("<III")
 _MOST_CODED = 1024
-"""Lanes that an encoder uses at most: each costs two bytes, and twice as many are hardly faster."""
+"""The most lanes that the encoder uses: each costs two bytes, and twice as many are hardly faster."""
 _LANE_BITS = 2048
-"""Bits that an encoder gives a lane, if there are so many."""
+"""The encoder uses fewer lanes where each would code fewer bits than this."""
 
 
 def encode(
     symbols: np.ndarray, neighbours: Neighbours, classes: Sequence[np.ndarray], n_classes: int
 ) -> bytes:
-    """Symbols as the bytes of a block.
+    """Encode symbols as the bytes of a block.
 
     Args:
         symbols: [n, n_channels] integers, -255 to 255; the more of them are 0, the fewer bytes they take.
-        neighbours: those of the n rows.
-        classes: for each channel [n] uint8, what is known about each symbol beforehand, below `n_classes`;
-            symbols of different classes are counted apart.
-        n_classes: 1 or more.
+        neighbours: the neighbours of the n rows.
+        classes: for each channel [n] uint8, below `n_classes`: a class of each symbol that the decoder knows
+            beforehand. Symbols of different classes are counted separately.
+        n_classes: number of classes, 1 or more.
 
     Raises:
-        ShapeError: shapes that do not agree, or a symbol or a class out of its range.
+        ShapeError: shapes do not agree, or a symbol or a class is out of its range.
 
     >>> rows = Neighbours(np.stack([np.arange(1000, dtype=np.int32) - n for n in (1, 2, 3)]))
     >>> symbols = (np.arange(2000).reshape(1000, 2) % 50 == 0).astype(np.int16)
@@ -124,9 +125,9 @@ def _check(
 
 
 def _contexts(row: np.ndarray, known: np.ndarray, classes: np.ndarray) -> np.ndarray:
-    """[n] int64: the context of each symbol of a channel [n], those of the classes one after the other."""
+    """Return the context [n] int64 of each symbol of a channel [n], numbered class after class."""
     near = np.append(MIXED.take(row + np.int16(END)), np.int16(0))
-    sums = near.take(known[0])  # in half the time of near[known[0]]
+    sums = near.take(known[0])  # takes half the time of near[known[0]]
     for rows in known[1:]:
         sums += near.take(rows)
     return CONTEXT_OF_SUM.take(sums + HALF) + classes.astype(np.int64) * N_CONTEXTS
@@ -135,7 +136,7 @@ def _contexts(row: np.ndarray, known: np.ndarray, classes: np.ndarray) -> np.nda
 def _fit(
     rows: np.ndarray, known: np.ndarray, classes: Sequence[np.ndarray], n_classes: int
 ) -> tuple[Tables, float]:
-    """Tables for clipped symbols [n_channels, n], and the bits that these take."""
+    """Return tables fitted to clipped symbols [n_channels, n], and the bits that the symbols then take."""
     seen = np.empty((len(rows), n_classes * N_CONTEXTS * N_SYMBOLS), np.int64)
     for channel, row in enumerate(rows):
         index = _contexts(row, known, classes[channel]) * N_SYMBOLS + row + END
@@ -144,7 +145,7 @@ def _fit(
 
 
 class Decoder:
-    """Decodes a block channel by channel, for classes that follow from the channels before.
+    """A decoder that returns a block channel by channel, so that classes may depend on earlier channels.
 
     >>> rows = Neighbours(np.full((3, 4), -1, np.int32))
     >>> none = np.zeros(4, np.uint8)
@@ -158,15 +159,17 @@ class Decoder:
     def __init__(
         self, data: bytes, neighbours: Neighbours, n_channels: int, n_classes: int, where: str
     ) -> None:
-        """Args:
+        """Read the header, tables, states and words of a block.
+
+        Args:
             data: a block's bytes.
-            neighbours: those of the n rows.
-            n_channels, n_classes: as it was encoded.
+            neighbours: the neighbours of the n rows.
+            n_channels, n_classes: those that the block was encoded with.
             where: the block's name in error messages.
 
         Raises:
-            FormatError: not a block of so many rows and channels. Memory is bounded by the rows, by the
-                length of `data`, and by 2 MB.
+            FormatError: not a block of so many rows and channels. Memory is bounded by the number of rows and
+                the length of `data`, plus 2 MB.
         """
         self._where, self._neighbours, self._n_classes = where, neighbours, n_classes
         self._channel, self._n_channels = 0, n_channels
@@ -202,7 +205,7 @@ class Decoder:
         self._lanes = Lanes(n, n_lanes)
 
     def channel(self, classes: np.ndarray) -> np.ndarray:
-        """The symbols [n] int16 of the next channel, for its classes [n] uint8. Raises FormatError."""
+        """Decode the symbols [n] int16 of the next channel with classes [n] uint8. Raises FormatError."""
         if self._empty:
             return np.zeros(self._neighbours.n, np.int16)
         if classes is not self._by_row:
@@ -231,7 +234,7 @@ class Decoder:
         return found
 
     def finish(self) -> None:
-        """Raise FormatError unless all is read that there is, and every state is what encoding began with."""
+        """Raise FormatError unless everything has been read, and every state is what encoding began with."""
         if self._empty:
             return
         if self._channel != self._n_channels or self._at != self._n_words:
@@ -255,11 +258,11 @@ def decode(
         where: the block's name in error messages.
 
     Returns:
-        [n, n_channels] int16, the symbols of a channel one after the other in memory.
+        [n, n_channels] int16, contiguous channel by channel.
 
     Raises:
-        FormatError: it is no block of so many rows and channels. What is taken in memory is bounded by
-            their number and the length of `data`, the time by their number.
+        FormatError: not a block of so many rows and channels. Memory is bounded by the numbers of rows and
+            channels and the length of `data`, time by these numbers.
     """
     decoder = Decoder(data, neighbours, len(classes), n_classes, where)
     found = np.empty((len(classes), neighbours.n), np.int16)
@@ -270,7 +273,7 @@ def decode(
 
 
 def _twin() -> ModuleType:
-    """Whichever encodes and decodes a channel: compiled code where there is numba, and numpy elsewhere."""
+    """Return the module that codes a channel: compiled code where numba is available, otherwise numpy."""
     from player import compiling
 
     if compiling.available():

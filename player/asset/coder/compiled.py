@@ -1,5 +1,5 @@
-"""Encodes and decodes a channel's symbols in compiled code, lane by lane. `player.asset.coder.arrays` is its
-twin."""
+"""Encode and decode a channel's symbols in compiled code, lane by lane. `player.asset.coder.arrays` has the
+same functions in numpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from player.scratch import check_scratch, scratch
 
 
 def encode_channel(states: np.ndarray, counts: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """As `player.asset.coder.arrays.encode_channel`."""
+    """Encode the symbols of a channel, as `player.asset.coder.arrays.encode_channel` does."""
     words = scratch(len(counts), np.uint16)  # a symbol takes one word or none
     at = _encode(states, counts, first, words)
     check_scratch(words)
@@ -35,7 +35,7 @@ def _encode(states, counts, first, words):
     at = n
     begin = (n - 1) // n_lanes * n_lanes
     while begin >= 0:
-        for lane in range(min(n_lanes, n - begin) - 1, -1, -1):  # words are written from the last one on
+        for lane in range(min(n_lanes, n - begin) - 1, -1, -1):  # words are written from last to first
             x, count = states[lane], counts[begin + lane]
             if x >> full >= count:
                 at -= 1
@@ -56,7 +56,7 @@ def decode_channel(
     classes: np.ndarray,
     neighbours: np.ndarray,
 ) -> tuple[np.ndarray, int]:
-    """As `player.asset.coder.arrays.decode_channel`."""
+    """Decode the symbols of a channel, as `player.asset.coder.arrays.decode_channel` does."""
     n = len(classes)
     near, of_lane = scratch(n + 1, np.uint8, END), scratch(len(states), np.uint8)
     table_of_sum = of_context[:, CONTEXT_OF_SUM].reshape(-1)
@@ -75,7 +75,7 @@ def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed,
     begin = 0
     for step in range(n_steps + 1):
         n_active = n_lanes if step < n_steps else n_longer
-        for lane in range(n_active):  # apart from what waits for the states: the loads overlap
+        for lane in range(n_active):  # a loop of its own, independent of the states: the loads overlap
             i = np.uint64(begin + lane)
             total = mixed[near[along_z[i]]] + mixed[near[along_y[i]]] + mixed[near[along_x[i]]] + HALF
             of_lane[lane] = table_of_sum[np.uint32(classes[i] * N_MIXED + total)]
@@ -92,7 +92,7 @@ def _decode(words, at, states, lookup, table_of_sum, classes, neighbours, mixed,
             at += is_low
             of_lane[lane] = symbol
         row = np.uint64(step)
-        for lane in range(n_active):  # only now: what is coded at the same step is not known
+        for lane in range(n_active):  # after the loops above: symbols of the same step count as unknown
             near[row] = of_lane[lane]
             row += np.uint64(n_steps + (lane < n_longer))
         begin += n_lanes

@@ -1,8 +1,8 @@
-"""In which order symbols are coded: rows dealt to lanes that go forward in step.
+"""The order in which symbols are coded: rows are dealt to lanes that advance together.
 
 The n rows of a block are cut into `n_lanes` runs of successive rows, the first `n % n_lanes` of them one
-row longer than the others. At step t every lane codes the t-th row of its run, lane after lane. What has been
-coded at an earlier step is known, in whichever lane.
+row longer than the others. At step t every lane codes the t-th row of its run, lane after lane. A symbol is
+known to all lanes at every later step.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Lanes:
-    """How n rows are dealt to lanes."""
+    """The dealing of n rows to lanes."""
 
     n: int
     n_lanes: int
 
     @property
     def n_steps(self) -> int:
-        """Steps of all lanes; the first `n_longer` make one more."""
+        """Number of steps that all lanes make; the first `n_longer` lanes make one more."""
         return self.n // self.n_lanes
 
     @property
@@ -29,13 +29,13 @@ class Lanes:
         return self.n % self.n_lanes
 
     def runs(self, by_row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What belongs to the rows [n] as two views, [n_longer, n_steps + 1] and [n_lanes - n_longer,
-        n_steps], a run a line."""
+        """Return two views of `by_row` [n] with a run in each line: [n_longer, n_steps + 1] and
+        [n_lanes - n_longer, n_steps]."""
         n = self.n_longer * (self.n_steps + 1)
         return by_row[:n].reshape(-1, self.n_steps + 1), by_row[n:].reshape(-1, self.n_steps)
 
     def in_order(self, by_row: np.ndarray) -> np.ndarray:
-        """What belongs to the rows [n], in the order of coding.
+        """Return the elements of `by_row` [n] in the order of coding.
 
         >>> Lanes(7, 3).in_order(np.arange(7)).tolist()
         [0, 3, 5, 1, 4, 6, 2]
@@ -57,7 +57,7 @@ class Lanes:
         return out
 
     def step(self) -> np.ndarray:
-        """[n] int32: the step at which each row is coded."""
+        """Return the step [n] int32 at which each row is coded."""
         out = np.empty(self.n, np.int32)
         for runs in self.runs(out):
             runs[:] = np.arange(runs.shape[1], dtype=np.int32)
@@ -66,7 +66,7 @@ class Lanes:
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Which three rows tell most about each row.
+    """The three neighbours of each row, whose symbols tell most about the row's symbol.
 
     >>> rows = Neighbours(np.array([[-1, 0, 1, 2], [-1, -1, 0, 1], [-1, -1, -1, -1]], np.int32))
     >>> rows.in_order(Lanes(4, 2))[0].tolist()
@@ -74,8 +74,8 @@ class Neighbours:
     """
 
     rows: np.ndarray
-    """[3, n] int32: the neighbours of each row, -1 for one that is not there. In a grid they are the next
-    vertices along -z, -y and -x."""
+    """[3, n] int32: the rows of each row's neighbours, -1 for a neighbour that does not exist. In a grid they
+    are the next vertices along -z, -y and -x."""
     _kept: dict[Lanes, np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
@@ -83,17 +83,17 @@ class Neighbours:
         return self.rows.shape[1]
 
     def in_order(self, lanes: Lanes) -> np.ndarray:
-        """[3, n] uint32: the neighbours of the rows in the order of coding, n for one that is not there; the
-        last answer is kept."""
+        """Return the neighbours [3, n] uint32 of the rows in the order of coding, n for a neighbour that does
+        not exist. The last result is cached."""
         found = self._kept.get(lanes)
         if found is None:
             found = np.stack([lanes.in_order(rows) for rows in self.rows]).view(np.uint32)
-            np.minimum(found, np.uint32(self.n), out=found)  # -1 is the highest of all
+            np.minimum(found, np.uint32(self.n), out=found)  # -1 is the largest uint32, and becomes n
             self._kept.clear()
             self._kept[lanes] = found
         return found
 
     def known(self, lanes: Lanes) -> np.ndarray:
-        """[3, n] int32: the neighbours of each row that are coded before it, n for the others."""
+        """Return [3, n] int32: each row's neighbours that are coded at an earlier step, n for others."""
         n, step = np.int32(self.n), np.append(lanes.step(), np.int32(self.n))
         return np.stack([np.where(step[rows] < step[:-1], rows, n) for rows in self.rows])

@@ -1,8 +1,8 @@
-"""Tables of probabilities: how often each symbol comes in a context, in 4096ths, and which context has which.
+"""Tables of probabilities, in 4096ths, of the symbols in each context; contexts can share a table.
 
 A symbol is an integer from -63 to 63; the two ends stand for anything beyond as well. The context of a symbol
-is the `context` of its neighbours' symbols, and a class that is known beforehand; each channel has contexts
-of its own. A block has up to 64 tables, and every context names one of them.
+is given by its neighbours' symbols (`context`), by a class that is known beforehand, and by the channel. A
+block has up to 64 tables, and every context names one of them.
 """
 
 from __future__ import annotations
@@ -15,35 +15,37 @@ import numpy as np
 from player.errors import FormatError
 
 END = 63
-"""The largest magnitude that has a place of its own in a table."""
+"""The largest magnitude of a symbol in a table; it stands for larger ones, too."""
 N_SYMBOLS = 2 * END + 1
 BITS = 12
-"""Probabilities are whole 4096ths."""
+"""Bits of a probability: probabilities are whole 4096ths."""
 TOTAL = 1 << BITS
 MAX_TABLES = 64
 SYMBOL_BITS = 7
 
 NEAR = 15
-"""Neighbours' symbols count as -15 to 15."""
+"""Neighbours' symbols are clipped to -15 ... 15."""
 SUM_STEPS = (1, 2, 3, 5, 8, 12, 18, 30)
-"""Sums of magnitudes from which on the context is another one."""
+"""Thresholds of the sum of the neighbours' magnitudes; the context changes at each."""
 LEAN_STEPS = (1, 2, 4, 8)
-"""Magnitudes of the sum of the symbols from which on the context is another one."""
+"""Thresholds of the magnitude of the sum of the neighbours' symbols; the context changes at each."""
 N_CONTEXTS = (len(SUM_STEPS) + 1) * (2 * len(LEAN_STEPS) + 1)
 
 N_MIXED = (3 * NEAR + 1) << 7
-"""Numbers that `mixed` symbols and 64 add up to."""
+"""Length of tables indexed by the sum of three `mixed` symbols and HALF, which is always below it."""
 HALF = 64
+"""Added to sums of `mixed` symbols, so that the bits from 7 on are the sum of the magnitudes."""
 
 TABLE_BITS = 48.0
-"""What the encoder takes another table to cost, beside a byte for each symbol in it."""
+"""Bits that the encoder assumes another table costs, besides a byte for each symbol in it."""
 
 
 def context(symbols: np.ndarray) -> np.ndarray:
-    """The context [n] that follows from the symbols [3, n] of the neighbours, 0 where one is not known.
+    """Return the context [n] for the symbols [3, n] of the neighbours, which are 0 where not known.
 
-    With the sums M of |s| and L of s, each s clipped to -15 ... 15: how many of `SUM_STEPS` are at most M,
-    times 9, plus 4, plus with the sign of L how many of `LEAN_STEPS` are at most |L|.
+    With each symbol s clipped to -15 ... 15, let M be the sum of |s| and L the sum of s. The context is
+    9 a + 4 + b. Here a is how many of `SUM_STEPS` are at most M; the magnitude of b is how many of
+    `LEAN_STEPS` are at most |L|, and its sign is that of L.
 
     >>> context(np.array([[0, 1, 9, -63], [0, 0, 9, -1], [0, 0, -1, 1]])).tolist()
     [4, 14, 71, 54]
@@ -57,13 +59,13 @@ def context(symbols: np.ndarray) -> np.ndarray:
 
 
 def mixed(symbols: np.ndarray) -> np.ndarray:
-    """Magnitude and sign of clipped symbols in one int16, `128 |s| + s`, so that one sum adds up both."""
+    """Return clipped symbols with their magnitudes in one int16, `128 |s| + s`, so that one sum adds both."""
     near = np.clip(symbols, -NEAR, NEAR).astype(np.int16)
     return (np.abs(near) << 7) + near
 
 
 MIXED = mixed(np.arange(-END, END + 1))
-"""[127] int16: `mixed`, by the symbol + 63."""
+"""[127] int16: `mixed` of each symbol, at the index symbol + 63."""
 
 
 def _contexts_of_sums() -> np.ndarray:
@@ -76,16 +78,16 @@ def _contexts_of_sums() -> np.ndarray:
 
 
 CONTEXT_OF_SUM = _contexts_of_sums()
-"""[N_MIXED] uint8: `context` by the sum of the three neighbours' `mixed` symbols and 64."""
+"""[N_MIXED] uint8: the context, at the index that is the sum of the neighbours' `mixed` symbols and 64."""
 
 
 class Lookup(NamedTuple):
-    """Tables as a decoder reads them."""
+    """Tables in the form that a decoder reads."""
 
     symbols: np.ndarray
-    """[n_tables * 4096] uint8: the symbol + 63 at each place."""
+    """[n_tables * 4096] uint8: the symbol + 63 that has each place."""
     places: np.ndarray
-    """[n_tables * 128] uint32: for each symbol + 63 its count, times 2^16, and where its places begin."""
+    """[n_tables * 128] uint32: for each symbol + 63, its count * 2^16 + the first of its places."""
 
 
 class Tables(NamedTuple):
@@ -97,7 +99,7 @@ class Tables(NamedTuple):
     """[n_channels, n_classes, 81] uint8: the table of each context."""
 
     def lookup(self) -> Lookup:
-        """The tables as a decoder reads them."""
+        """Return the tables in the form that a decoder reads."""
         first = np.cumsum(self.counts, axis=1, dtype=np.uint32) - self.counts
         places = np.zeros((len(self.counts), 1 << SYMBOL_BITS), np.uint32)
         places[:, :N_SYMBOLS] = (self.counts.astype(np.uint32) << 16) | first
@@ -105,8 +107,8 @@ class Tables(NamedTuple):
         return Lookup(symbols.repeat(self.counts.reshape(-1)), places.reshape(-1))
 
     def packed(self) -> bytes:
-        """The tables as bytes: zlib of the tables' indices by context, the number of tables, the first symbol
-        + 63 and the number of symbols of each, and their counts, 16 bits each."""
+        """Return the tables as bytes: a zlib stream of the table index of each context, the number of tables,
+        the first symbol + 63 and the number of symbols of each, and the symbols' counts, 16 bits each."""
         used = self.counts > 0
         first, beyond = used.argmax(axis=1), N_SYMBOLS - used[:, ::-1].argmax(axis=1)
         symbol = np.arange(N_SYMBOLS)
@@ -117,7 +119,7 @@ class Tables(NamedTuple):
 
 
 def unpack_tables(data: bytes, n_channels: int, n_classes: int, where: str) -> Tables:
-    """Undo `Tables.packed`. Raises FormatError; takes no more than 20 kB and a byte a context."""
+    """Undo `Tables.packed`. Raises FormatError; unpacks no more than 20 kB and a byte a context."""
     n_named = n_channels * n_classes * N_CONTEXTS
     most = n_named + 1 + MAX_TABLES * (2 + 2 * N_SYMBOLS)
     stream = zlib.decompressobj()
@@ -146,13 +148,14 @@ def unpack_tables(data: bytes, n_channels: int, n_classes: int, where: str) -> T
 
 
 def fit_tables(seen: np.ndarray) -> tuple[Tables, float]:
-    """Tables for how often each symbol comes in each context, and how many bits the symbols then take.
+    """Return tables fitted to how often each symbol occurs in each context, and the bits of all symbols then.
 
-    Contexts that are alike share a table. One table after the other is begun with the context that the
-    tables so far serve worst, then contexts choose tables and tables follow their contexts, in turns.
+    Contexts that are alike share a table. Tables are added one by one, each from the counts of the context
+    that the tables so far serve worst. Then, in turns, each context chooses its cheapest table and each table
+    becomes the sum of its contexts.
 
     Args:
-        seen: [n_channels, n_classes, 81, 127] how often.
+        seen: [n_channels, n_classes, 81, 127]: how often each symbol occurs in each context.
     """
     every = seen.reshape(-1, N_SYMBOLS).astype(np.float64)
     filled = np.flatnonzero(every.any(axis=1))
@@ -184,19 +187,20 @@ def fit_tables(seen: np.ndarray) -> tuple[Tables, float]:
     kept, chosen = np.unique(chosen, return_inverse=True)
     of_context = np.zeros(len(every), np.uint8)
     last = np.searchsorted(filled, np.arange(len(every)), side="right") - 1
-    of_context[:] = chosen.reshape(-1)[np.maximum(last, 0)]  # contexts without symbols: as the one before
+    of_context[:] = chosen.reshape(-1)[np.maximum(last, 0)]  # a context without symbols: as the one before
     found = Tables(counts[kept], of_context.reshape(seen.shape[:-1]))
     return found, float(cost.min(axis=1).sum())
 
 
 def _bits(tables: np.ndarray) -> np.ndarray:
-    """Bits of each symbol by how often tables [n, 127] have it; rather many for one that they do not have."""
+    """Return the bits [n, 127] of each symbol, by how often it occurs in each table [n, 127]. A symbol that a
+    table lacks costs many bits, but finitely many."""
     share = tables + 0.01
     return np.log2(share.sum(axis=1, keepdims=True)) - np.log2(share)
 
 
 def _counts(tables: np.ndarray) -> np.ndarray:
-    """[n, 127] uint16 4096ths of how often symbols come, at least 1 for each that does."""
+    """Return how often symbols occur as whole 4096ths, [n, 127] uint16, at least 1 for each that occurs."""
     wanted = tables * (TOTAL / tables.sum(axis=1, keepdims=True))
     counts = np.where(tables > 0, np.maximum(np.rint(wanted), 1), 0).astype(np.int64)
     for row, ideal in zip(counts, wanted, strict=True):

@@ -1,1 +1,1 @@
-"""What a level of a pyramid says about the next finer one."""
+"""Prediction of a level's values from those of the next coarser level of a pyramid."""

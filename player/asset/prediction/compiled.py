@@ -1,5 +1,5 @@
-"""Values of a level of a pyramid from those of the next coarser level, vertex by vertex
-(`player.asset.prediction.prediction`)."""
+"""Compute the values of a level of a pyramid from those of the next coarser level, vertex by vertex; compiled
+code for `player.asset.prediction.prediction`."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def add_to_prediction(
     sums: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """For every vertex: what the coarser level says, plus the step times the symbol, within the limits.
+    """Write the value of every vertex to `out`: the coarser level's prediction, and, off the border, plus the
+    step times the symbol, clipped to the limits.
 
     Args:
-        masks: [n_bricks, 8] uint64, which vertices there are.
-        border: [n_bricks, 8] uint64, which of them have no symbol.
-        coarse_bricks: [n_bricks, 4] int32: a brick of `coarse_rows`, and along each axis 0 or 4, where in it
-            the brick begins.
+        masks: [n_bricks, 8] uint64, which vertices exist.
+        border: [n_bricks, 8] uint64, which of these have no symbol.
+        coarse_bricks: [n_bricks, 4] int32: for each brick, the index of the coarser brick around it in
+            `coarse_rows`, and where in that one it begins along each axis, 0 or 4.
         coarse_rows: [n_coarse_bricks * 729] int32: the rows of the coarser level's vertices.
         coarse: [n_coarse, n_channels] values of the coarser level.
-        symbols: [n_stored, n_channels] int16, a channel after the other in memory; [0, n_channels] if all are
-            0.
-        limits: step, lowest and highest value.
-        sums: [n_channels] int32, room for sums.
-        out: [n, n_channels].
+        symbols: [n_stored, n_channels] int16, contiguous channel by channel; [0, n_channels] if all are 0.
+        limits: the step, the lowest and the highest value.
+        sums: [n_channels] int32, scratch memory for sums.
+        out: [n, n_channels], written here.
     """
     step, low, high = limits
     n_channels = out.shape[1]

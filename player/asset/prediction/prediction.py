@@ -1,5 +1,5 @@
-"""What a level of a pyramid says at the vertices of the next finer one, and the finer one's values with it:
-compiled where numba is installed, otherwise in numpy. Both give the same integers.
+"""Predict the values of a level of a pyramid from the next coarser one, and add the steps that the level
+stores: compiled where numba is installed, otherwise in numpy. Both give the same integers.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from player.asset.prediction.compiled import add_to_prediction
 from player.compiling import available
 
 _AT_ONCE = 256
-"""Bricks whose values are predicted at a time in numpy: some megabytes."""
+"""Bricks whose values are predicted at a time in numpy, so that temporaries take only some megabytes."""
 
 
 class Places(NamedTuple):
-    """Where the coarser level's vertices around those of a level's bricks are."""
+    """Places of the coarser level's vertices around the bricks of a level."""
 
     bricks: np.ndarray
-    """[n_bricks, 4] int32: which brick of `rows`, and where in it along each axis, 0 or 4, a brick begins."""
+    """[n_bricks, 4] int32: for each brick, the index of the coarser brick around it in `rows`, and where in
+    that one it begins along each axis, 0 or 4."""
     rows: np.ndarray
-    """[n_coarse_bricks * 729] int32: the rows of the coarser level's vertices, brick by brick with an apron;
-    -1 where there is none."""
+    """[n_coarse_bricks * 729] int32: the rows of the coarser level's vertices, brick by brick with an apron
+    (9 x 9 x 9 each); -1 where there is no vertex."""
 
 
 def values_from(
@@ -36,18 +37,18 @@ def values_from(
     limits: tuple[int, int],
     dtype: type[np.generic],
 ) -> np.ndarray:
-    """The values [n, n_channels] of a level: clip(predicted + step * symbol), and what is predicted on the
-    border.
+    """Return the values [n, n_channels] of a level: clip(predicted + step * symbol), and on the border the
+    prediction alone.
 
     Args:
-        masks: [n_bricks, 8] uint64, which vertices there are.
-        border: [n_bricks, 8] uint64, which of them have no symbol.
-        places: the coarser level's vertices around them.
+        masks: [n_bricks, 8] uint64, which vertices exist.
+        border: [n_bricks, 8] uint64, which of these have no symbol.
+        places: the places of the coarser level's vertices around the bricks.
         coarse: [n_coarse, n_channels] the coarser level's values.
         symbols: [n_stored, n_channels] int16; [0, n_channels] if all are 0.
-        step: width of a step.
-        limits: lowest and highest value.
-        dtype: of the values.
+        step: the quantization step.
+        limits: the lowest and the highest value.
+        dtype: dtype of the values.
     """
     n = int(np.bitwise_count(masks).sum(dtype=np.int64))
     out = np.empty((n, coarse.shape[1]), dtype)
@@ -75,7 +76,8 @@ def values_from(
 
 
 def _predicted(bricks: np.ndarray, rows: np.ndarray, coarse: np.ndarray, stored: np.ndarray) -> np.ndarray:
-    """[n, n_channels] int16: (sum over the 8 vertices at floor and ceil of half the position + 4) >> 3."""
+    """Return the predictions [n, n_channels] int16 at the vertices that `stored` selects: (sum over the 8
+    coarser vertices at floor and ceil of half the position + 4) >> 3."""
     n_channels = coarse.shape[1]
     x, y, z = (bricks[:, 1:, None] + np.arange(BRICK // 2 + 1, dtype=np.int32)).transpose(1, 0, 2)
     index = bricks[:, 0, None, None, None].astype(np.int64) * 729 + (
@@ -91,7 +93,7 @@ def _predicted(bricks: np.ndarray, rows: np.ndarray, coarse: np.ndarray, stored:
 
 
 def _doubled(values: np.ndarray, axis: int) -> np.ndarray:
-    """Twice the values at 8 places, from those at 5 that are twice as far apart along an axis."""
+    """Return twice the values, interpolated along an axis at 8 places from 5 that are twice as far apart."""
     shape = list(values.shape)
     shape[axis] = BRICK
     out = np.empty(shape, values.dtype)

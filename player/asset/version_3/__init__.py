@@ -1,1 +1,1 @@
-"""How versions 3.x of the format store an asset: it is read, and no longer written."""
+"""Reading of assets in versions 3.x of the format, which are no longer written."""

@@ -1,9 +1,9 @@
-"""The arrays of an asset of version 3 out of its files, within a budget of memory.
+"""Read the arrays of an asset of version 3 from its files, within a memory budget.
 
-Every step is as large as what came before it says, and is compared with the budget before it is taken: the
-manifest has the sizes of the files; so many bytes of coordinates are so many bricks; each has a mask of 64
-bytes; and the bits of the masks are the codes that are unpacked and the rows of the grid that is built. No
-more than that is ever unpacked, whatever a file holds.
+The memory of each step follows from what was read before, and is compared with the budget before the step is
+taken. The manifest has the sizes of the files. The size of a file of coordinates gives the number of bricks,
+each of which has a mask of 64 bytes. The set bits of the masks give the number of codes to unpack and of rows
+of the grid to build. No more than that is ever unpacked, whatever a file holds.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _LONGEST_HEADER = 10 + 65535
 
 
 class Counts(NamedTuple):
-    """How much there is in one of the two grids, as far as it is known yet."""
+    """The sizes of one of the two grids, as far as they are known yet."""
 
     n_per_axis: int
     """Bricks along an axis."""
@@ -70,11 +70,12 @@ class Counts(NamedTuple):
 
 
 def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
-    """Most memory that is taken while `n_packed` bytes of files become arrays and those a grid.
+    """Return the most bytes of memory taken while `n_packed` bytes of files are unpacked into arrays and
+    these are arranged in a grid.
 
-    Bytes a brick, a row, a cell of a table are those of the arrays in `player.asset.asset` and
-    `player.asset.grid`, and of their temporaries; tests/player/asset/test_unpacking.py compares the sum with
-    what numpy asks for.
+    The bytes for each brick, row and table entry are those of the arrays in `player.asset.asset` and
+    `player.asset.grid`, and of their temporaries. tests/player/asset/test_unpacking.py compares the sum with
+    what numpy allocates.
     """
     d, f = densities, features
     kept = sum(70 * grid.n_bricks + grid.n_codes for grid in (d, f))
@@ -86,8 +87,11 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
 
 
 def _check_coords_files(folder: Path, manifest: Manifest, allowed: int) -> None:
-    """Look at the sizes of the files of coordinates: against the number of bricks that there can be, and with
-    what they come to, against the memory that is allowed. Raises FormatError, ConfigError."""
+    """Check the sizes of the files of coordinates before they are read.
+
+    Raises FormatError: more bricks than a grid can have. ConfigError: the bricks take more memory than is
+    allowed.
+    """
     for names, n_per_axis in _per_axis(manifest):
         name, most = PLACES[names[0]], 6 * n_per_axis**3 + _LONGEST_HEADER
         if manifest.files[name].bytes > most:
@@ -106,19 +110,19 @@ def _per_axis(manifest: Manifest) -> list[tuple[Names, int]]:
 
 
 def _n_bricks(manifest: Manifest, names: Names) -> int:
-    """The least number of bricks that a grid can have, by the size of the file of their coordinates."""
+    """Return the least number of bricks that a grid can have, by the size of the file of coordinates."""
     return max(manifest.files[PLACES[names[0]]].bytes - _LONGEST_HEADER, 0) // 6
 
 
 def _most_packed(n_bytes: int) -> int:
-    """The largest size of a zlib stream of `n_bytes`: it takes a thousandth more where nothing can be packed,
-    and more than that for a few bytes."""
+    """Return a bound on the size of a zlib stream of `n_bytes`. Data that cannot be compressed takes about a
+    thousandth more than its own size, and a few bytes take relatively more."""
     return n_bytes + n_bytes // 100 + 1000
 
 
 def read_version_3(folder: Path, manifest: Manifest, allowed: int) -> tuple[PyramidValues, PyramidValues]:
-    """The densities and the features of an asset of version 3, whose files are there; arguments and errors as
-    `read_arrays`."""
+    """Read the densities and the features of an asset of version 3 as pyramids of one level. Arguments and
+    errors are those of `read_arrays`."""
     densities, features = read_arrays(folder, manifest, allowed)
     return (
         from_vertices(densities, manifest.resolution),
@@ -127,11 +131,12 @@ def read_version_3(folder: Path, manifest: Manifest, allowed: int) -> tuple[Pyra
 
 
 def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexBricks, VertexBricks]:
-    """The densities and the features of an asset of version 3, as its files have them.
+    """Read the densities and the features of an asset of version 3, in bricks of vertices as its files have
+    them.
 
     `allowed`: bytes of memory that the asset may take.
 
-    Raises FormatError, IntegrityError: they break the format; ConfigError: they take more than is allowed.
+    Raises FormatError: the files break the format. ConfigError: they take more memory than is allowed.
     """
 
     _check_coords_files(folder, manifest, allowed)
@@ -147,7 +152,7 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
         resolution = manifest.feature_resolution if of_features else manifest.resolution
         check_sorted(coords, str(folder / PLACES[names[0]]))
         check_inside(Bricks(coords, found), resolution + 1, "vertices", str(folder / PLACES[names[0]]))
-        if of_features and not found.any():  # every sample that counts is given a feature
+        if of_features and not found.any():  # every sample with weight needs a feature
             raise FormatError(f"{folder / PLACES[names[1]]}: expected at least one stored vertex, got none")
         n_rows = n_set(found)
         n_held = len(with_corners(coords, found, n_per_axis)) if of_features else 0
@@ -167,7 +172,7 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
     n_packed = sum(manifest.files[name].bytes for name in PLACES.values())
     least = needed_bytes(n_packed, Counts(n_dense, len(coords)), Counts(n_coarse, len(coarse)))
     check_memory(least, allowed, str(folder))
-    with ThreadPoolExecutor(1) as other:  # both at a time: what unpacks leaves the interpreter to others
+    with ThreadPoolExecutor(1) as other:  # both grids at the same time: unpacking releases the GIL
         later = other.submit(masks, FEATURES, coarse, n_coarse)
         found, dense_counts = masks(DENSITIES, coords, n_dense)
         coarse_found, coarse_counts = later.result()
@@ -178,9 +183,10 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
 
 
 def read_coords(data: bytes, where: str) -> np.ndarray:
-    """Coordinates of bricks [n, 3] uint16 out of a .npy file's bytes. Raises FormatError.
+    """Return the coordinates of bricks [n, 3] uint16 from a .npy file's bytes. Raises FormatError.
 
-    Its header is read as numpy writes it, and not by numpy, which takes it for a line of Python.
+    The header must be exactly as numpy writes it. It is not read by numpy, which evaluates it as a Python
+    literal.
 
     >>> import io
     >>> file = io.BytesIO()
@@ -199,5 +205,5 @@ def read_coords(data: bytes, where: str) -> np.ndarray:
 
 
 def n_set(masks: np.ndarray) -> int:
-    """Set bits of masks of bricks [n, 8] uint64."""
+    """Return the number of set bits in masks of bricks [n, 8] uint64."""
     return int(np.bitwise_count(masks).sum(dtype=np.int64))
