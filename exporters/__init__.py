@@ -1,15 +1,16 @@
-"""Files for other programs out of a baked asset: arrays in, bytes out. A library heavier than numpy is
-imported by the function that needs it.
+"""Exports of a baked asset as files for other programs. Writers take arrays and return bytes. A library
+heavier than numpy is imported inside the function that needs it.
 
-A room may import `player` and the rooms above it in this table, never one beside or below it:
+A room (a module or folder of this package) may import `player` and the rooms in the rows above its own, never
+another room of its own row or of a row below:
 
 | room | what is in it |
 |---|---|
-| `extras`, `progress`, `options` | optional packages; how far work is; what can be asked for |
-| `shapes` | what is exported: meshes, colours, textures, crops, volumes |
-| `mesh`, `formats`, `head` | what is done to a mesh; one file format a module; the head as ONNX |
-| `surface` | how an asset's surface is found, and its colours |
-| `pictures`, `pages`, `export_mesh` | the exports that are several files |
-| `export` | every export |
+| `extras`, `progress`, `options` | optional packages; progress reports; formats and settings |
+| `shapes` | the data that are exported: meshes, colours, textures, crops, volumes |
+| `mesh`, `formats`, `head` | operations on meshes; file formats, one per module; the head as ONNX |
+| `surface` | extraction of an asset's surface, and its colours |
+| `pictures`, `pages`, `export_mesh` | exports that may write several files |
+| `export` | the function that runs any export |
 | `cli` | the command `vfr-export` |
 """

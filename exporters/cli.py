@@ -1,4 +1,4 @@
-"""`vfr-export ASSET FILE`: files for other tools out of a baked asset; the suffix picks the format."""
+"""The command `vfr-export ASSET FILE`: writes a baked asset for other tools; the suffix picks the format."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ exit codes: 0 done, 1 an error in one line, 2 wrong usage, 130 interrupted, 141 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     words = joined_negatives(sys.argv[1:] if argv is None else argv, "--crop", "--views")
     return run("vfr-export", lambda: _export(words))
 
 
 def _export(argv: list[str]) -> int:
     arguments = make_parser().parse_args(argv)
-    from exporters import export  # only now: `--help` needs no numpy
+    from exporters import export  # imported late, because `--help` needs no numpy
 
     with Bars() as bars:
         summary = export.export_asset(arguments.asset, arguments.file, _options(arguments), bars.count)

@@ -1,7 +1,8 @@
-"""From an asset to the file or folder that was asked for: reads, changes, writes, compares.
+"""Export of an asset to the file or folder that was asked for.
 
-Meshes are the matter of `exporters.export_mesh`, pictures that of `exporters.pictures`. Everything is made
-and read back in memory, or in a folder beside the target, before the target's name appears.
+Meshes are exported by `exporters.export_mesh`, pictures by `exporters.pictures` and pages by
+`exporters.pages`. Everything is made and read back in memory, or in a folder beside the target, before the
+target's name appears.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from player.files.files import check_target, new_folder, write_bytes
 from player.page.page import is_site_file
 
 Facts = dict[str, Any]
-"""What is said of an export: JSON values."""
+"""Description of an export: JSON values by name."""
 
 
 def export_asset(
@@ -46,29 +47,29 @@ def export_asset(
     options: ExportOptions | None = None,
     report: Report | None = None,
 ) -> Facts:
-    """Write one file or folder out of the asset in `asset_path` and describe it.
+    """Export the asset in `asset_path` to one file or folder, and return a description.
 
     Args:
         asset_path: the folder of an asset; every checksum is compared.
         target: what to write.
-        options: what to write there, and how; by default the mesh, in the world's coordinates, as the suffix
-            says.
-        report: called with (stage, done, of) while something takes its time.
+        options: the settings; by default the mesh is written in the world's coordinates and in the format of
+            the suffix.
+        report: called with (stage, done, of) during the steps that take long.
 
     Returns:
-        JSON values: `file`, `format`, `bytes`, and what the format has: `vertices`, `faces`, `bounds` [2][3]
-        in WORLD units and axes whatever the frame, `frame`, `removed` (share of the faces that a crop took),
-        `faces_asked`, `texture` (its size), `lods` (`file`, `faces`, `bytes` of each), and of a surface that
-        was made again `method`, `unseen_faces_removed`, `haze_faces_removed`, `floaters_removed`,
-        `floater_faces_removed`;
-        `voxels`, `densities` (their range) and `level` (half opaque over a voxel), 1/unit of the frame;
-        `points`; `cameras`; `pictures`, `channels`; `inputs`, `outputs`; of a page `viewer_bytes` (all but
-        the scene's data and the poster) and `gpu_bytes`.
+        JSON values: `file`, `format`, `bytes`, and those that apply to the format. Meshes: `vertices`,
+        `faces`, `bounds` [2][3] in WORLD units and axes whatever the frame, `frame`, `removed` (share of the
+        faces that a crop removed), `faces_asked`, `texture` (its size), `lods` (`file`, `faces`, `bytes` of
+        each level). A surface that was made again: `method`, `unseen_faces_removed`, `haze_faces_removed`,
+        `floaters_removed`, `floater_faces_removed`. Volumes: `voxels`, `densities` (their range) and `level`
+        (half opaque over a voxel), 1/unit of the frame. Others: `points`; `cameras`; `pictures`, `channels`;
+        `inputs`, `outputs`; for a page `viewer_bytes` (all but the scene's data and the poster) and
+        `gpu_bytes`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
             asset that takes more memory than it may, a page that takes more graphics memory or has more
-            channels than browsers can draw, or two files of one name.
+            channels than browsers can draw, or two files with the same name.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.
@@ -164,7 +165,7 @@ def _export_colmap(
 
 
 def _cloud(asset: Asset, options: ExportOptions, report: Report) -> tuple[TriangleMesh, Facts]:
-    """Points on the surface in the world's coordinates, and what to say about them."""
+    """Return points on the surface in the world's coordinates, and facts about them for the summary."""
     surface = AssetSurface(asset, report)
     mesh, facts = world_mesh(surface, options)
     cloud = points.sample_points(
@@ -174,7 +175,7 @@ def _cloud(asset: Asset, options: ExportOptions, report: Report) -> tuple[Triang
 
 
 def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str]]:
-    """The cameras to render, and the names of their files: as `vfr-play` would call them."""
+    """Return the cameras to render and the names of their files, which `vfr-play` would give them, too."""
     width, height = asset.manifest.view_size
     given = options.cameras
     cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
@@ -184,7 +185,7 @@ def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str
 
 
 def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> bool:
-    """Refuse a target before any work; returns whether what is there is to be replaced.
+    """Raise OutputError if the target cannot be written, before any work; return whether to replace it.
 
     A folder is replaced as a whole, so it must hold nothing but an earlier export of its kind.
     """

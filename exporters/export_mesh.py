@@ -1,7 +1,8 @@
-"""A mesh file, or a few of them, out of an asset: surface, crop, fewer faces, texture, coordinates, bytes.
+"""Export of an asset's mesh, as one file or several.
 
-Order: the surface as baked or made again, crop (world units), fewer faces, then for each level of detail the
-colours, the coordinates and the bytes. Everything is made and read back in memory, before any name appears.
+Steps: take the baked surface or make it again, crop it (in world units), reduce its faces; then, for each
+level of detail, find the colours, change the coordinates and encode the bytes. Everything is made and read
+back in memory before any file gets its name.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from player.errors import ConfigError
 from player.files.files import write_together
 
 _SECONDS = 300.0
-"""Time for the layout of a texture unless asked for another."""
+"""Seconds that the layout of a texture may take unless another limit is asked for."""
 
 
 def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Path]]:
-    """The files of each level of detail, the finest first; the first of each level is the mesh.
+    """Return the files of each level of detail, the finest level first; a level's first file is the mesh.
 
-    Raises ConfigError: two of them have one name, where the target does not end as its format does.
+    Raises ConfigError: two files would have the same name, because the target's suffix is not its format's.
 
     >>> [[path.name for path in level] for level in mesh_paths(Path("a.glb"), ExportOptions(lods=3), "glb")]
     [['a.glb'], ['a.lod1.glb'], ['a.lod2.glb']]
@@ -59,14 +60,14 @@ def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Pat
 def export_mesh(
     asset: Asset, target: Path, options: ExportOptions, name: str, matrix: np.ndarray, report: Report
 ) -> dict[str, Any]:
-    """Write the mesh of an asset, and describe it as `exporters.export.export_asset` says.
+    """Write the mesh of an asset, and return its description as `exporters.export.export_asset` documents it.
 
     Args:
         asset: an open asset.
-        target: the file; with levels of detail, the finest's.
-        options: checked for this format.
+        target: the file to write; with levels of detail, that of the finest level.
+        options: the settings, already checked for this format.
         name: one of `exporters.options.MESHES`.
-        matrix: [4, 4] what takes the world to the coordinates of the file.
+        matrix: [4, 4] transform from the world to the coordinates of the file.
         report: called with (stage, done, of).
     """
     is_few = options.method is None and options.level is None and options.texture is None
@@ -99,11 +100,12 @@ def export_mesh(
 
 
 def world_mesh(surface: AssetSurface, options: ExportOptions) -> tuple[TriangleMesh, dict[str, Any]]:
-    """The mesh in the world's coordinates, cropped, and what to say about it.
+    """Return the mesh in the world's coordinates, cropped, and facts about it for the summary.
 
-    `method` "baked" takes it as it lies in the asset. All others make it again, and then it is white, and
-    what is said has a `method`: by default with the faces of a grid of
-    `exporters.surface.few_faces.RESOLUTION`, with a method or a level with all that there are.
+    The `method` "baked" takes the mesh that is stored in the asset. All others make the mesh again:
+    it is then white, and the facts include the `method`. By default it has about the faces of a
+    grid of `exporters.surface.few_faces.RESOLUTION` voxels along the box; with a method or a level
+    it keeps all of its faces.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     facts: dict[str, Any] = {"frame": options.coordinates}
@@ -124,7 +126,7 @@ def world_mesh(surface: AssetSurface, options: ExportOptions) -> tuple[TriangleM
 
 
 def bounds_of(mesh: TriangleMesh) -> list[list[float]]:
-    """Smallest and largest coordinate, [2][3]; 0 for a mesh without vertices, as JSON has no NaN."""
+    """Return the smallest and largest coordinates, [2][3]; 0 without vertices, because JSON has no NaN."""
     return np.nan_to_num(mesh.bounds).tolist()
 
 
@@ -143,7 +145,7 @@ def _files(
     name: str,
     matrix: np.ndarray,
 ) -> dict[Path, bytes]:
-    """The bytes of one level of detail, compared with what they were written from."""
+    """Return the bytes of the files of one level of detail, after comparing them with the mesh they hold."""
     where, texture = str(paths[0]), None
     if options.texture is not None:
         seconds = options.time_limit or _SECONDS
@@ -154,7 +156,7 @@ def _files(
     if texture is not None and name == "obj":
         files = obj.textured_obj_files(mesh, texture, paths[0].stem)
         check_textured_obj(files, mesh, texture, where)
-        # the mesh last: where it is, what it names is there too
+        # the OBJ is written last, so that where it exists the files that it names exist too
         return {paths[1]: files[".mtl"], paths[2]: files[".png"], paths[0]: files[".obj"]}
     if name == "glb":
         data = glb.glb_bytes(mesh, texture)

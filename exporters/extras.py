@@ -1,4 +1,4 @@
-"""Optional packages: what to install where one is missing."""
+"""Imports of optional packages, with errors that say what to install where one is missing."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from player.errors import MissingExtraError
 
 @contextmanager
 def needs(what: str, package: str, also: str = "") -> Iterator[None]:
-    """Around the import of a package that comes with the extra `export`: raises MissingExtraError, which says
-    how to get it.
+    """Wrap the import of a package that belongs to the extra `export`; if the import fails, raise
+    MissingExtraError, which says how to install the package.
 
     Args:
-        what: what needs the package, the first words of the message: "--faces".
+        what: the option or task that needs the package, with which the message begins: "--faces".
         package: its name on PyPI.
-        also: libraries that it loads and that a bare machine lacks; the message then says why, too.
+        also: system libraries that the package loads and a bare machine lacks; the message then names them
+            and the cause of the failure.
 
     >>> with needs("--faces", "scipy"):
     ...     import no_such_package
@@ -35,7 +36,8 @@ def needs(what: str, package: str, also: str = "") -> Iterator[None]:
 
 
 def require_open3d(what: str) -> Any:
-    """The package `open3d` for `what`, untyped: its stubs know less than its code. Or MissingExtraError."""
+    """Import and return `open3d`, which `what` needs, or raise MissingExtraError. The return type is Any
+    because the package's type stubs are incomplete."""
     with needs(what, "open3d", also="libusb-1.0-0, libgl1"):
         import open3d
     return open3d

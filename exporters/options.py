@@ -1,4 +1,5 @@
-"""What `vfr-export` can write, and which settings go with it. No numpy: `vfr-export --help` reads this."""
+"""Formats and settings of `vfr-export`, and the settings that each format takes. Imports no numpy, because
+`vfr-export --help` reads this module."""
 
 from __future__ import annotations
 
@@ -24,23 +25,23 @@ FORMATS = {
     ".html": "a page that plays the scene in any browser with WebGL2: one file, no server",
     ".onnx": "the head as an ONNX graph; --decode puts the decode of the features in front",
 }
-"""Files, by suffix."""
+"""Descriptions of the file formats, by suffix."""
 
 FOLDERS = {
     "exr": "pictures of many layers (colour, depth, position, normals, features), one OpenEXR a camera",
     "colmap": "COLMAP text: the training cameras and a point cloud",
     "web": "the page as files for a web server, which shows something before all of it is there",
 }
-"""Folders, by --format."""
+"""Descriptions of the formats that are folders, by the name that --format takes."""
 
 MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
-"""The files that hold a mesh."""
+"""Names of the formats that hold a mesh."""
 
 POINTS = 100_000
-"""Points of a COLMAP model, unless asked for another number."""
+"""Points of a COLMAP model, unless another number is asked for."""
 
 TEXTURE_FACES = 200_000
-"""Faces of a mesh with a texture, unless asked for another number: laying out more takes minutes."""
+"""Faces of a mesh with a texture, unless another number is asked for: laying out more takes minutes."""
 
 _SURFACE = {"frame", "crop", "method", "level"}
 _MESH = _SURFACE | {"faces", "lods"}
@@ -110,10 +111,11 @@ class ExportOptions:
 
 
 def check_options(target: Path, options: ExportOptions) -> str:
-    """The name of the format, "ply", ..., "exr", after checking that it takes every setting that is given.
+    """Return the name of the format, "ply", ..., "exr", after checking that it takes
+    every setting that is given.
 
-    Raises ConfigError in one line: an unknown suffix or format (with the known ones), a setting that does
-    nothing there.
+    Raises ConfigError with one line: the suffix or format is unknown (the line lists the known ones), or a
+    setting does nothing for the format or is out of range.
 
     >>> check_options(Path("scene.GLB"), ExportOptions(faces=1000))
     'glb'
@@ -178,6 +180,6 @@ def _check_ranges(options: ExportOptions) -> None:
 
 
 def kind_name(name: str, kind: str) -> str:
-    """How a message calls what is written."""
+    """Return the words by which an error message calls what is written."""
     mesh, volume = f"a {name} mesh", f"a {name} volume"
     return {"points": "a point cloud", "mesh": mesh, "textured": mesh, "volume": volume}.get(kind, name)

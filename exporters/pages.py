@@ -19,23 +19,24 @@ from player.page.text_bytes import bytes_of_text
 def export_page(
     asset: Asset, target: Path, kind: Literal["html", "web"], max_gpu_mb: int | None, force: bool
 ) -> dict[str, Any]:
-    """Write the page of an asset, after reading its data back.
+    """Write the page that plays an asset, after checking that the page's bytes hold the asset's data.
 
     Args:
-        asset: an open asset, all of its parts.
-        target: the file, or the folder, which appears when every file is in it.
-        kind: "html" for a file, "web" for a folder.
-        max_gpu_mb: megabytes of graphics memory that it may take; MAX_GPU_MB if None.
+        asset: an open asset with all of its parts.
+        target: the file to write, or the folder, which appears once every file is in it.
+        kind: "html" for one file, "web" for a folder.
+        max_gpu_mb: megabytes of graphics memory that the page may take; MAX_GPU_MB if None.
         force: replace a folder that exists.
 
     Returns:
-        `bytes`, `viewer_bytes`, `gpu_bytes`, for `exporters.export.export_asset`.
+        `bytes`, `viewer_bytes` and `gpu_bytes`, described in `exporters.export.export_asset`.
 
     Raises:
-        ConfigError: more graphics memory than it may take, or more channels than browsers can draw.
+        ConfigError: the page needs more graphics memory than it may take, or browsers cannot draw so many
+            channels.
         FormatError: a file of the asset is broken.
         OutputError: the target cannot be written.
-        ParityError: what was to be written does not hold the asset's data.
+        ParityError: the bytes that were to be written do not hold the asset's data.
     """
     make = page_of_one_file if kind == "html" else page_of_many_files
     made = make(asset, max_gpu_mb=max_gpu_mb or MAX_GPU_MB)
@@ -51,9 +52,9 @@ def export_page(
 
 
 def files_in_page(page: bytes) -> dict[str, bytes]:
-    """The files of the scene that a page of one file holds; zeros may follow what counts.
+    """Return the scene's files that a one-file page contains, by name. Zeros may follow a file's content.
 
-    Raises ParityError: text that stands for no bytes.
+    Raises ParityError: the text of a file cannot be decoded into bytes.
     """
     found = {}
     for name, text in re.findall(rb'<script type="text/plain" data-file="([^"]*)">([^<]*)</script>', page):
@@ -65,7 +66,7 @@ def files_in_page(page: bytes) -> dict[str, bytes]:
 
 
 def _check_data(files: dict[str, bytes], where: str) -> None:
-    """Raise ParityError unless every file of the scene is the one that its manifest names."""
+    """Raise ParityError unless every file of the scene has the SHA-256 that the scene's manifest gives."""
     for name, entry in json.loads(files[MANIFEST])["files"].items():
         digest = hashlib.sha256(files.get(name, b"")[: entry["bytes"]]).hexdigest()
         if digest != entry["sha256"]:

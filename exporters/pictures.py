@@ -1,4 +1,4 @@
-"""A folder of pictures for compositing: an asset seen by a list of cameras, one EXR each."""
+"""Export of pictures for compositing: a folder with one EXR file for each of a list of cameras."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ def export_pictures(
     force: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Render each camera, with the asset's own number of fetches, and write `target/NAME.exr`.
+    """Render each camera with the asset's own number of feature lookups per ray, and write `target/NAME.exr`.
 
     Args:
         asset: an open asset.
         target: the new folder; it appears when every picture is in it.
         cameras: WORLD frame, at least one.
-        names: of the files, without suffix, one a camera (`player.cameras.transforms.frame_names`).
+        names: names of the files without suffix, one per camera (`player.cameras.transforms.frame_names`).
         half: see `exporters.formats.exr`.
         force: replace a folder that exists.
         progress: called with the number done and the total after each picture.
 
     Returns:
-        `pictures`, `channels`, `bytes`, for `exporters.export.export_asset`.
+        `pictures`, `channels` and `bytes`, described in `exporters.export.export_asset`.
 
     Raises:
         ConfigError: no camera, or a picture that is too large.

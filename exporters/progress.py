@@ -1,15 +1,15 @@
-"""How long work says how far it is: the functions that are called meanwhile."""
+"""Types of the functions that long-running work calls to report its progress."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
+"""A function called with (done, of): the steps done and their total."""
 
 Report = Callable[[str, int, int], object]
-"""Called with (stage, done, of)."""
+"""A function called with (stage, done, of): the name of the stage, its steps done and their total."""
 
 
 def silent(*_: object) -> None:
-    """Progress, or a report, that nobody wants to hear of."""
+    """Ignore the call: a Progress or Report for callers that want none."""

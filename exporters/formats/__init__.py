@@ -1,1 +1,1 @@
-"""One file format a module: arrays in, bytes out, and the way back for comparison."""
+"""File formats, one per module: functions from arrays to bytes, and back for comparison."""

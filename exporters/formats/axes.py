@@ -1,15 +1,15 @@
-"""The coordinates that an export can be in (`vfr-export --frame`), as matrices out of the world's.
+"""Coordinates that an export can be in (`vfr-export --frame`), as matrices from the world's coordinates.
 
-World are the coordinates of the photographs' cameras (for Blender's data sets: Z up), with their unit. A file
-format may have axes of its own on top: glTF is Y up by its specification, so the GLB writer turns what it is
-given, and whoever opens the file turns it back.
+The world's coordinates are those of the photographs' cameras (for Blender's data sets: Z up), with their
+unit. A file format may add axes of its own: glTF is Y up by its specification, so the GLB writer turns the
+mesh that it is given, and a Z-up program that opens the file turns it back.
 
 | coordinates | what the numbers in the file are |
 |---|---|
 | `world` | the world's; in a GLB turned to Y up |
 | `model` | the field's own: its box is -1..1, no unit; in a GLB turned to Y up |
 | `gltf` | the world turned to Y up, (x, y, z) -> (x, z, -y), in every format |
-| `blender` | what Blender, left as it is, shows as the world: OBJ and GLB Y up, VDB half a voxel lower |
+| `blender` | those that Blender by default shows as the world: OBJ and GLB Y up, VDB half a voxel lower |
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from player.errors import ConfigError
 COORDINATES = ("world", "model", "gltf", "blender")
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""[4, 4] (x, y, z) -> (x, z, -y): a quarter turn about x."""
+"""[4, 4] matrix of (x, y, z) -> (x, z, -y), a quarter turn about x."""
 
 
 def coordinates_from_world(
     coordinates: str, world_from_model: np.ndarray, file_format: str = ""
 ) -> np.ndarray:
-    """The matrix from world coordinates to those that a writer is given.
+    """Return the matrix from world coordinates to those that a writer is given.
 
     Args:
         coordinates: one of COORDINATES.
@@ -39,7 +39,7 @@ def coordinates_from_world(
         [4, 4] float64 similarity.
 
     Raises:
-        ConfigError: no such coordinates.
+        ConfigError: `coordinates` is not one of COORDINATES.
 
     >>> coordinates_from_world("gltf", np.eye(4), "ply")[:3, :3].tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]

@@ -1,8 +1,10 @@
-"""A COLMAP model as text: `cameras.txt`, `images.txt`, `points3D.txt`; for Gaussian splatting and MVS.
+"""Writer of a COLMAP model as text (`cameras.txt`, `images.txt`, `points3D.txt`), for Gaussian splatting and
+multi-view stereo.
 
-COLMAP's camera looks along +z with y down (OpenCV), and a picture has the pose camera from world, as a
-quaternion (w, x, y, z) and a translation; pixel centres are at +0.5 as here. Pictures have no keypoints and
-points no tracks: the asset has not kept them. Points are of the surface, ERROR is 0.
+A COLMAP camera looks along +z with y down (OpenCV). A picture's pose is the transform camera from world, as a
+quaternion (w, x, y, z) and a translation. Pixel centres are at +0.5, as in this project. Pictures have no
+keypoints and points have no tracks, because the asset does not keep them. The points lie on the surface, and
+their ERROR is 0.
 """
 
 from __future__ import annotations
@@ -21,16 +23,16 @@ from player.errors import ParityError
 COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 """The names of a model's files."""
 TOLERANCE = 1e-9
-"""Poses go through a quaternion and back, in float64."""
+"""Largest relative difference of a camera read back: poses go through a quaternion and back, in float64."""
 
 
 def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
-    """The three files, by name, read back and compared.
+    """Return the three files, by name, after reading them back and comparing them.
 
     Args:
         cameras: at least one, in the frame of the export; those of equal lens and size share a COLMAP camera.
             A leading `./` of their names is dropped: COLMAP's names are relative to the folder of pictures.
-            A rotation that is one only nearly (float32 files) is replaced by the nearest.
+            A matrix that is only nearly a rotation (float32 files) is replaced by the nearest rotation.
         cloud: points in the same frame; its normals and faces are not used.
 
     Raises:
@@ -68,7 +70,7 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
 
 
 def _rigid(camera: Camera) -> Camera:
-    """The camera as COLMAP can hold it: its name, and the rotation nearest to its own."""
+    """Return the camera as COLMAP can hold it: with COLMAP's name and the rotation nearest to its own."""
     u, _, v = np.linalg.svd(camera.c2w[:3, :3])
     c2w = camera.c2w.copy()
     c2w[:3, :3] = u @ v
@@ -84,7 +86,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _check(files: dict[str, bytes], cameras: Sequence[Camera], cloud: TriangleMesh) -> None:
-    """Parse the text again and compare."""
+    """Parse the text again; raise ParityError unless it holds the cameras and the points."""
     heads, images, points = (
         [line for line in files[name].decode().split("\n")[1:-1] if line] for name in COLMAP_FILES
     )

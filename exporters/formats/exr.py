@@ -5,19 +5,19 @@
 | `R G B A` | colour | linear light, Rec. 709 primaries, multiplied by A; A is the opacity |
 | `Z` | float | mean depth along the camera's axis, world units |
 | `distance.V` | float | mean depth along the ray: from the camera to the place, world units |
-| `position.X .Y .Z` | float | the place itself, world frame |
-| `normal.X .Y .Z` | colour | the density's, world frame, of unit length (`player.march.normals`) |
+| `position.X .Y .Z` | float | the place at that distance, world frame |
+| `normal.X .Y .Z` | colour | normal of the density, world frame, unit length (`player.march.normals`) |
 | `opacity.V` | colour | A again, for programs that show a layer and not an alpha |
 | `samples.V` | float | density samples that the player took |
-| `features.00 ...` | colour | what the head was given: sum of weight times feature, in units of the codes |
+| `features.00 ...` | colour | the head's input: sum of weight times feature, in units of the codes |
 
-"colour" is half with `half=True`, else float. The depth is the MEAN of the distances along the ray, by
-compositing weight: between two surfaces that are both seen, it is between them. A pixel is met if its opacity
-is over 1/512, as for the player; elsewhere Z and distance are infinite, and everything but A, opacity and
-samples is 0.
+The type "colour" is half with `half=True`, else float. The depth is the MEAN of the distances along the ray,
+weighted by compositing weight: where two surfaces are both seen, it lies between them. A pixel is hit if its
+opacity is over 1/512, as for the player. In other pixels Z and distance are infinite, and everything but A,
+opacity and samples is 0.
 
-Layers have names of one dot and channels of one letter, which Blender, Nuke and OpenImageIO group; features
-have numbers.
+A name has one dot between the layer and a channel of one letter, so that Blender, Nuke and OpenImageIO group
+the channels of a layer; the channels of the features have numbers.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from player.march.march import MIN_OPACITY
 from player.render import Frame
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""x, y of red, green, blue and white: sRGB's primaries."""
+"""Chromaticities x, y of sRGB's primaries red, green and blue, and of its white."""
 
 DEPTH = (
     "mean by compositing weight; Z along the camera's axis, distance.V along the ray; world units; "
@@ -44,11 +44,11 @@ DEPTH = (
 
 
 def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, np.ndarray]:
-    """The channels of a rendered frame, by name.
+    """Return the channels of a rendered frame, by name.
 
     Args:
-        frame: over no background ("transparent") and with `layers`.
-        camera: the one that it was rendered with, WORLD frame.
+        frame: rendered over no background ("transparent") and with `layers`.
+        camera: the camera that the frame was rendered with, WORLD frame.
         half: 16 bits for the channels that hold colours, directions and features.
 
     Returns:
@@ -85,7 +85,7 @@ def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, 
 
 
 def exr_header(camera: Camera) -> dict[str, Any]:
-    """Attributes of a picture: what its numbers mean, and its camera.
+    """Return the attributes of a picture: the meaning of its numbers, and its camera.
 
     `worldToCamera` and `worldToNDC` are OpenEXR's own, for ROW vectors (p' = p M); the camera's axes are x
     right, y up, -z ahead. `vfr.cameraToWorld` is the c2w of transforms.json, for column vectors, and
@@ -119,7 +119,7 @@ def exr_header(camera: Camera) -> dict[str, Any]:
 
 
 def write_exr(path: Path, channels: dict[str, np.ndarray], header: dict[str, Any]) -> None:
-    """Write one file and read it back; not atomic: `exporters.pictures` writes into a folder that is.
+    """Write one file and read it back. This is not atomic; `exporters.pictures` writes into a folder that is.
 
     Args:
         path: the new file.
@@ -127,14 +127,14 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], header: dict[str, Any
         header: attributes besides those that every file has.
 
     Raises:
-        OutputError: the disk is full, ...
+        OutputError: the file cannot be written, for example because the disk is full.
         ParityError: the file does not hold the channels or the attributes.
         MissingExtraError: OpenEXR is not installed.
     """
     openexr = load_openexr()
     fixed = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
     try:
-        # OpenEXR puts objects of its own into the dictionaries that it is given: copies
+        # given copies, because OpenEXR puts objects of its own into these dictionaries
         openexr.File({**header, **fixed}, dict(channels)).write(str(path))
         with openexr.File(str(path), separate_channels=True) as file:
             check_channels(path, channels, {name: c.pixels for name, c in file.channels().items()})
@@ -144,7 +144,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], header: dict[str, Any
 
 
 def load_openexr() -> Any:
-    """The package OpenEXR, or MissingExtraError that says how to get it; called before long work."""
+    """Import OpenEXR, or raise MissingExtraError, which says how to install it; called before long work."""
     with needs("EXR", "OpenEXR"):
         import OpenEXR
     return OpenEXR
@@ -183,8 +183,8 @@ def _check_header(path: Path, expected: dict[str, Any], got: dict[str, Any]) -> 
 
 
 def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine to the camera's axis [h, w] and unit direction [h, w, 3] of each pixel, float64, as in
-    `Camera.rays`."""
+    """Return each pixel's cosine to the camera's axis [h, w] and unit direction [h, w, 3], float64, computed
+    as in `Camera.rays`."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = -(np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     x, y = np.meshgrid(x, y)

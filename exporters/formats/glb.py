@@ -1,11 +1,11 @@
 """GLB, binary glTF 2.0: the file that engines, Blender and web viewers open with its colours.
 
-glTF is Y up and metres: a mesh given Z up is turned by (x, y, z) -> (x, z, -y). COLOR_0 is LINEAR light by
-the specification (sRGB bytes there look washed out), stored as normalised 16-bit numbers, because 8 would
-show bands in the dark. With a texture the colours are its texels alone, a PNG inside the file, which the
-specification takes as sRGB; a COLOR_0 beside it would be multiplied with it, and is left out. The picture's
-light is already in the colours, so the material is unlit (KHR_materials_unlit), double sided, and for viewers
-without that extension not metallic and fully rough.
+glTF is Y up and in metres: a mesh given Z up is turned by (x, y, z) -> (x, z, -y). COLOR_0 is LINEAR light by
+the specification (sRGB bytes there look washed out). It is stored as normalised 16-bit numbers, because 8
+bits would show bands in the dark. With a texture, the colours are its texels alone, a PNG inside the file,
+which the specification takes as sRGB; a COLOR_0 beside it would be multiplied with it, and is left out. The
+scene's lighting is already in the colours, so the material is unlit (KHR_materials_unlit), double sided, and,
+for viewers without that extension, not metallic and fully rough.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def glb_bytes(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
-    """The file's content, Y up, for a mesh that is Z up; with a texture instead of vertex colours if one is
-    given. The same mesh gives the same bytes.
+    """Return the file's content, Y up, for a mesh that is Z up; with a texture in place of vertex colours if
+    one is given. The same mesh gives the same bytes.
 
     Raises ConfigError for a mesh without faces (glTF has no empty accessors) or one of 4 GiB and more.
     """
@@ -104,7 +104,7 @@ def glb_bytes(mesh: TriangleMesh, texture: Texture | None = None) -> bytes:
 
 
 def y_up(vectors: np.ndarray) -> np.ndarray:
-    """[n, 3] vectors of a Z-up world in a Y-up one: a quarter turn about x.
+    """Return vectors [n, 3] of a Z-up world as those of a Y-up world: a quarter turn about x.
 
     >>> y_up(np.array([[1.0, 2.0, 3.0]])).tolist()
     [[1.0, 3.0, -2.0]]
@@ -113,9 +113,8 @@ def y_up(vectors: np.ndarray) -> np.ndarray:
 
 
 def parse_glb(data: bytes, where: str) -> tuple[dict, bytes]:
-    """The document and the buffer of a file as `glb_bytes` lays it out; FormatError if the chunks do not fill
-    it.
-    """
+    """Return the JSON document and the buffer of a file that `glb_bytes` wrote; raise FormatError if the
+    chunks do not fill the file."""
     magic, version, total = struct.unpack_from("<4sII", data)
     if (magic, version, total) != (b"glTF", 2, len(data)):
         raise FormatError(
@@ -131,15 +130,15 @@ def parse_glb(data: bytes, where: str) -> tuple[dict, bytes]:
 
 
 def glb_content(data: bytes, where: str) -> dict[str, Any]:
-    """The arrays in a file that `glb_bytes` wrote, Y up.
+    """Return the arrays in a file that `glb_bytes` wrote, Y up.
 
     Returns:
-        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 4] linear, 0..1, or, of a mesh with a
+        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 4] linear, 0..1, or, for a mesh with a
         texture, `uvs` [n, 2], origin at the upper left, and `picture`, the bytes of a PNG file.
 
     Raises:
         FormatError: as `parse_glb`.
-        ParityError: the smallest and largest coordinate that the file names are not those of its vertices.
+        ParityError: the smallest and largest coordinates that the file states are not those of its vertices.
     """
     document, buffer = parse_glb(data, where)
     primitive = document["meshes"][0]["primitives"][0]

@@ -1,14 +1,14 @@
-"""NPZ: a volume as plain numpy arrays, for a program of one's own. `np.load(file)`, nothing is pickled.
+"""NPZ: a volume as plain numpy arrays, for users' own programs. `np.load(file)` reads it; nothing is pickled.
 
 | array | type | meaning |
 |---|---|---|
-| `index` | int32 [n, 3] | vertices of the grid that hold something |
+| `index` | int32 [n, 3] | vertices of the grid that have a density |
 | `density` | float32 [n] | sigma, 1/unit of the frame |
 | `colour` | uint8 [n, 3] | sRGB; only if asked for |
 | `matrix` | float64 [4, 4] | place = matrix @ (i, j, k, 1) |
 | `info` | text | JSON: `format`, `version`, `frame`, `unit`, `voxel`, `level`, ... |
 
-Dense: `grid = np.zeros(index.max(0) + 1, np.float32); grid[tuple(index.T)] = density`.
+A dense grid: `grid = np.zeros(index.max(0) + 1, np.float32); grid[tuple(index.T)] = density`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from player.errors import FormatError
 
 
 def npz_bytes(volume: Volume, frame: str) -> bytes:
-    """The file's content, compressed; the same volume gives the same bytes.
+    """Return the file's content, compressed; the same volume gives the same bytes.
 
     >>> volume = Volume(np.array([[1, 0, 2]], np.int32), np.ones(1, np.float32), None, np.eye(4))
     >>> parse_npz(npz_bytes(volume, "world"), "a.npz").index.tolist()
@@ -51,7 +51,7 @@ def npz_bytes(volume: Volume, frame: str) -> bytes:
 
 
 def parse_npz(data: bytes, where: str) -> Volume:
-    """The volume in a file that `npz_bytes` made; FormatError for any other."""
+    """Return the volume in a file that `npz_bytes` made; raise FormatError for any other file."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -1,10 +1,10 @@
-"""Wavefront OBJ: text, `v x y z r g b` (sRGB in [0, 1], the widely read extension for vertex colours), `vn`,
-`f v//vn`.
+"""Wavefront OBJ, a text format: `v x y z r g b` (sRGB in [0, 1], the widely read extension for vertex
+colours), `vn`, `f v//vn`.
 
 Numbers are written in fixed point by numpy, digit by digit for a whole array, because Python's formatting
-takes seconds for a million faces. OBJ has no alpha per vertex: it is left out.
+takes seconds for a million faces. OBJ has no alpha per vertex, so alpha is left out.
 
-With a texture there are three files: `v x y z`, `vt u v` (origin at the LOWER left, unlike glTF's), `vn` and
+A mesh with a texture is three files: `v x y z`, `vt u v` (origin at the LOWER left, unlike glTF's), `vn` and
 `f v/vt/vn` in the OBJ, a material without light in the MTL, and the picture as a PNG.
 """
 
@@ -20,11 +20,12 @@ from player.errors import ConfigError, ParityError
 
 _PLAIN = b"# vfr-bake: v x y z r g b (sRGB), vn, f\n"
 _TEXTURED = b"# vfr-bake: v, vt, vn, f\n"
-_CHUNK = 1 << 17  # rows turned into text at once: tens of megabytes of scratch memory
+_CHUNK = 1 << 17  # rows turned into text at once, with tens of megabytes of scratch memory
 
 
 def obj_bytes(mesh: TriangleMesh) -> bytes:
-    """The file's content; positions to nine digits of the largest one, colours to 1e-4 (8 bits survive).
+    """Return the file's content: positions to nine digits of the largest one, colours
+    to 1e-4 (8 bits survive).
 
     Raises ConfigError for a coordinate of 1e15 or more.
 
@@ -39,9 +40,11 @@ def obj_bytes(mesh: TriangleMesh) -> bytes:
 
 
 def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[str, bytes]:
-    """The files of a mesh with a texture, `.png`, `.mtl` and `.obj`; they name each other `stem` plus suffix.
+    """Return the files of a mesh with a texture by suffix, `.png`, `.mtl` and `.obj`; they refer to each
+    other as `stem` plus suffix.
 
-    Raises ConfigError for a coordinate of 1e15 or more, or a stem that is no plain word: MTL cannot quote.
+    Raises ConfigError for a coordinate of 1e15 or more, or a stem that is empty or has spaces, which
+    an MTL file cannot quote.
 
     >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
@@ -71,13 +74,13 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
 
 
 def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:
-    """The arrays in a file that `obj_bytes` or `textured_obj_files` wrote.
+    """Return the arrays in a file that `obj_bytes` or `textured_obj_files` wrote.
 
     Returns:
-        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 3] sRGB, 0..1, or, of a mesh with a
+        `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours` [n, 3] sRGB, 0..1, or, for a mesh with a
         texture, `uvs` [n, 2], origin at the upper left.
 
-    Raises ParityError: a corner of a face has another normal or place in the picture than its vertex.
+    Raises ParityError: a corner of a face has the normal or the place in the picture of another vertex.
     """
     textured = data.startswith(_TEXTURED)
     widths = {"v": 3, "vt": 2, "vn": 3, "f": 9} if textured else {"v": 6, "vn": 3, "f": 6}
@@ -106,8 +109,8 @@ def _decimals(mesh: TriangleMesh) -> int:
 
 
 def _rows(word: str, *columns: tuple[np.ndarray, int]) -> list[bytes]:
-    """Lines that begin with `word`: a row each of arrays [n, m], side by side, and how many decimals each
-    has."""
+    """Return lines that begin with `word`. Each has one row of every array [n, m] side by side; an array
+    comes with its number of decimals."""
     lines = []
     for start in range(0, len(columns[0][0]), _CHUNK):
         rows = [_fixed(values[start : start + _CHUNK], decimals) for values, decimals in columns]
@@ -116,7 +119,7 @@ def _rows(word: str, *columns: tuple[np.ndarray, int]) -> list[bytes]:
 
 
 def _faces(faces: np.ndarray, separator: str, n_times: int) -> list[bytes]:
-    """Lines of faces whose corners repeat the vertex's number `n_times`."""
+    """Return the lines of faces whose corners repeat the vertex's number `n_times`."""
     lines = []
     for start in range(0, len(faces), _CHUNK):
         corners = _fixed(faces[start : start + _CHUNK] + 1, 0)
@@ -126,9 +129,8 @@ def _faces(faces: np.ndarray, separator: str, n_times: int) -> list[bytes]:
 
 
 def _fixed(values: np.ndarray, decimals: int) -> list[np.ndarray]:
-    """The columns of `values` [n, m] as fixed-point text: m arrays [n, width] of ASCII codes, 0 where nothing
-    is.
-    """
+    """Return the columns of `values` [n, m] as fixed-point text: m arrays [n, width] of ASCII codes, 0
+    where there is no character."""
     scaled = np.rint(np.asarray(values, np.float64) * 10.0**decimals).astype(np.int64)
     magnitude = np.abs(scaled)
     n_digits = max(len(str(int(magnitude.max(initial=0)))), decimals + 1)
@@ -151,7 +153,8 @@ def _fixed(values: np.ndarray, decimals: int) -> list[np.ndarray]:
 
 
 def _lines(parts: list[np.ndarray | str]) -> bytes:
-    """One line per row: arrays [n, width] of ASCII codes (0 is nothing) and constant strings side by side."""
+    """Return one line of text per row, from arrays [n, width] of ASCII codes (0 is no character) and constant
+    strings, side by side."""
     n_rows = next(len(part) for part in parts if isinstance(part, np.ndarray))
     columns = [
         part

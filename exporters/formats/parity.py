@@ -1,6 +1,5 @@
-"""Does a written file hold what it was written from? Every number is read from the bytes and compared, before
-any rename.
-"""
+"""Checks that a written file holds what it was written from. Every number is read back from the bytes and
+compared before the file gets its name."""
 
 from __future__ import annotations
 
@@ -24,22 +23,25 @@ from exporters.shapes.volume import Volume
 from player.errors import ParityError
 
 COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6, ".usdc": 6e-8, ".usda": 6e-8}
-"""Half a step of what the format writes: bytes, four decimals, 16 bits, float32."""
+"""Largest difference of a colour, by suffix: half a quantization step of four decimals, 16 bits or float32;
+none for the bytes of a PLY."""
 UV_TOLERANCE = {".obj": 1e-7, ".glb": 0.0}
-"""The same for places in a picture: seven decimals, float32."""
+"""Largest difference of a place in a picture, by suffix: one step of seven decimals for
+OBJ; none for GLB's float32."""
 LINEAR_TOLERANCE = 6e-8
-"""Half a step of linear light in float32."""
+"""Largest difference of linear light: half a quantization step in float32."""
 
 
 def check_mesh_bytes(
     suffix: str, data: bytes, mesh: TriangleMesh, where: str, texture: Texture | None = None
 ) -> None:
-    """Raises ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl, .usdc, .usda) file,
-    does not hold `mesh`: counts, places, normals, faces, and colours or the places in the picture and, of a
-    GLB, every texel; of an STL, which has no vertices, the corners.
+    """Raise ParityError if `data`, the content of a `suffix` (.ply, .obj, .glb, .stl, .usdc, .usda) file,
+    does not hold `mesh`.
 
-    Places may differ by what the format rounds: float32 for PLY, GLB, STL and USD, nine digits for OBJ. The
-    message names the worst.
+    Compared are counts, places, normals and faces, and the colours or else the places in the picture; for a
+    GLB also every texel. An STL has no vertices, so only the corners of its faces are compared. Places may
+    differ by what the format rounds: float32 for PLY, GLB, STL and USD, nine digits for OBJ. The message
+    names the largest difference.
     """
     if suffix == ".stl":
         corners = parse_stl(data, where)["corners"].reshape(-1, 3)
@@ -66,7 +68,7 @@ def check_mesh_bytes(
 
 
 def check_textured_obj(files: dict[str, bytes], mesh: TriangleMesh, texture: Texture, where: str) -> None:
-    """Raises ParityError if the `.obj`, `.mtl` and `.png` in `files` do not hold `mesh` and `texture`."""
+    """Raise ParityError if the `.obj`, `.mtl` and `.png` in `files` do not hold `mesh` and `texture`."""
     data = files[".obj"]
     named = [line[7:] for line in files[".mtl"].decode().splitlines() if line.startswith("map_Kd ")]
     start = data.index(b"mtllib ") + 7
@@ -78,7 +80,7 @@ def check_textured_obj(files: dict[str, bytes], mesh: TriangleMesh, texture: Tex
 
 
 def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
-    """Raises ParityError if `data`, the content of a point cloud's PLY, holds other points than `cloud`."""
+    """Raise ParityError if `data`, the content of a point cloud's PLY, holds other points than `cloud`."""
     points = parse_points(data, where)
     _check_rows(where, "points", cloud.vertices, points["position"], _rounding(cloud))
     _check_rows(where, "normals", cloud.normals, points["normal"], 1e-6)
@@ -86,7 +88,7 @@ def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
 
 
 def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> None:
-    """Raises ParityError if `data`, the content of a `suffix` (.vdb, .npz) file, holds another volume: every
+    """Raise ParityError if `data`, the content of a `suffix` (.vdb, .npz) file, holds another volume. Every
     vertex, density, colour and the matrix are compared, exactly but for linear colours in float32."""
     if suffix == ".npz":
         got = parse_npz(data, where)
@@ -110,7 +112,7 @@ def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> 
 
 
 def _check_grid(where: str, what: str, expected: VdbGrid, got: VdbGrid, tolerance: float) -> None:
-    """Compare two grids, in whichever order their vertices are."""
+    """Raise ParityError unless two grids agree, in whichever order their vertices are."""
     order, rows = _sorted(expected.index), _sorted(got.index)
     _check_rows(where, "matrix", expected.matrix, got.matrix, 0.0)
     _check_rows(where, "vertices", expected.index[order], got.index[rows], 0.0)
@@ -123,7 +125,7 @@ def _sorted(index: np.ndarray) -> np.ndarray:
 
 
 def _rounding(mesh: TriangleMesh) -> float:
-    """How far float32, or nine digits, may move the largest coordinate."""
+    """Return how far rounding to float32, or to nine digits, may move the largest coordinate."""
     return 2e-7 * max(float(np.abs(mesh.vertices).max(initial=0)), 1e-30)
 
 
@@ -149,8 +151,9 @@ def _check_picture(where: str, texture: Texture, png: bytes) -> None:
 
 
 def _content(suffix: str, data: bytes, where: str) -> dict[str, Any]:
-    """The arrays in a file, in its own axes: `vertices`, `normals` [n, 3], `faces` [m, 3], and `colours`
-    [n, 3 or 4] in 0..1, sRGB, in GLB and USD linear, or `uvs` [n, 2] with the origin at the upper left."""
+    """Return the arrays in a file, in its own axes: `vertices`, `normals` [n, 3], `faces` [m, 3],
+    and either `colours` [n, 3 or 4] in 0..1, linear in GLB and USD and else sRGB, or `uvs` [n, 2],
+    origin at the upper left."""
     if suffix == ".obj":
         return parse_obj(data, where)
     if suffix == ".glb":

@@ -1,9 +1,9 @@
-"""PLY, binary little endian: the mesh inside an asset, and the format that every mesh program reads.
+"""Binary little-endian PLY: the format of the mesh inside an asset, which every mesh program reads.
 
-Vertex: x y z nx ny nz float, red green blue alpha uchar (sRGB; the names are what makes Blender and MeshLab
-show the colour). Face: a list of three int. The mesh inside an asset has no normals and no alpha: readers
-make normals of the faces, and 13 of 28 bytes a vertex are saved. `read_ply` reads these two layouts alone,
-and accounts for every byte.
+A vertex has x y z nx ny nz as float, and red green blue alpha as uchar (sRGB; by these names Blender and
+MeshLab find the colour). A face is a list of three int. The mesh inside an asset has no normals and no alpha,
+which saves 13 of 28 bytes per vertex; readers compute the normals from the faces. `read_ply` reads only these
+two layouts, and accounts for every byte.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from player.errors import FormatError, IntegrityError, VfrError
 from player.files.files import read_bytes
 
 MAX_BYTES = 4 << 30
-"""A hundred million faces. What an asset's mesh may take is compared with its budget when it is opened."""
+"""Largest file that `read_ply` reads, in bytes: room for a hundred million faces. The mesh of an asset is
+also compared with the asset's memory budget when the asset is opened."""
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 4)])
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
 
@@ -54,7 +55,7 @@ _PATTERNS = [
 
 
 def ply_bytes(mesh: TriangleMesh) -> bytes:
-    """The file's content; the same mesh gives the same bytes.
+    """Return the file's content; the same mesh gives the same bytes.
 
     >>> empty = np.zeros((0, 3))
     >>> mesh = TriangleMesh(empty, empty.astype(np.int32), empty, np.zeros((0, 4), np.uint8))
@@ -65,7 +66,7 @@ def ply_bytes(mesh: TriangleMesh) -> bytes:
 
 
 def small_ply_bytes(mesh: TriangleMesh) -> bytes:
-    """The content of an asset's `mesh.ply`, which has no normals and no alpha.
+    """Return the content of an asset's `mesh.ply`, which has no normals and no alpha.
 
     >>> corners = np.zeros((4, 3))
     >>> up = np.tile([0.0, 0, 1], (4, 1))
@@ -79,7 +80,7 @@ def small_ply_bytes(mesh: TriangleMesh) -> bytes:
 
 
 def small_ply_size(n_vertices: int, n_faces: int) -> int:
-    """Bytes of `small_ply_bytes`."""
+    """Return how many bytes `small_ply_bytes` returns."""
     header = len(SMALL_HEADER.format(n_vertices=n_vertices, n_faces=n_faces))
     return header + n_vertices * SMALL_VERTEX.itemsize + n_faces * FACE.itemsize
 
@@ -91,15 +92,15 @@ def _file(header: str, rows: np.ndarray, corners: np.ndarray) -> bytes:
 
 
 def vertex_rows(mesh: TriangleMesh) -> np.ndarray:
-    """The vertices of a mesh as they are in a file, [n_vertices] of VERTEX."""
+    """Return the vertices of a mesh as a file stores them, [n_vertices] of VERTEX."""
     rows = np.empty(len(mesh.vertices), VERTEX)
     rows["position"], rows["normal"], rows["colour"] = mesh.vertices, mesh.normals, mesh.colours
     return rows
 
 
 def read_ply(path: Path) -> TriangleMesh:
-    """The mesh in a file that `ply_bytes` or `small_ply_bytes` wrote. Without normals it gets those of its
-    faces, by area.
+    """Return the mesh in a file that `ply_bytes` or `small_ply_bytes` wrote. If the file has no normals, they
+    are computed from the faces, weighted by area.
 
     Raises:
         FormatError: the file cannot be read, its header is another one, or its content is not a mesh.
@@ -109,7 +110,7 @@ def read_ply(path: Path) -> TriangleMesh:
 
 
 def parse_ply(data: bytes, where: str) -> TriangleMesh:
-    """The mesh in `data`; `where` names it in an error message."""
+    """Return the mesh in `data`; `where` names the file in an error message."""
     matches = ((vertex, pattern.match(data)) for vertex, pattern in _PATTERNS)
     vertex, match = next((found for found in matches if found[1]), (VERTEX, None))
     if match is None:
@@ -135,7 +136,7 @@ def parse_ply(data: bytes, where: str) -> TriangleMesh:
             return TriangleMesh(positions, corners, normals, np.ascontiguousarray(vertices["colour"]))
         colours = np.pad(vertices["colour"], ((0, 0), (0, 1)), constant_values=255)
         up = np.tile(np.array([0, 0, 1], np.float32), (len(positions), 1))
-        flat = TriangleMesh(positions, corners, up, colours)  # checks what normals are then made of
+        flat = TriangleMesh(positions, corners, up, colours)  # checks the arrays that normals are made from
         return replace(flat, normals=unit_normals(np.zeros(positions.shape), positions, corners))
     except VfrError as error:
         raise FormatError(f"{where}: {error}") from error

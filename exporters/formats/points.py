@@ -1,6 +1,6 @@
-"""A point cloud: places spread evenly over the surface, with its normals and colours, as a PLY without faces.
+"""Point clouds: points spread evenly over a surface, with normals and colours, as a PLY without faces.
 
-The vertex has the layout of `exporters.formats.ply`. A cloud is a `TriangleMesh` that has no faces.
+A vertex has the layout of `exporters.formats.ply`. A cloud is a `TriangleMesh` that has no faces.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ _PATTERN = re.compile(HEADER.format(n_vertices="(0|[1-9][0-9]{0,9})").encode())
 
 
 def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
-    """`n_points` points on the faces of a mesh, as dense everywhere; the same mesh gives the same points.
+    """Return `n_points` points on the faces of a mesh, equally dense everywhere. The result is deterministic:
+    the same mesh gives the same points.
 
-    The area is cut into `n_points` equal shares, and a point is drawn in each: gaps and clumps are smaller
-    than with free draws. Normals and colours (sRGB) are those of the corners, interpolated.
+    The area is cut into `n_points` equal shares and a point is drawn in each, so that gaps and clumps are
+    smaller than with independent draws. Normals and colours (sRGB) are interpolated between the corners.
 
     Args:
         mesh: the surface.
@@ -58,7 +59,7 @@ def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
 
 
 def points_bytes(cloud: TriangleMesh) -> bytes:
-    """The file's content; the faces of `cloud`, if it has any, are left out.
+    """Return the file's content; the faces of `cloud`, if it has any, are left out.
 
     >>> none = np.zeros((0, 3))
     >>> empty = TriangleMesh(none, np.zeros((0, 3), np.int32), none, np.zeros((0, 4), np.uint8))
@@ -69,7 +70,8 @@ def points_bytes(cloud: TriangleMesh) -> bytes:
 
 
 def parse_points(data: bytes, where: str) -> np.ndarray:
-    """The rows [n_points] of `exporters.formats.ply.VERTEX` in `data`; FormatError if it is another file."""
+    """Return the points in `data`, [n_points] of `exporters.formats.ply.VERTEX`;
+    FormatError for another file."""
     match = _PATTERN.match(data)
     if match is None or len(data) != match.end() + int(match[1]) * VERTEX.itemsize:
         raise FormatError(f"{where}: expected a point cloud as `vfr-export` writes it, got {data[:40]!r}")

@@ -1,7 +1,7 @@
-"""STL, binary: triangles alone, for printers and CAD. No colours, no shared corners, no unit.
+"""Binary STL: triangles without colours, shared corners or unit, for printers and CAD.
 
-Each triangle is its normal, from the corners' winding, and three corners, float32; the two bytes after it are
-0. The header must not begin with "solid", or readers take the file for text.
+A triangle is stored as its normal, computed from the corners' winding, and its three corners, all float32;
+the two bytes after them are 0. The header must not begin with "solid", or readers take the file for text.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ HEADER = b"vfr-bake: binary STL".ljust(80, b" ")
 
 
 def stl_bytes(mesh: TriangleMesh) -> bytes:
-    """The file's content; the same mesh gives the same bytes. 50 bytes a face.
+    """Return the file's content, 50 bytes per face; the same mesh gives the same bytes.
 
     Raises ConfigError for a mesh without faces, or with more than the format's 2^32 - 1.
 
@@ -37,7 +37,8 @@ def stl_bytes(mesh: TriangleMesh) -> bytes:
 
 
 def parse_stl(data: bytes, where: str) -> np.ndarray:
-    """The triangles [n_faces] of TRIANGLE in `data`; FormatError if their number does not fill the file."""
+    """Return the triangles in `data`, [n_faces] of TRIANGLE; FormatError if their
+    number does not fill the file."""
     n_faces = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
     if len(data) != 84 + n_faces * TRIANGLE.itemsize or data.startswith(b"solid"):
         raise FormatError(f"{where}: expected a binary STL of {n_faces} faces, got {len(data)} bytes")

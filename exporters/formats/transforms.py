@@ -1,8 +1,8 @@
-"""transforms.json of cameras in the frame of an export: instant-ngp's form, as `player.cameras.transforms`
-writes it.
+"""Writer of a transforms.json with cameras in the frame of an export: instant-ngp's form, as
+`player.cameras.transforms` writes it.
 
-The axes of a camera (x right, y up, looks along -z) and the pixels stay; what changes with the frame is where
-the cameras are.
+The axes of a camera (x right, y up, looks along -z) and its pixels are the same in every frame; only the
+poses of the cameras change.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from player.errors import ParityError
 
 
 def transforms_bytes(cameras: Sequence[Camera], matrix: np.ndarray, where: str) -> bytes:
-    """The file of `cameras` [world] in another frame, read back.
+    """Return the file of `cameras`, transformed to another frame, after reading it back.
 
     Args:
         cameras: at least one, world frame.
@@ -38,7 +38,7 @@ def transforms_bytes(cameras: Sequence[Camera], matrix: np.ndarray, where: str) 
 
 
 def moved_cameras(cameras: Sequence[Camera], matrix: np.ndarray) -> list[Camera]:
-    """The cameras in another frame; bit for bit the same ones where the matrix is the identity."""
+    """Return the cameras in another frame; bit for bit the same ones where the matrix is the identity."""
     if np.array_equal(matrix, np.eye(4)):
         return list(cameras)
     return [camera.transformed(matrix) for camera in cameras]

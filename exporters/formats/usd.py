@@ -1,8 +1,9 @@
 """USD: the mesh for film, Omniverse, Unreal and Blender, as .usdc (binary) or .usda (text).
 
-Written by Pixar's own library (the package usd-core). The stage says what glTF and OBJ can only assume:
-`upAxis`, `metersPerUnit = 1` (a world unit is taken as a metre, as glTF takes it). `primvars:displayColor` is
-LINEAR light by the specification; `displayOpacity` is there only if some vertex is not opaque.
+The file is written by Pixar's own library (the package usd-core). Its stage states what glTF and
+OBJ leave to convention: `upAxis` and `metersPerUnit = 1` (a world unit is taken as a metre, as in
+glTF). `primvars:displayColor` is LINEAR light by the specification; `displayOpacity` is there only
+if some vertex is not opaque.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from player.errors import ConfigError, FormatError
 
 
 def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
-    """The file's content; the same mesh gives the same bytes.
+    """Return the file's content; the same mesh gives the same bytes.
 
     Args:
         mesh: at least one face, in the coordinates of the file.
@@ -28,7 +29,7 @@ def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
         up: "Y" or "Z", the axis that is up in those coordinates.
 
     Raises:
-        ConfigError: no face.
+        ConfigError: the mesh has no face.
         MissingExtraError: the package `usd-core` is not installed.
     """
     if not len(mesh.faces):
@@ -58,21 +59,21 @@ def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
             opacity = (mesh.colours[:, 3] / 255).astype(np.float32)
             prim.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex).Set(Vt.FloatArray.FromNumpy(opacity))
         stage.GetRootLayer().Save()
-        del prim, root, stage  # the file is closed before its folder goes, which Windows asks for
+        del prim, root, stage  # closes the file before its folder is deleted, as Windows requires
         return Path(path).read_bytes()
 
 
 def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
-    """The arrays of a file, read by the library: `vertices`, `normals` [n, 3], `colours` [n, 4] linear and
-    `faces` [m, 3], and besides `up` ("Y" or "Z") and `metres` (a unit). Raises FormatError for another
-    file."""
+    """Return the arrays of a file, read by the library: `vertices`, `normals` [n, 3], `colours` [n, 4] linear
+    and `faces` [m, 3], and also `up` ("Y" or "Z") and `metres` (per unit). Raises FormatError for a file
+    without triangles or of another format."""
     Usd, UsdGeom, _ = _pxr()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mesh{suffix}"
         path.write_bytes(data)
         try:
             stage = Usd.Stage.Open(str(path))
-        except Exception as error:  # the library has one exception for everything
+        except Exception as error:  # the library raises one exception for everything
             raise FormatError(f"{where}: expected USD, got: {str(error).splitlines()[0]}") from error
         prim = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
         if not prim or set(prim.GetFaceVertexCountsAttr().Get()) != {3}:

@@ -1,17 +1,17 @@
-"""OpenVDB: the volume file of film and of Blender, written without the library.
+"""OpenVDB, the volume format of film software and Blender, written without the library.
 
-OpenVDB has no wheel on PyPI, and the asset's bricks are its leaf nodes already: 8 x 8 x 8 values, x slowest,
-a mask of 512 bits. So this writes the format itself, version 224 (read by OpenVDB 6.1 and later); the
-library's own readers are what the tests ask.
+OpenVDB has no wheel on PyPI, and the asset's bricks already have the layout of its leaf nodes: 8 x 8 x 8
+values, x slowest, and a mask of 512 bits. So this module writes the format itself, version 224 (read by
+OpenVDB 6.1 and later); the tests read the files with the library.
 
-File: magic, versions, a UUID, metadata, then each grid: a descriptor with three offsets, its compression,
-metadata, the affine map, TOPOLOGY (root, one node of 32^3, nodes of 16^3, leaves: masks of their children)
-and BUFFERS (the leaves' values). Only active values are stored (COMPRESS_ACTIVE_MASK), the rest is
-background 0.
+A file has a magic number, versions, a UUID, metadata, and then the grids. Each grid has a descriptor with
+three offsets, its compression, metadata, the affine map, TOPOLOGY (root, one node of 32^3, nodes of 16^3,
+leaves: masks of their children) and BUFFERS (the leaves' values). Only active values are stored
+(COMPRESS_ACTIVE_MASK); all others are the background, 0.
 
 Grids: `density` float, 1/unit of the frame, class "fog volume"; `color` vec3s, LINEAR light, as renderers
-take it. Renderers interpolate both between voxels, the density down to 0 over the voxel beside the outermost:
-`color` reaches one voxel further, so that what is there has a colour and is not dark.
+take it. Renderers interpolate both between voxels, so that the density falls to 0 over the voxel next to the
+outermost one. `color` has values one voxel further than `density`, or else the colour would darken there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROOT_CHILD = 4096  # voxels along an edge of the one node below the root
 
 
 class VdbGrid(NamedTuple):
-    """A grid as it is in a file."""
+    """A grid as a file stores it."""
 
     index: np.ndarray
     """[n, 3] int64, in the order of the file."""
@@ -47,9 +47,9 @@ class VdbGrid(NamedTuple):
 
 
 def vdb_bytes(volume: Volume) -> bytes:
-    """The file's content; the same volume gives the same bytes (the UUID is a checksum).
+    """Return the file's content; the same volume gives the same bytes (the UUID is a checksum).
 
-    Raises ConfigError for an empty volume, or one of 4096 vertices and more along an axis.
+    Raises ConfigError for an empty volume, or one with a vertex index of 4096 or more.
 
     >>> volume = Volume(np.array([[1, 0, 2]], np.int32), np.ones(1, np.float32), None, np.eye(4))
     >>> list(parse_vdb(vdb_bytes(volume), "a.vdb"))
@@ -76,9 +76,11 @@ def vdb_bytes(volume: Volume) -> bytes:
 
 
 def colour_voxels(index: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The voxels of the grid `color`: those of a volume and all that touch one, and their linear light.
+    """Return the voxels of the grid `color`, those of a volume and all that touch
+    one, and their linear light.
 
-    A voxel that only touches has the mean of its neighbours along x; what still has none, along y; then z.
+    A voxel that only touches one takes the mean of its neighbours along x; voxels that still have no colour
+    then take it along y, and last along z.
 
     Args:
         index: [n, 3] integers, 0 to 4095, each once.
@@ -112,9 +114,9 @@ def colour_voxels(index: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, n
 
 
 def parse_vdb(data: bytes, where: str) -> dict[str, VdbGrid]:
-    """The grids in a file that `vdb_bytes` made, by name.
+    """Return the grids in a file that `vdb_bytes` made, by name.
 
-    Raises FormatError for a file that is laid out in another way: this is no reader for all VDB files.
+    Raises FormatError for a file with another layout: this does not read VDB files in general.
     """
     try:
         return _parse(data)
@@ -137,7 +139,7 @@ def _metadata(entries: dict[str, str | float]) -> bytes:
 
 
 def _depth_first(coords: np.ndarray) -> np.ndarray:
-    """Order of the leaves: by the node of 16^3 leaves that holds them, then within it."""
+    """Return the order of the leaves: by the node of 16^3 leaves that holds them, then within the node."""
     x, y, z = coords.T.astype(np.int64)
     within = ((x & 15) << 8) | ((y & 15) << 4) | (z & 15)
     return np.lexsort((within, _node(coords)))
@@ -149,7 +151,7 @@ def _node(coords: np.ndarray) -> np.ndarray:
 
 
 def _in_order(values: np.ndarray, masks: np.ndarray, leaves: np.ndarray) -> list[bytes]:
-    """The bytes of each leaf's values, in the order of `leaves`."""
+    """Return the bytes of each leaf's values, in the order of `leaves`."""
     counts = np.bitwise_count(masks).sum(axis=1, dtype=np.int64)
     stops = np.cumsum(counts)
     rows = np.ascontiguousarray(values, "<f4")
@@ -159,7 +161,7 @@ def _in_order(values: np.ndarray, masks: np.ndarray, leaves: np.ndarray) -> list
 def _grid(
     name: str, coords: np.ndarray, masks: np.ndarray, values: list[bytes], volume: Volume, at: int
 ) -> bytes:
-    """Descriptor and content of a grid that begins at byte `at` of the file."""
+    """Return the descriptor and content of a grid that begins at byte `at` of the file."""
     width = 1 if name == "density" else 3
     header = _text(name) + _text(_TYPES[width]) + _text("")
     kind = {"class": "fog volume", "vfr.level": volume.level} if width == 1 else {"class": "unknown"}
@@ -189,7 +191,7 @@ def _topology(coords: np.ndarray, masks: np.ndarray, width: int) -> bytes:
 
 
 def _inner(children: np.ndarray, edge: int) -> bytes:
-    """A node of `edge`^3 entries: the mask of its children, no active tile, no value."""
+    """Return a node of `edge`^3 entries: the mask of its children, no active tile, no value."""
     has = np.zeros(edge**3, bool)
     has[children] = True
     return np.packbits(has, bitorder="little").tobytes() + b"\0" * (edge**3 // 8) + _REST_IS_BACKGROUND
@@ -245,7 +247,7 @@ def _read_grid(file: _Reader, width: int) -> VdbGrid:
 
 
 class _Reader:
-    """A file's bytes, taken one after another."""
+    """Reader of a file's bytes, one item after another."""
 
     def __init__(self, data: bytes, at: int) -> None:
         self.data = data
@@ -273,7 +275,7 @@ class _Reader:
             self.at += size
 
     def children(self, edge: int) -> np.ndarray:
-        """The numbers of the children of a node of `edge`^3 entries, as `_inner` writes it."""
+        """Read a node of `edge`^3 entries, as `_inner` writes it; return the numbers of its children."""
         has = np.unpackbits(self.array("u1", edge**3 // 8), bitorder="little")
         self.at += edge**3 // 8 + len(_REST_IS_BACKGROUND)
         return np.flatnonzero(has)

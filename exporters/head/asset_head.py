@@ -5,13 +5,14 @@
 | alone | `features` float [n, n_channels], `dirs` float [n, 3] | `rgb` float [n, 3] |
 | with decode | `codes` int8 [n, k, n_channels], `weights` float [n, k], `dirs` float [n, 3] | the same |
 
-n, and k, are free. `features` are the sum of weight times code that a player composes; the scales of the
-codes are in the head's first layer since the asset was baked. With the decode, `codes` are k rows of
-features.codes and `weights` what each counts, compositing weight times the share of a corner: `features =
-sum_k weights codes` is part of the graph. `dirs` are unit, model frame, from the camera into the scene;
-`rgb` is 0..1 in the asset's colour space, to be composed as `rgb A + (1 - A) background`.
+n and k are free. `features` are the sum of weight times code that a player composites; the bake has put the
+scales of the codes into the head's first layer. With the decode, `codes` are k rows of features.codes, and
+`weights` are their weights, each a compositing weight times the interpolation weight of a corner; `features =
+sum_k weights codes` is then part of the graph. `dirs` are unit, model frame, from the camera into the scene;
+`rgb` is 0..1 in the asset's colour space, to be composited as `rgb A + (1 - A) background`.
 
-The file's metadata records the opset, the names, and what was compared and how far it was apart.
+The file's metadata records the opset, the names of inputs and outputs, what the graph was compared with, and
+the largest difference.
 """
 
 from __future__ import annotations
@@ -26,33 +27,34 @@ from player.errors import FormatError, ParityError
 from player.head.head import Head, read_head_file
 
 TOLERANCE = 1e-6
-"""The most that rgb may differ from the asset's own head. It is the same graph, on numbers that are exact in
-float32, so that only another order of float32 additions is allowed for."""
+"""Largest allowed difference of rgb from the asset's own head. Both compute the same graph on numbers that
+are exact in float32, so that only the order of float32 additions may differ."""
 
 N_FETCHES = 5
-"""Fetches a pixel, k, in the comparisons."""
+"""Feature lookups per pixel, k, in the comparisons."""
 
 
 class Comparison(NamedTuple):
-    """Inputs of a head."""
+    """Inputs for which two heads are compared."""
 
     label: str
-    """What an error message calls them."""
+    """Name of these inputs in an error message."""
     features: np.ndarray
     """[n, n_channels] float32."""
     codes: np.ndarray | None
-    """[n, k, n_channels] int8, which with `weights` make the features; None if no codes do."""
+    """[n, k, n_channels] int8, whose sum weighted by `weights` is `features`; None if the features are not
+    made of codes."""
     weights: np.ndarray | None
-    """[n, k] float32."""
+    """[n, k] float32 weights of the codes; None without codes."""
     dirs: np.ndarray
     """[n, 3] float32, unit."""
 
 
 def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> bytes:
-    """The file's content; the same asset gives the same bytes.
+    """Return the file's content; the same asset gives the same bytes.
 
-    Checked by `onnx.checker`, run in onnxruntime, and compared with `player.head.head.Head` on random and
-    extreme inputs.
+    The graph is checked by `onnx.checker`, run in onnxruntime, and compared with `player.head.head.Head` on
+    random and extreme inputs.
 
     Args:
         asset: an open asset.
@@ -98,8 +100,9 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
 
 
 def _make_weights_unsigned(onnx: Any, model: Any) -> None:
-    """The same numbers with codes of weights from 0 to 255 around 128, which every processor multiplies
-    exactly: onnxruntime adds up products of an unsigned and a signed byte in 16 bits, where it has to."""
+    """Store the codes of weights as unsigned bytes around 128, which represent the same numbers. Every
+    processor multiplies these exactly, while on some of them onnxruntime adds up products of an unsigned and
+    a signed byte in 16 bits."""
     to_array, from_array = onnx.numpy_helper.to_array, onnx.numpy_helper.from_array
     for tensor in model.graph.initializer:
         if tensor.name.endswith(("_weight_codes", "_weight_zero")):
@@ -108,7 +111,8 @@ def _make_weights_unsigned(onnx: Any, model: Any) -> None:
 
 
 def _put_decode_in_front(onnx: Any, model: Any, n_channels: int) -> None:
-    """`features = squeeze(weights [n, 1, k] @ codes [n, k, c])`, instead of the input `features`."""
+    """Compute `features = squeeze(weights [n, 1, k] @ codes [n, k, c])` in the graph, in place
+    of the input `features`."""
     helper, graph = onnx.helper, model.graph
     axis = onnx.numpy_helper.from_array(np.array([1], np.int64), "decode_axis")
     nodes = [
@@ -131,7 +135,8 @@ def _put_decode_in_front(onnx: Any, model: Any, n_channels: int) -> None:
 
 
 def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
-    """The largest difference of rgb to the asset's own head; ParityError over TOLERANCE."""
+    """Return the largest difference of rgb from the asset's own head; raise ParityError
+    if it is over TOLERANCE."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -151,7 +156,7 @@ def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
         if not len(got):
             continue
         difference = np.abs(got.astype(np.float64) - expected)
-        difference[np.isnan(got) & np.isnan(expected)] = 0  # beyond float32 both say so
+        difference[np.isnan(got) & np.isnan(expected)] = 0  # both overflow float32: no difference
         if not (difference <= TOLERANCE).all():
             pixel = int(np.argmax(np.where(np.isnan(difference), np.inf, difference).max(axis=-1)))
             raise ParityError(
@@ -163,8 +168,9 @@ def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
 
 
 def comparisons(n_channels: int) -> list[Comparison]:
-    """Random and extreme inputs. Weights are multiples of 1/64 and codes integers, so that every order of
-    addition gives the same float32 features: an 8-bit layer would turn a last bit into a whole level."""
+    """Return random and extreme inputs. Weights are multiples of 1/64 and codes are integers, so that every
+    order of addition gives the same float32 features; an 8-bit layer could turn a difference in the last bit
+    into a whole level."""
     random = np.random.default_rng(0)
 
     def unit(n: int) -> np.ndarray:

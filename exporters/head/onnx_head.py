@@ -1,9 +1,10 @@
-"""The head of Volume Feature Rendering as one ONNX graph: composited features and a direction in, rgb out.
+"""Writer of the head of Volume Feature Rendering as one ONNX graph, which maps composited features and a
+direction to rgb.
 
-The graph, its letters and what 8 bits round are specified in `player.head.graph`; here are the weights that
-go into it. The spherical harmonics are computed inside the graph from the one table of
-`exporters.head.spherical_harmonics`, so that no caller can disagree with it on order or sign. Built from
-numpy arrays, the same weights give the same bytes.
+The graph, its letters and its rounding to 8 bits are specified in `player.head.graph`; this module adds the
+weights. The spherical harmonics are computed inside the graph from the one table of
+`exporters.head.spherical_harmonics`, so that no caller can disagree with it on order or sign. The graph is
+built from numpy arrays, and the same weights give the same bytes.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class HeadWeights:
         output: the last layer, [n_in, 3], followed by a sigmoid.
         sh_degree: number of bands, 1 to 8; n_bases = sh_degree^2.
         n_sh_features: features a basis.
-        activation: what follows each hidden layer.
+        activation: the function applied after each hidden layer.
 
     Raises:
         ShapeError: two layers do not fit.
@@ -98,7 +99,7 @@ def _check_layer(name: str, layer: Layer, n_in: int, n_out: int | None = None) -
 
 
 def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> bytes:
-    """The head as a serialised ONNX model (opset 20, any number of pixels).
+    """Return the head as a serialised ONNX model (opset 20, any number of pixels).
 
     Inputs `features` [n, n_channels] (composited, not divided by the opacity) and `dirs` [n, 3] (unit, from
     the camera into the scene); output `rgb` [n, 3] sRGB in [0, 1]; all float32.
@@ -111,8 +112,8 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
             pixel's colour does not depend on which pixels it is evaluated with.
 
     Raises:
-        ShapeError: another number of ranges.
-        FormatError: a head that no player would take, such as one of too many layers.
+        ShapeError: the number of ranges does not fit the head.
+        FormatError: no player would take the head, for example because it has too many layers.
         MissingExtraError: the package `onnx` is not installed.
     """
     with needs("the ONNX head", "the package onnx"):
@@ -151,12 +152,12 @@ def head_onnx(weights: HeadWeights, ranges: Sequence[Range] | None = None) -> by
     )
     onnx.checker.check_model(model, full_check=True)
     data = model.SerializeToString(deterministic=True)
-    read_head(data, "head")  # what is written can be played
+    read_head(data, "head")  # checks that a player can read it
     return data
 
 
 def levels(limits: Range) -> tuple[float, int]:
-    """The step between the 256 levels of a range, and the code of 0.
+    """Return the quantization step between the 256 levels of a range, and the code of 0.
 
     >>> levels((-0.1, 25.4))
     (0.1, 1)
@@ -166,20 +167,21 @@ def levels(limits: Range) -> tuple[float, int]:
 
 
 def weight_scales(weight: np.ndarray) -> np.ndarray:
-    """The step between two codes of the weights [n_in, n_out], for each output: [n_out] float32.
+    """Return the quantization step of the codes of the weights [n_in, n_out], for each
+    output: [n_out] float32.
 
-    No two neighbouring codes then exceed `player.head.graph.PAIR_LIMIT`: their sum before rounding is one
-    less at most, and each may be rounded up by a half.
+    With these steps the magnitudes of two neighbouring codes add up to `player.head.graph.PAIR_LIMIT` at
+    most: before rounding their sum is at most one less, and rounding may raise each by a half.
     """
     return (np.maximum(pair_sums(weight).max(axis=0), 1e-12) / (PAIR_LIMIT - 1)).astype(np.float32)
 
 
 def _constants(weights: HeadWeights, ranges: Sequence[Range] | None) -> dict[str, np.ndarray]:
-    """The graph's constants by name."""
+    """Return the graph's constants by name."""
     constants: dict[str, np.ndarray] = {}
 
     def dense(name: str, layer: Layer, x: str = "", parts: Sequence[str] = ("weight", "bias")) -> None:
-        """The parts of a layer, in 8 bits if what it takes in, `x`, is."""
+        """Add the parts of a layer, in 8 bits if its input `x` is in 8 bits."""
         x_scale = constants.get(f"{x}_scale")
         if x_scale is None:
             for part, array in zip(parts, layer, strict=False):
@@ -215,9 +217,10 @@ def _constants(weights: HeadWeights, ranges: Sequence[Range] | None) -> dict[str
 
 
 def _in_8_bits(layer: Layer, x_scale: np.float32) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Weights as signed 8-bit codes, a scale for each output; the bias in steps of the products' scale.
+    """Return the weights as signed 8-bit codes with a scale for each output, and the bias as codes in steps
+    of the products' scale.
 
-    A bias that is huge beside its weights makes the steps coarser: its code has to fit into 32 bits.
+    A bias that is huge beside its weights makes the steps coarser, because its code has to fit into 32 bits.
     """
     weight, bias = layer
     smallest = np.abs(bias) / (float(x_scale) * 2**30)
@@ -229,8 +232,8 @@ def _in_8_bits(layer: Layer, x_scale: np.float32) -> dict[str, tuple[np.ndarray,
 
 
 def _harmonics(weights: HeadWeights) -> dict[str, np.ndarray]:
-    """Monomials of every order from those of the order below, and each basis's coefficients, repeated
-    `n_sh_features` times."""
+    """Return the constants that compute the monomials of every order from those of the order below, and the
+    coefficients of each basis function, repeated `n_sh_features` times."""
     exponents, coefficients = sh_monomials(weights.sh_degree)
     columns = np.repeat(coefficients, weights.n_sh_features, axis=1).astype(np.float32)
     of_powers = {tuple(powers): columns[row] for row, powers in enumerate(exponents.tolist())}

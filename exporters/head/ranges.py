@@ -1,8 +1,8 @@
 """Ranges of the head's hidden activations, for multiplying in 8 bits.
 
-Letters as in `player.head.graph`: h is what the spatial MLP emits, e the encoded features, z_i what
-directional layer i emits. h and z_i come out of an activation: GELU is never below -0.17, hard swish never
-below -0.375.
+Letters as in `player.head.graph`: h is the output of the spatial MLP, e the encoded features, z_i the output
+of directional layer i. h and z_i come out of an activation function: GELU is never below -0.17, hard swish
+never below -0.375.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from exporters.head.onnx_head import HeadWeights, Range
 from exporters.head.spherical_harmonics import sh_monomials
 
 COVERED = 99.99
-"""Percentage of the activations inside a range; the rare larger ones are clipped, and the others keep a
-finer step."""
+"""Percentile at the upper end of a range; the lower end is at 100 minus this. The rare values outside are
+clipped, so that the others keep a finer quantization step."""
 
 
 def activation_ranges(weights: HeadWeights, features: np.ndarray, dirs: np.ndarray) -> tuple[Range, ...]:
-    """The ranges of h, of e, and of each z_i that another directional layer takes in.
+    """Return the ranges of h, of e, and of each z_i that another directional layer takes in.
 
     Args:
         weights: the head.
@@ -51,7 +51,8 @@ def _range(values: np.ndarray) -> Range:
 
 
 def _gelu(x: np.ndarray) -> np.ndarray:
-    """The tanh form, within 5e-4 of the exact one: near enough for a range, and numpy alone can do it."""
+    """Return the tanh form of GELU, within 5e-4 of the exact one: near enough for a range, and numpy alone
+    can compute it."""
     return 0.5 * x * (1 + np.tanh(0.7978845608 * (x + 0.044715 * x**3)))
 
 

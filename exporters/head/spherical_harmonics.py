@@ -25,8 +25,8 @@ Polynomial = dict[tuple[int, int, int], float]
 
 
 def sh_monomials(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """The bands l = 0 .. degree - 1 as monomials and their coefficients: Y(d) = prod(d ** exponents) @
-    coefficients.
+    """Return the bands l = 0 .. degree - 1 as monomials and their coefficients: Y(d) = prod(d **
+    exponents) @ coefficients.
 
     Args:
         degree: number of bands, 1 to 8; there are degree^2 bases.
@@ -72,7 +72,7 @@ def _harmonic(order: int, m: int) -> Polynomial:
 
 
 def _circular(m: int) -> dict[tuple[int, int], int]:
-    """Re (x + iy)^m for m >= 0, Im (x + iy)^|m| for m < 0, by powers of x and y."""
+    """Return Re (x + iy)^m for m >= 0, Im (x + iy)^|m| for m < 0, as coefficients by powers of x and y."""
     result = {}
     for power_y in range(1 if m < 0 else 0, abs(m) + 1, 2):
         result[abs(m) - power_y, power_y] = (-1) ** (power_y // 2) * math.comb(abs(m), power_y)

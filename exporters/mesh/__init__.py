@@ -1,1 +1,1 @@
-"""What is done to a mesh: fewer faces, a flat layout and a texture, rays onto it."""
+"""Operations on meshes: simplification, texture layout and painting, ray casting."""

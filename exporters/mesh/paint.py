@@ -1,8 +1,8 @@
-"""The texture of a mesh that has been laid out: which texel lies where on it, its colour, and the padding.
+"""Painting of the texture of a mesh that has been laid out.
 
-Letters as in `exporters.shapes.texture`. A texel belongs to the face whose triangle holds its centre; all
-others take the colour of the nearest one that has a face, so that neither linear filtering nor smaller copies
-of the picture show what is between the charts.
+Letters as in `exporters.shapes.texture`. A texel belongs to the face whose triangle contains its centre.
+Every texel without a face takes the colour of the nearest coloured texel, so that neither linear filtering
+nor mipmaps show the gaps between the charts.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from exporters.shapes.texture import Texture
 from player.errors import DataError
 from player.files.images import to_8_bit
 
-_AT_ONCE = 1 << 22  # how many candidate texels are looked at together
+_AT_ONCE = 1 << 22  # candidate texels tested at a time
 
 ColourPoints = Callable[[np.ndarray, np.ndarray], KnownColours]
-"""The colours of points [n, 3] with unit normals [n, 3]."""
+"""A function that returns the colours of points [n, 3] with unit normals [n, 3]."""
 
 
 class CoveredTexels(NamedTuple):
-    """Texels whose centre a face holds."""
+    """Texels whose centre lies in a face."""
 
     texels: np.ndarray
     """[n] int64, row * size + column."""
     faces: np.ndarray
-    """[n] int64, the face that holds the centre."""
+    """[n] int64, the face that contains the centre."""
     shares: np.ndarray
-    """[n, 3] float64, what each corner of the face counts there, of sum 1."""
+    """[n, 3] float64, the weights of the face's corners there (barycentric coordinates), of sum 1."""
 
 
 def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints) -> Texture:
-    """The texture of a mesh that has been laid out.
+    """Paint the texture of a mesh that has been laid out.
 
     Args:
-        mesh: as laid out.
-        uvs: [n_vertices, 2], as `exporters.mesh.unwrap` returns them.
+        mesh: the mesh that `exporters.mesh.unwrap` returns.
+        uvs: [n_vertices, 2], returned with it.
         size: texels along each side.
-        colours: asked once, for the points under the centres of all covered texels.
+        colours: called once, with the points under the centres of all covered texels.
 
     Raises:
         DataError: no texel is covered, or none has a colour.
@@ -63,7 +63,8 @@ def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints)
 
 
 def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> CoveredTexels:
-    """The texels that the faces of a mesh cover, ascending, each once, with the first face that holds it.
+    """Return the texels that the faces of a mesh cover, ascending, each once, with the first face that
+    contains its centre.
 
     Args:
         uvs: [n_vertices, 2], 0..1.
@@ -93,7 +94,8 @@ def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> CoveredTexe
 
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """The picture [h, w, 3] with every texel that is not `covered` [h, w] coloured as the nearest that is."""
+    """Return the picture [h, w, 3] in which every texel that is not `covered` [h, w] has the colour of the
+    nearest one that is."""
     with needs("--texture", "scipy"):
         from scipy.ndimage import distance_transform_edt
     nearest = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
@@ -103,9 +105,11 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 def _inside(
     corners: np.ndarray, low: np.ndarray, extent: np.ndarray, faces: np.ndarray, size: int
 ) -> CoveredTexels:
-    """The texels that the faces numbered `faces` hold, out of all in the boxes around them.
+    """Return the texels whose centres the faces numbered `faces` contain, out of all texels in the bounding
+    boxes of these faces.
 
-    `corners` [n_faces, 3, 2], in texels; the boxes begin at `low` [n_faces, 2] and are `extent` wide.
+    `corners` [n_faces, 3, 2] are in texels. The bounding boxes begin at `low` [n_faces, 2] and have `extent`
+    [n_faces, 2] texels.
     """
     counts = extent[faces, 0] * extent[faces, 1]
     face = np.repeat(faces, counts)

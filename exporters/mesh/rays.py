@@ -1,7 +1,7 @@
-"""Which face of a mesh each pixel of a camera sees: rays cast by Open3D (Embree).
+"""Ray casting with Open3D (Embree): the face of a mesh that each pixel of a camera sees.
 
-Letters: t, the distance along a ray of unit direction; b, what each of a face's three corners counts at the
-place that a ray meets, of sum 1.
+Letters: t, the distance along a ray of unit direction; b, the weights of a face's three corners at the point
+that a ray hits (barycentric coordinates), of sum 1.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from player.cameras.camera import Camera
 
 
 class Hits(NamedTuple):
-    """The places where rays through the pixels of a camera meet a mesh."""
+    """The points where rays through the pixels of a camera hit a mesh."""
 
     pixels: np.ndarray
-    """[n] int64, the pixels whose ray meets the mesh, ascending; pixels are numbered row by row."""
+    """[n] int64, the pixels whose ray hits the mesh, ascending; pixels are numbered row by row."""
     distance: np.ndarray
-    """[n] float32, distance along the ray, world units."""
+    """[n] float32, distance t along the ray, world units."""
     faces: np.ndarray
-    """[n] int64, the first face that the ray meets."""
+    """[n] int64, the first face that the ray hits."""
     shares: np.ndarray
-    """[n, 3] float64, the shares b of that face's corners."""
+    """[n, 3] float64, the weights b of that face's corners."""
 
 
 class MeshRays:
-    """A mesh, ready to be looked at.
+    """A mesh prepared for ray casting.
 
     Raises MissingExtraError: Open3D is not installed.
     """
@@ -43,7 +43,7 @@ class MeshRays:
         )
 
     def seen_by(self, camera: Camera) -> Hits:
-        """Where the rays through the pixel centres of a camera (world frame) meet the mesh."""
+        """Return where the rays through the pixel centres of a camera (world frame) hit the mesh."""
         rays = np.concatenate(camera.rays(), axis=1)
         answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)))
         distance = answer["t_hit"].numpy()

@@ -1,12 +1,13 @@
-"""Fewer faces: quadric edge collapse (Garland and Heckbert 1997) by Open3D, colours and normals kept.
+"""Mesh simplification: quadric edge collapse (Garland and Heckbert 1997) by Open3D, which
+keeps colours and normals.
 
-Open3D averages colours and normals of the two ends of each edge that it collapses. It knows no alpha, which
-is taken from the nearest vertex of the source. It stops early where every edge that is left would fold the
-surface: a mesh with many thin parts keeps more faces than were asked for (lego, 380,541 faces: 20,000 are
-reached, of 5,000 remain 11,721). The command says so.
+Open3D averages the colours and normals of the two ends of each edge that it collapses. It does not know
+alpha, which is taken from the nearest vertex of the source. It stops early where collapsing any edge that is
+left would fold the surface, so a mesh with many thin parts keeps more faces than were asked for (lego,
+380,541 faces: a target of 20,000 is reached, one of 5,000 leaves 11,721). The command then says so.
 
-That takes minutes for millions of faces. There, vertices in the same small cube are made one first, until
-about FIRST times as many faces are left as are asked for.
+Edge collapse takes minutes for millions of faces. A mesh that large is first clustered: vertices in the same
+small cube are merged, until about FIRST times the faces that are asked for are left.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from player.errors import ConfigError, DataError
 from player.files.images import to_8_bit
 
 FIRST = 12
-"""Edges are collapsed from this many times the faces that are asked for; what is finer is clustered first."""
+"""Edges are collapsed from about this many times the faces that are asked for; a mesh of more than twice as
+many is clustered first."""
 
 
 def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
-    """The mesh with `n_faces` faces, or as few as can be reached; itself if it has no more. The same mesh
-    gives the same result.
+    """Return the mesh with `n_faces` faces, or as few as can be reached; a mesh that has no more is returned
+    itself. The same mesh gives the same result.
 
     Args:
         mesh: any mesh; parts that are not connected are simplified together.
@@ -73,7 +75,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
 
 
 def clustered(vertices: np.ndarray, faces: np.ndarray, cube: float) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with all vertices in the same cube made one, at their mean.
+    """Merge all vertices of a mesh that lie in the same cube, at their mean.
 
     Args:
         vertices: [n_vertices, 3] float64.
@@ -98,7 +100,7 @@ def clustered(vertices: np.ndarray, faces: np.ndarray, cube: float) -> tuple[np.
 
 
 def mean_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Mean length of the first edge of each face."""
+    """Return the mean length of the first edge of each face."""
     return float(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1).mean())
 
 

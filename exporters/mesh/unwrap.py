@@ -1,9 +1,8 @@
-"""A mesh laid out flat: charts and their places in a square, by xatlas.
+"""Texture layout of a mesh by xatlas: the mesh is cut into charts, which are packed into a square.
 
-xatlas has no way to be stopped and says nothing while it works, so it runs in a process of its own, which is
-ended when the time is over, or with Ctrl-C. Its time grows faster than the number of faces that it
-is given at once (1,500 faces: a tenth of a millisecond each; 6,000: over three), so the mesh is cut into
-small parts.
+xatlas cannot be stopped and reports no progress, so it runs in a process of its own, which is killed when the
+time limit is over or on Ctrl-C. Its time grows faster than the number of faces that it is given at once
+(1,500 faces: a tenth of a millisecond each; 6,000: over three), so the mesh is cut into small parts.
 """
 
 from __future__ import annotations
@@ -23,33 +22,33 @@ from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
 
 GUTTER = 2
-"""Texels that are left free between two charts."""
+"""Texels left free between two charts."""
 PART = 1000
-"""The most faces that a part of the mesh has; parts share no chart."""
-_FILLED = (
-    0.8  # charts are scaled to this share of the picture's edge: xatlas fills three quarters of the area
-)
-_POLL = 0.1  # seconds between two looks at the other process
+"""Largest number of faces in a part of the mesh; parts share no chart."""
+# The charts together have the area of a square whose edge is this share of the picture's edge; xatlas packs
+# charts so that they fill three quarters of the area.
+_FILLED = 0.8
+_POLL = 0.1  # seconds between two checks of the other process
 
 
 def unwrap(
     mesh: TriangleMesh, size: int, seconds: float, progress: Progress = silent
 ) -> tuple[TriangleMesh, np.ndarray]:
-    """A mesh cut along seams, and where its vertices are in a square picture.
+    """Cut a mesh along seams, and place its vertices in a square picture.
 
     Args:
         mesh: any mesh with faces.
         size: texels along each side of the picture that the charts are packed for.
-        seconds: after so long it is given up.
+        seconds: time limit, after which the layout is given up.
         progress: called with the seconds passed and `seconds`, about every second.
 
     Returns:
-        The mesh: the same faces in the same order, vertices on seams once for each side. uvs [n_vertices, 2]
-        float32, 0..1, origin at the upper left corner of the picture.
+        The mesh: the same faces in the same order, with vertices on seams once for each side. Its uvs
+        [n_vertices, 2] float32, 0..1, with the origin at the upper left corner of the picture.
 
     Raises:
-        ConfigError: the time is over.
-        DataError: xatlas lays out nothing.
+        ConfigError: the time limit is over.
+        DataError: xatlas fails, or lays out other faces.
         MissingExtraError: xatlas is not installed.
     """
     if importlib.util.find_spec("xatlas") is None:
@@ -76,7 +75,7 @@ def unwrap(
 
 
 def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None:
-    """Start the other process and wait until it has written atlas.npz into `folder`."""
+    """Run the layout in another process, and wait until it has written atlas.npz into `folder`."""
     begin = time.monotonic()
     command = python_command("exporters.mesh.unwrap", str(folder))
     with (
@@ -97,7 +96,7 @@ def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None
                     progress(shown, max(int(seconds), shown + 1))
                 time.sleep(_POLL)
         finally:
-            process.kill()  # nothing where it has ended
+            process.kill()  # does nothing if it has ended
     if process.returncode:
         last = (folder / "errors").read_text(errors="replace").strip().splitlines() or ["no message"]
         raise DataError(
@@ -106,8 +105,8 @@ def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None
 
 
 def parts_of(vertices: np.ndarray, faces: np.ndarray, largest: int) -> list[np.ndarray]:
-    """Face numbers in groups of at most `largest` that lie together: halved along the longest side, again and
-    again.
+    """Return face numbers in groups of at most `largest` faces that lie together: the faces are halved along
+    the longest side, again and again.
 
     >>> corners = np.array([[float(x), 0, 0] for x in range(6)])
     >>> faces = np.array([[4, 5, 5], [0, 1, 1], [3, 4, 4], [1, 2, 2]])
@@ -128,7 +127,7 @@ def parts_of(vertices: np.ndarray, faces: np.ndarray, largest: int) -> list[np.n
 
 
 def _child(folder: str) -> None:
-    """The work of the other process: from mesh.npz to atlas.npz."""
+    """Lay out mesh.npz of `folder` and write atlas.npz there: the work of the other process."""
     import xatlas
 
     with np.load(Path(folder) / "mesh.npz") as mesh:

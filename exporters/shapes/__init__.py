@@ -1,1 +1,1 @@
-"""What is exported: meshes, their colours and textures, crops, volumes."""
+"""The data that are exported: meshes, their colours and textures, crops, volumes."""

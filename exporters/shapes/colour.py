@@ -1,7 +1,7 @@
-"""Colours: sRGB and linear light, bytes, and colours that not every point has.
+"""Colours: conversion between sRGB and linear light, and colours that are known for some points only.
 
-The two curves are those of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear).
-Pictures, PLY and OBJ hold sRGB; glTF vertex colours (COLOR_0) and EXR hold linear light.
+The two curves are those of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear). Pictures, PLY and
+OBJ hold sRGB; glTF vertex colours (COLOR_0) and EXR hold linear light.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from numpy.typing import ArrayLike
 
 
 class KnownColours(NamedTuple):
-    """Colours of n points, as far as they are known."""
+    """Colours of n points, some of which may have none."""
 
     rgb: np.ndarray
     """[n, 3] float32 or float64 sRGB, 0..1."""
     known: np.ndarray
-    """[n] bool: whether the point has a colour."""
+    """[n] bool, true where the point has a colour."""
 
 
 def linear_from_srgb(srgb: ArrayLike) -> np.ndarray:
-    """Linear light in [0, 1] from sRGB values in [0, 1]; any shape, computed in float64.
+    """Convert sRGB values in [0, 1] to linear light in [0, 1]; any shape, computed in float64.
 
     >>> linear_from_srgb([0.0, 128 / 255, 1.0]).round(4).tolist()
     [0.0, 0.2159, 1.0]
@@ -32,7 +32,7 @@ def linear_from_srgb(srgb: ArrayLike) -> np.ndarray:
 
 
 def srgb_from_linear(linear: ArrayLike) -> np.ndarray:
-    """sRGB values in [0, 1] from linear light in [0, 1]: the inverse of `linear_from_srgb`.
+    """Convert linear light in [0, 1] to sRGB values in [0, 1]: the inverse of `linear_from_srgb`.
 
     >>> srgb_from_linear([0.0, 0.21586, 1.0]).round(4).tolist()
     [0.0, 0.502, 1.0]

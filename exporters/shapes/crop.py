@@ -1,12 +1,13 @@
-"""The part of a mesh inside an oriented box, in world units.
+"""Crop of a mesh to an oriented box, in world units.
 
-A person types `X,Y,Z,W,D,H` or `X,Y,Z,W,D,H,YAW`: centre, whole edge lengths, and degrees about the world's
-Z, counter-clockwise seen from above. For any other orientation a JSON file: `{"matrix": 4 x 4, "size": [W, D,
-H]}`, where the matrix is rigid and takes the box's frame, its centre at the origin, to the world; or the same
-numbers by name, `{"centre": [X, Y, Z], "size": [W, D, H], "yaw": 30}`.
+On the command line a box is `X,Y,Z,W,D,H` or `X,Y,Z,W,D,H,YAW`: its centre, its whole edge lengths, and a
+turn in degrees about the world's Z, counter-clockwise seen from above. A JSON file describes any other
+orientation: `{"matrix": 4 x 4, "size": [W, D, H]}`, where the matrix is rigid and maps the box's frame, whose
+origin is the box's centre, to the world; or the same numbers by name, `{"centre": [X, Y, Z], "size": [W, D,
+H], "yaw": 30}`.
 
-A face stays when its three corners are in the box (its faces included): nothing is cut, so the edge is as
-rough as a face is long, and nothing sticks out.
+A face is kept if its three corners are in the box or on its sides. No face is cut, so the edge is as rough as
+a face is long, and nothing sticks out of the box.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _FORM = "X,Y,Z,W,D,H[,YAW] (centre, size, degrees about Z) or a .json file"
 
 @dataclass(frozen=True, eq=False)
 class CropBox:
-    """A box anywhere in the world.
+    """A box with any place and orientation in the world.
 
     >>> box = CropBox(np.eye(4), np.array([2.0, 2, 2]))
     >>> box.holds(np.array([[0.0, 0, 0], [1, 1, 1], [0, 0, 1.1]])).tolist()
@@ -36,21 +37,22 @@ class CropBox:
     """
 
     matrix: np.ndarray
-    """[4, 4] rigid, world from box; the box's centre is its origin."""
+    """[4, 4] rigid transform, world from box; the origin of the box's frame is the box's centre."""
     size: np.ndarray
     """[3] whole edge lengths, world units, > 0."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """[n] bool: which of the world points [n, 3] are in the box, its faces included (to 1e-6 of its size:
-        what float32 does to a corner must not decide)."""
+        """Return which of the world points [n, 3] are in the box or on its sides, [n] bool. A tolerance of
+        1e-6 of the box's size keeps float32 rounding of a corner from deciding."""
         local = (points - self.matrix[:3, 3]) @ self.matrix[:3, :3]
         return np.all(np.abs(local) <= self.size * (0.5 + 1e-6), axis=-1)
 
 
 def parse_crop(text: str) -> CropBox:
-    """The box that a person typed, or that a JSON file describes: the forms are at the top of the module.
+    """Return the box that an argument or a JSON file describes; the forms are listed
+    at the top of the module.
 
-    Raises ConfigError (what was typed) or FormatError (the file), in one line.
+    Raises ConfigError or FormatError with one line: the argument or the file describes no box.
 
     >>> parse_crop("0,0,1,2,4,6,90").matrix.round(3).tolist()[0]
     [0.0, -1.0, 0.0, 0.0]
@@ -67,9 +69,9 @@ def parse_crop(text: str) -> CropBox:
 
 
 def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
-    """The faces of a mesh (world frame) that are inside, and the share of the faces that went, 0..1.
+    """Return the faces of a mesh (world frame) inside the box, and the share of the faces removed, 0..1.
 
-    Raises ConfigError: none is inside; the message has the mesh's bounds.
+    Raises ConfigError: no face is inside; the message has the mesh's bounds.
     """
     inside = box.holds(mesh.vertices.astype(np.float64))
     keep = np.all(inside[mesh.faces], axis=-1)
@@ -79,12 +81,12 @@ def crop_mesh(mesh: TriangleMesh, box: CropBox) -> tuple[TriangleMesh, float]:
 
 
 def nothing_inside(what: str, parts: str, bounds: np.ndarray) -> ConfigError:
-    """The error that a crop leaves nothing.
+    """Return the error for a crop that leaves nothing.
 
     Args:
         what: what was cropped: "mesh".
-        parts: what it has, and the words before where it is: "12 faces; the mesh is".
-        bounds: [2, 3] where it is, from and to.
+        parts: its parts, and the words that come before its bounds: "12 faces; the mesh is".
+        bounds: [2, 3] its smallest and largest coordinates.
     """
     low, high = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in bounds)
     return ConfigError(

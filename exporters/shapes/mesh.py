@@ -1,7 +1,7 @@
-"""The triangle mesh that every mesh writer takes: arrays, checked once; and the normals of meshes.
+"""The triangle mesh that every mesh writer takes, whose arrays are checked once; and functions for normals.
 
-Faces run counter-clockwise seen from outside; colours are sRGB, as in a picture; positions are float64 so
-that a world far from its origin survives the arithmetic and is rounded to float32 only by the writer.
+Corners of faces run counter-clockwise seen from outside. Colours are sRGB, as in a picture. Positions may be
+float64, so that a world far from its origin survives the arithmetic; only the writer rounds them to float32.
 """
 
 from __future__ import annotations
@@ -81,14 +81,14 @@ class TriangleMesh:
 
     @property
     def bounds(self) -> np.ndarray:
-        """[2, 3] smallest and largest coordinate; NaN for a mesh without vertices."""
+        """Smallest and largest coordinates, [2, 3]; NaN for a mesh without vertices."""
         if not len(self.vertices):
             return np.full((2, 3), np.nan)
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     def transformed(self, matrix: np.ndarray) -> TriangleMesh:
-        """The mesh in other coordinates; `matrix` [4, 4] is a similarity (rotation, uniform scale > 0,
-        translation). The identity gives the mesh itself.
+        """Return the mesh in other coordinates. `matrix` [4, 4] is a similarity (rotation, uniform scale > 0,
+        translation); the identity returns the mesh itself.
 
         Raises ConfigError for any other matrix: a shear or a mirror would need other normals and another
         winding.
@@ -114,11 +114,11 @@ class TriangleMesh:
         return replace(self, vertices=vertices, normals=normals)
 
     def at(self, faces: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points on the mesh [n, 3] and its unit normals there [n, 3], interpolated in float64.
+        """Return points on the mesh [n, 3] and its unit normals there [n, 3], interpolated in float64.
 
         Args:
             faces: [n] face numbers.
-            shares: [n, 3] what each corner of the face counts, of sum 1.
+            shares: [n, 3] the weights of the face's corners (barycentric coordinates), of sum 1.
         """
         corners = self.faces[faces]
         normals = interpolated(self.normals, corners, shares)
@@ -127,19 +127,21 @@ class TriangleMesh:
 
 
 def interpolated(values: np.ndarray, corners: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """[n, m] float64 mixtures of the rows of `values` [n_vertices, m] named by `corners` [n, 3], which count
-    `shares` [n, 3]."""
+    """Return mixtures [n, m] float64 of the rows of `values` [n_vertices, m] that `corners` [n, 3] names,
+    weighted by `shares` [n, 3]."""
     return np.einsum("ij,ijk->ik", shares, values[corners].astype(np.float64))
 
 
 def crossed_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[n_faces, 3] float64 cross product of two edges of each face: its normal, as long as twice its area."""
+    """Return the cross product of two edges of each face, [n_faces, 3] float64: the face's normal, with twice
+    its area as its length."""
     corners = vertices.astype(np.float64)[faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def unit(vectors: np.ndarray, otherwise: np.ndarray | list[float] | float, least: float = 0.0) -> np.ndarray:
-    """Vectors [n, 3] at unit length; `otherwise`, which broadcasts, where one is not longer than `least`.
+    """Return vectors [n, 3] at unit length, and `otherwise`, which broadcasts, in place of a vector that is
+    not longer than `least`.
 
     >>> unit(np.array([[0.0, 3, 4], [0, 0, 0]]), [0.0, 0, 1]).tolist()
     [[0.0, 0.6, 0.8], [0.0, 0.0, 1.0]]
@@ -152,8 +154,9 @@ def unit(vectors: np.ndarray, otherwise: np.ndarray | list[float] | float, least
 def unit_normals(
     normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray, least: float = 0.0
 ) -> np.ndarray:
-    """Normals [n_vertices, 3] at unit length; where one is not longer than `least`, the mean of the faces
-    around its vertex, by their area, and (0, 0, 1) where these cancel."""
+    """Return normals [n_vertices, 3] at unit length. A normal that is not longer than `least` is
+    replaced by the mean normal of the faces around its vertex, weighted by their area, or by (0,
+    0, 1) where these cancel."""
     lost = ~(np.linalg.norm(normals, axis=-1) > least)
     if lost.any():
         around = np.zeros((len(vertices), 3))
@@ -163,15 +166,14 @@ def unit_normals(
 
 
 def has_three_corners(faces: np.ndarray) -> np.ndarray:
-    """[n_faces] bool: whether the corners of each face [n_faces, 3] are three different vertices."""
+    """Return whether the corners of each face [n_faces, 3] are three different vertices, [n_faces] bool."""
     a, b, c = faces.T
     return (a != b) & (b != c) & (c != a)
 
 
 def take_faces(mesh: TriangleMesh, keep: np.ndarray) -> TriangleMesh:
-    """The mesh of the faces where `keep` [n_faces] bool is true, without the vertices that none of them
-    uses.
-    """
+    """Return the mesh of the faces where `keep` [n_faces] bool is true, without the vertices that none of
+    these faces uses."""
     faces = mesh.faces[keep]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True

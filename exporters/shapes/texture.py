@@ -1,7 +1,7 @@
-"""A picture on a mesh, and where the mesh's vertices are in it.
+"""A square texture, and the places of a mesh's vertices in it.
 
-Letters: (u, v) in 0..1 with the origin at the upper left corner of the picture, as in glTF; the texel in
-row r and column c has its centre at u = (c + 1/2) / size, v = (r + 1/2) / size.
+Letters: (u, v) in 0..1 with the origin at the upper left corner of the picture, as in glTF; the texel in row
+r and column c has its centre at u = (c + 1/2) / size, v = (r + 1/2) / size.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from player.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A square picture and where a mesh's vertices are in it.
+    """A square picture, and the places of a mesh's vertices in it.
 
     Raises ShapeError: an array has another shape or type.
 
@@ -39,7 +39,7 @@ class Texture:
             )
 
     def png(self) -> bytes:
-        """The picture as a PNG file; the same picture gives the same bytes."""
+        """Return the picture as the content of a PNG file; the same picture gives the same bytes."""
         from PIL import Image
 
         data = io.BytesIO()

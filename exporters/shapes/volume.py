@@ -1,10 +1,10 @@
-"""The density of an asset as other programs take a volume: values at the points of a sparse grid.
+"""The density of an asset as a volume for other programs: values at the vertices of a sparse grid.
 
 Letters: vertex i (three integers, 0..R) of the asset's grid is at `matrix @ (i, 1)` in the frame of the
 export. sigma is the density there, in 1/unit of that frame: a world in millimetres has densities a thousand
-times smaller than one in metres. What is not listed is empty. The player interpolates log sigma, other
-programs sigma itself: between two vertices theirs is the denser one, so that a surface is fuller there by a
-fraction of a voxel.
+times smaller than one in metres. Vertices that are not listed are empty. The player interpolates log sigma,
+other programs sigma itself. Between two vertices the interpolated sigma is denser, so that surfaces in other
+programs are thicker by a fraction of a voxel.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from player.head.head import Head
 from player.march.fetches import MIN_TOTAL, stored_features
 from player.threads import default_threads
 
-_ROWS = 1 << 16  # vertices at a time: some megabytes of scratch memory a thread
+_ROWS = 1 << 16  # vertices processed at a time, with some megabytes of scratch memory per thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +41,14 @@ class Volume:
     """
 
     index: np.ndarray
-    """[n, 3] int32, 0 or more, each vertex once."""
+    """Vertices [n, 3] int32, 0 or more, each once."""
     density: np.ndarray
     """[n] float32, 1/unit of the frame, > 0."""
     colours: np.ndarray | None
-    """[n, 3] uint8 sRGB: what the head says of this vertex alone, seen against the slope of the density."""
+    """[n, 3] uint8 sRGB: the head's colour for the features of this vertex alone, seen along the density
+    gradient. None if not asked for."""
     matrix: np.ndarray
-    """[4, 4] float64: frame from index; vertices are where the values are, not corners of voxels."""
+    """[4, 4] float64, frame from index; an index is the place of its value, not the corner of a voxel."""
 
     def __post_init__(self) -> None:
         n = len(self.index)
@@ -62,36 +63,37 @@ class Volume:
 
     @property
     def voxel(self) -> float:
-        """Distance between vertices, units of the frame; the mean of the axes, which may differ by little."""
+        """Distance between neighbouring vertices, units of the frame: the geometric mean over the axes, whose
+        distances may differ slightly."""
         return float(np.cbrt(np.linalg.det(self.matrix[:3, :3])))
 
     @property
     def level(self) -> float:
-        """The density that is half opaque over a voxel: a level for a surface, 1/unit of the frame."""
+        """Density at which one voxel is half opaque, 1/unit of the frame: a level for a surface."""
         return math.log(2) / self.voxel
 
     def for_blender(self) -> Volume:
-        """Half a voxel lower along each axis of the grid: Blender's renderer (Cycles, 3.4 and 4.5 alike)
-        draws the value of vertex i at i + 1/2, where OpenVDB has it at i."""
+        """Return the volume shifted down by half a voxel along each axis of the grid. Blender's renderer
+        (Cycles, 3.4 and 4.5 alike) draws the value of vertex i at i + 1/2, where OpenVDB has it at i."""
         shift = np.eye(4)
         shift[:3, 3] = -0.5
         return replace(self, matrix=self.matrix @ shift)
 
     def points(self) -> np.ndarray:
-        """[n, 3] float64: where the vertices are, in the frame."""
+        """Return the places of the vertices in the frame, [n, 3] float64."""
         return self.index @ self.matrix[:3, :3].T + self.matrix[:3, 3]
 
 
 def asset_volume(
     asset: Asset, frame_from_world: np.ndarray, box: CropBox | None = None, colour: bool = False
 ) -> tuple[Volume, float]:
-    """The volume of an asset in a frame, and the share of its vertices that the crop removed.
+    """Return the volume of an asset in a frame, and the share of its vertices that the crop removed.
 
     Args:
         asset: an open asset.
         frame_from_world: [4, 4] similarity, as `exporters.formats.axes.coordinates_from_world` makes it.
-        box: keep the vertices in it (world units); None keeps all.
-        colour: ask the head for colours too.
+        box: keep only the vertices in this box (world units); None keeps all.
+        colour: compute colours with the head, too.
 
     Raises ConfigError: no vertex is in the box.
     """
@@ -124,7 +126,8 @@ def asset_volume(
 
 
 def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
-    """[n, 3] uint8: the features at each vertex through the head, as if it alone were the whole pixel."""
+    """Return the colours [n, 3] uint8 that the head gives the features at each vertex, as if the vertex alone
+    made the whole pixel."""
     head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
     grid, densities = asset.grid, asset.arrays.densities
     codes, vertices = densities.values[0][:, 0], densities.pyramid.vertices[0]
@@ -142,8 +145,8 @@ def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
 
 
 def _slope(grid: SparseGrid, vertices: Vertices, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[n, 3] float32 unit directions up the density, which is how a surface is looked at; down where it is
-    flat, inside a solid, which nobody sees."""
+    """Return the unit directions [n, 3] float32 of the density gradient, along which a surface is looked at;
+    (0, 0, -1) where the density is flat, as inside a solid, which nobody sees."""
     slope = np.empty((len(index), 3))
     for axis, step in enumerate(np.eye(3, dtype=np.int64)):
         rise = _codes_at(vertices, codes, index + step) - _codes_at(vertices, codes, index - step)
@@ -152,6 +155,6 @@ def _slope(grid: SparseGrid, vertices: Vertices, codes: np.ndarray, index: np.nd
 
 
 def _codes_at(vertices: Vertices, codes: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[n] float64 codes at vertices that may lie outside; 0 where none is stored."""
+    """Return the codes [n] float64 at vertices that may lie outside the grid; 0 where none is stored."""
     found = vertices.rows(index)
     return np.where(found >= 0, codes[np.maximum(found, 0)], 0).astype(np.float64)

@@ -1,1 +1,1 @@
-"""How an asset's surface is found, and the colours that it gets."""
+"""Extraction of an asset's surface, and the colours that it gets."""

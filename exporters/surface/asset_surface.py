@@ -1,6 +1,5 @@
-"""The surface of an asset in the world, made again from its density or its depth; what floats and what no
-training camera sees is taken away.
-"""
+"""The surface of an asset in the world, made again from its density or from depth pictures, without floaters
+and without what no training camera sees."""
 
 from __future__ import annotations
 
@@ -34,32 +33,32 @@ from player.errors import DataError, MissingExtraError
 from player.files.images import to_8_bit
 
 FLOATER_FRACTION = 1e-4
-"""Connected parts with a smaller share of the faces are floaters and go."""
+"""Connected parts with a smaller share of the faces than this are floaters, which are removed."""
 
 FIT_TOLERANCE = 3.0
-"""Voxels between a pixel's depth and the mesh at which the pixel's colour still counts for it."""
+"""Largest distance in voxels between a pixel's depth and the mesh at which its colour counts for the mesh."""
 
 SOLID_SHARE = 0.25
-"""A corner is haze where less than this share of the views that see it show something solid there. On good
-models hardly anything is between 0 and a half (lego: 0.3 % of the faces)."""
+"""A vertex is haze if less than this share of the views that see it show something solid there. On good
+models hardly any vertex is between 0 and a half (lego: 0.3 % of the faces)."""
 
 
 class Removed(NamedTuple):
-    """What cleaning took away."""
+    """Counts of what was removed from a surface."""
 
     unseen_faces: int
     """Faces that no training camera sees."""
     haze_faces: int
-    """Faces that training cameras see through: what they show is behind them, or nothing solid."""
+    """Faces that training cameras see through: the pictures show something behind them, or nothing solid."""
     floaters: int
-    """Parts that were too small."""
+    """Connected parts that were too small."""
     floater_faces: int
-    """Their faces."""
+    """Faces of the floaters."""
 
 
 class AssetSurface:
-    """Meshes of an asset's surface, in the world. The training cameras are played once, when somebody first
-    asks what they see."""
+    """Maker of meshes of an asset's surface, in the world. The views of the training cameras are rendered
+    once, when they are first needed."""
 
     def __init__(
         self, asset: Asset, report: Report, max_pixels: int = SMALL_PIXELS, max_views: int = MAX_VIEWS
@@ -67,13 +66,13 @@ class AssetSurface:
         self.asset = asset
         self.report = report
         self.max_pixels = max_pixels
-        """Pixels of each view that is played, at most."""
+        """Largest number of pixels of each view that is rendered."""
         self.max_views = max_views
-        """Views that are played, at most."""
+        """Largest number of views that are rendered."""
 
     @cached_property
     def views(self) -> list[DepthView]:
-        """What the training cameras see."""
+        """The rendered views of the training cameras."""
         return self._played(self.max_pixels)
 
     @property
@@ -82,13 +81,14 @@ class AssetSurface:
         return voxel_size(self.asset.grid) * self.asset.scale
 
     def from_density(self, level: float | None = None) -> tuple[TriangleMesh, Removed]:
-        """The surface by marching cubes on the asset's density, white, and what was removed of it.
+        """Return the surface by marching cubes on the asset's density as a white mesh, and
+        what was removed from it.
 
         Args:
             level: density of the surface, 1/model unit; `exporters.surface.marching_cubes` has the default.
 
         Raises:
-            ConfigError: a level outside the data.
+            ConfigError: the level is outside the stored densities.
             DataError: there is no surface, or nothing of it is seen.
             MissingExtraError: scikit-image or scipy is not installed.
         """
@@ -100,8 +100,8 @@ class AssetSurface:
         self.report("surface", round(share * 100), 100)
 
     def from_depth(self) -> tuple[TriangleMesh, Removed]:
-        """The surface that the training cameras' pictures of depth agree on, white, and what was removed of
-        it.
+        """Return the surface that the depth pictures of the training cameras agree on as a white mesh, and
+        what was removed from it.
 
         Raises:
             DataError: there is no surface, or nothing of it is seen.
@@ -111,14 +111,14 @@ class AssetSurface:
         return self._in_world(fuse_depth(views, self.voxel, partial(self.report, "fusion")))
 
     def shaded(self, points: np.ndarray, normals: np.ndarray) -> KnownColours:
-        """What the asset's head says of points [n, 3] on the surface with unit normals [n, 3]
-        (`exporters.surface.shaded_colours`)."""
+        """Return the colours that the asset's head gives points [n, 3] on the surface with unit normals [n,
+        3] (`exporters.surface.shaded_colours`)."""
         return surface_colours(self.asset, points, normals, self.views, partial(self.report, "colours"))
 
     def painted(self, mesh: TriangleMesh) -> TriangleMesh:
-        """A mesh on the surface with the colours that fit the training views best
-        (`exporters.surface.fitted_colours`); where they see nothing, and where Open3D is not to be had, the
-        head's own."""
+        """Return a mesh on the surface with the colours that fit the training views best
+        (`exporters.surface.fitted_colours`). Where the views see nothing, and everywhere if Open3D is not
+        installed, the colours are the head's own."""
         try:
             tolerance = FIT_TOLERANCE * self.voxel
             rgb, known = fit_colours(mesh, self.views, tolerance, partial(self.report, "colours"))
@@ -134,7 +134,7 @@ class AssetSurface:
         return depth_views(self.asset, max_pixels, self.max_views, partial(self.report, "views"))
 
     def cleaned(self, surface: Surface) -> tuple[TriangleMesh, Removed]:
-        """A surface (model frame) as a white mesh in the world, and what was removed of it."""
+        """Return a surface (model frame) as a white mesh in the world, and what was removed from it."""
         matrix = self.asset.world_from_model
         vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         normals = surface.normals @ matrix[:3, :3].T / self.asset.scale
@@ -146,14 +146,15 @@ class AssetSurface:
 
 
 def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tuple[TriangleMesh, Removed]:
-    """A mesh (world frame) without the faces that no view sees, without haze and without floaters, and what
-    went.
+    """Return a mesh (world frame) without the faces that no view sees, without haze and without floaters, and
+    what was removed.
 
-    A face is seen if a corner of it is: by a view that has nothing before it (`tolerance`: see
-    `exporters.surface.depth_views.sightings`), or because a pixel hits a face there. The second keeps what
-    fills a hole, from whichever side it is seen; it needs Open3D, and where that is not to be had, it goes.
-    A face that is seen is haze if no corner of it is solid for SOLID_SHARE of the views that see it; where
-    pixels alone see it, if none of them shows something at its depth or before.
+    A face is seen if a corner of it is seen: by a view in which nothing hides it (`tolerance`: see
+    `exporters.surface.depth_views.sightings`), or because the ray of a pixel hits a face at that corner. The
+    second test keeps faces that fill a hole, from whichever side they are seen. It needs Open3D; without it
+    these faces are removed. A face that is seen is haze if no corner of it is solid for SOLID_SHARE of the
+    views that see it, or, for a corner that only rays of pixels hit, if none of these pixels shows something
+    at its depth or before.
 
     Raises DataError: no face is seen, or all that is seen is haze.
     """
@@ -179,8 +180,8 @@ def cleaned(mesh: TriangleMesh, views: list[DepthView], tolerance: float) -> tup
 def _hit_vertices(
     mesh: TriangleMesh, views: list[DepthView], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the faces that pixels of the views hit, [n_vertices] bool, and of those that they hit no
-    farther than `tolerance` before what the pixel shows."""
+    """Return the corners of the faces that rays of the views' pixels hit, [n_vertices] bool, and the corners
+    of those that they hit no farther than `tolerance` before what the pixel shows."""
     rays = MeshRays(mesh)
     seen, solid = np.zeros((2, len(mesh.vertices)), bool)
     for view in views:
@@ -192,10 +193,11 @@ def _hit_vertices(
 
 
 def _from_around(colours: np.ndarray, known: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Colours [n, 4] with those that are not `known` [n] taken from the known corners around them.
+    """Return colours [n, 4] in which vertices that are not `known` [n] take colours
+    from known ones around them.
 
-    Ring after ring, a face has the mean of its known corners and an unknown corner the mean of its faces. A
-    corner that no faces connect with a known one keeps its colour; alpha stays.
+    The colours spread ring by ring: a face has the mean of its known corners, and an unknown corner takes the
+    mean of its faces. A vertex that no faces connect with a known one keeps its colour. Alpha stays.
     """
     colours, known = colours.copy(), known.copy()
     while not known.all():

@@ -1,4 +1,4 @@
-"""Connected parts of a mesh: small ones float in front of what the photographs show, and are taken away."""
+"""Removal of small connected parts of a mesh, which float in front of what the photographs show."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from player.errors import ConfigError
 
 
 def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[TriangleMesh, int]:
-    """The mesh without connected parts of fewer than `min_fraction` of all faces, and how many parts went.
+    """Return the mesh without the connected parts that have fewer than `min_fraction` of all faces, and how
+    many parts were removed.
 
     Args:
-        mesh: parts are connected through shared vertices.
+        mesh: the mesh, whose parts are connected through shared vertices.
         min_fraction: share of the faces, 0 (keep all) to 1; the largest part always stays.
 
     Raises:

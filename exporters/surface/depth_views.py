@@ -1,8 +1,8 @@
-"""What the training cameras see of an asset: pictures of depth, which are rendered, and the points in view.
+"""Depth pictures of an asset, rendered for the training cameras, and tests of which points the cameras see.
 
 Letters: t, the distance from a camera to a point, world units; c, the cosine between the point's normal and
 the direction to the camera. The camera sees the point if c > 0 and t is at most the depth that the picture
-has there, plus a tolerance; where the picture is less than half opaque nothing is in the way.
+has there, plus a tolerance. Where the picture is less than half opaque, nothing hides the point.
 """
 
 from __future__ import annotations
@@ -19,35 +19,38 @@ from player.cameras.views import asset_cameras
 from player.render import Renderer
 
 MAX_VIEWS = 100
-"""The most views that are played, unless fewer do; they are spread over all of the training cameras."""
+"""Largest number of views that are rendered unless fewer suffice; they are spread
+over all training cameras."""
 SMALL_PIXELS = 90_000
-"""The most pixels of a view that is played to tell what is seen, and in which colour."""
+"""Largest number of pixels of a view that is rendered to find what is seen, and in which colour."""
 FEW_PIXELS = 22_500
-"""The same for a mesh in few faces, each as large as several of these pixels."""
+"""Largest number of pixels of such a view for a mesh of few faces, each as large as
+several of these pixels."""
 FULL_PIXELS = 1 << 18
-"""The most pixels of a view that is played for its depth, which becomes a surface."""
+"""Largest number of pixels of a view that is rendered for its depth, from which a surface is made."""
 SOLID = 0.5
-"""Least opacity of a pixel that has something at its depth."""
+"""Least opacity of a pixel that has a depth."""
 TOLERANCE = 2.0
-"""How many voxels behind the depth of a pixel a point still counts as seen: that depth is a mean."""
+"""Distance in voxels behind a pixel's depth up to which a point counts as seen,
+because that depth is a mean."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A training camera and how far it sees."""
+    """A training camera, and the depth and colours that it sees."""
 
     camera: Camera
     """World frame, at the size of the picture."""
     distance: np.ndarray
     """[height, width] float32, along the ray, world units; infinite where the opacity is below SOLID."""
     rgb: np.ndarray
-    """[height, width, 3] uint8 sRGB, straight: not mixed with what is behind."""
+    """[height, width, 3] uint8 sRGB, straight colours: not mixed with what is behind."""
 
 
 def depth_views(
     asset: Asset, max_pixels: int = SMALL_PIXELS, max_views: int = MAX_VIEWS, progress: Progress = silent
 ) -> list[DepthView]:
-    """The training cameras' pictures, at most `max_views` of `max_pixels` each.
+    """Render the views of the training cameras, at most `max_views` of at most `max_pixels` each.
 
     Raises FormatError if the asset's cameras are damaged.
     """
@@ -65,10 +68,10 @@ def depth_views(
 
 
 def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, tolerance: float) -> np.ndarray:
-    """How squarely a camera sees points: [n] float32 cosines, 0 for those that it does not see.
+    """Return how squarely a camera sees points: cosines [n] float32, 0 for points that it does not see.
 
     Args:
-        view: the camera and its picture of depth.
+        view: the camera and its depth picture.
         points: [n, 3] world frame.
         normals: [n, 3] unit, world frame.
         tolerance: how far behind the depth of the pixels around it a point may be, world units.
@@ -81,18 +84,18 @@ def cosines_in_view(view: DepthView, points: np.ndarray, normals: np.ndarray, to
 
 
 class Sightings(NamedTuple):
-    """How often views see points, and how often they show something there."""
+    """Counts of the views that see each point, and of those that show something there."""
 
     seen: np.ndarray
-    """[n] int32, the views that have nothing before the point."""
+    """[n] int32, the views in which nothing hides the point."""
     solid: np.ndarray
     """[n] int32, those of them whose picture is solid at the point's depth; the others see through it."""
 
 
 def sightings(views: list[DepthView], points: np.ndarray, normals: np.ndarray, tolerance: float) -> Sightings:
-    """How often views see each point; the arguments are those of `cosines_in_view`. A point is within
-    `tolerance` of what a picture shows if it is no farther than that before the nearest, and behind the
-    farthest, of the pixels around it."""
+    """Count the views that see each point; the arguments are those of `cosines_in_view`. A picture shows
+    something at a point if the point is not more than `tolerance` nearer than the nearest, nor more than
+    `tolerance` farther than the farthest, of the depths of the pixels around it."""
     seen, solid = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for view in views:
         at = _projected(view.camera, points, normals)
@@ -109,13 +112,13 @@ class _Projected(NamedTuple):
     """The points that face a camera and are inside its picture."""
 
     points: np.ndarray
-    """[m] their numbers."""
+    """[m] int64, the numbers of these points."""
     distance: np.ndarray
-    """[m] from the camera, world units."""
+    """[m] distance from the camera, world units."""
     cosines: np.ndarray
-    """[m] between their normals and the direction to the camera, above 0."""
+    """[m] cosine between the normal and the direction to the camera, above 0."""
     corners: tuple[np.ndarray, np.ndarray]
-    """Row and column [m] of the corner of pixels that is nearest to where each is seen."""
+    """Row and column [m] of the corner between pixels that is nearest to where the point is seen."""
 
 
 def _projected(camera: Camera, points: np.ndarray, normals: np.ndarray) -> _Projected:
@@ -135,8 +138,9 @@ def _projected(camera: Camera, points: np.ndarray, normals: np.ndarray) -> _Proj
 
 
 def _farthest_around(distance: np.ndarray) -> np.ndarray:
-    """[height + 1, width + 1] distances at the corners of pixels: the largest of the up to four pixels around
-    that are finite, so that nothing inside a solid is seen past its outline; infinite where none is."""
+    """Return distances [height + 1, width + 1] at the corners between pixels: the largest finite one
+    of the up to four pixels around, so that no point inside a solid is seen past its outline;
+    infinite if none is finite."""
     padded = np.pad(np.where(np.isfinite(distance), distance, -np.inf), 1, constant_values=-np.inf)
     farthest = np.maximum(
         np.maximum(padded[:-1, :-1], padded[1:, :-1]), np.maximum(padded[:-1, 1:], padded[1:, 1:])
@@ -145,7 +149,7 @@ def _farthest_around(distance: np.ndarray) -> np.ndarray:
 
 
 def _small(camera: Camera, max_pixels: int) -> Camera:
-    """The camera with at most so many pixels."""
+    """Return the camera at a size of at most `max_pixels` pixels."""
     share = (max_pixels / (camera.width * camera.height)) ** 0.5
     if share >= 1:
         return camera

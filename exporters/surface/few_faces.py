@@ -1,10 +1,10 @@
-"""A mesh of an asset's surface in as many faces as are wanted: the one that is baked into an asset, within
-its bytes, and the one that `vfr-export` writes where nothing else is asked for.
+"""A mesh of an asset's surface with the wanted number of faces: the mesh that is baked into an asset, within
+a limit of bytes, and the mesh that `vfr-export` writes by default.
 
-The grid is cut at a stride that still makes far more faces than are wanted; corners in the same small cube
-are made one before they are moved onto the level; what cameras do not see is taken away; and edges are
-collapsed where that changes the shape least (`exporters.mesh.simplify`). Where Open3D is not to be had, the
-stride alone decides.
+First the grid is cut at a stride that still makes far more faces than are wanted. Vertices in the same small
+cube are merged before they are moved onto the level, faces that no camera sees are removed, and edges are
+collapsed where that changes the shape least (`exporters.mesh.simplify`). Without Open3D, only the stride
+limits the number of faces.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from player.asset.grid import SparseGrid
 from player.errors import DataError, MissingExtraError
 
 RESOLUTION = 128
-"""Voxels along the box whose faces a mesh has, unless it is told otherwise."""
+"""Voxels along the box of a grid whose number of faces a mesh has by default."""
 FINER = 3
-"""Times the faces that are wanted, from which edges are collapsed. With 4 lego's mesh of 1.1 MB is 0.2 dB
-nearer to the player's pictures, and takes a third longer."""
+"""Ratio of the faces that edge collapse starts from to those that are wanted. With 4, lego's mesh of 1.1 MB
+is 0.2 dB nearer to the player's pictures, and takes a third longer."""
 KEPT = 0.7
-"""Share of the faces of a cut that cameras see, roughly (lego 0.7, the built-in scene 0.9)."""
+"""Rough share of the faces of a cut that cameras see (lego 0.7, the built-in scene 0.9)."""
 FACE_BYTES = 21.5
-"""Bytes that a face takes in an asset, roughly: 13 for itself and 15 for each of 0.57 vertices."""
+"""Rough number of bytes that a face takes in an asset: 13 for itself and 15 for each of 0.57 vertices."""
 
 
 def few_faces(
     surface: AssetSurface, resolution: int = RESOLUTION, max_bytes: int | None = None
 ) -> tuple[TriangleMesh, Removed]:
-    """The surface at the default level, white, world frame, and what was removed of it.
+    """Return the surface at the default level as a white mesh, world frame, and what was removed from it.
 
     Args:
-        surface: the asset's.
-        resolution: the mesh has about the faces that a grid of so many voxels along the box would give it,
+        surface: the asset's surface.
+        resolution: the mesh has about as many faces as a grid of so many voxels along the box would give it,
             or fewer.
-        max_bytes: bytes that the mesh may take in an asset; room for a few faces at least.
+        max_bytes: bytes that the mesh may take in an asset; at least enough for a few faces.
 
     Raises:
         DataError: there is no surface, or nothing of it is seen, or nothing of it fits.
@@ -66,7 +66,8 @@ def few_faces(
 
 
 def _stride(grid: SparseGrid, resolution: int) -> int:
-    """The largest at which the grid is still cut twice as finely along an axis as is wanted."""
+    """Return the largest stride at which the grid is still cut at least twice as
+    finely per axis as is wanted."""
     stride = 1
     while grid.resolution >= 4 * stride * resolution and stride < BLOCK:
         stride *= 2
@@ -74,7 +75,7 @@ def _stride(grid: SparseGrid, resolution: int) -> int:
 
 
 def _thinned(cut: Cut, n_faces: float) -> Cut:
-    """The cut with about `n_faces` faces, where it has half as many again or more."""
+    """Return the cut reduced to about `n_faces` faces; unchanged if it has less than 1.5 times as many."""
     ratio = len(cut.faces) / n_faces
     if ratio < 1.5:
         return cut
@@ -83,10 +84,10 @@ def _thinned(cut: Cut, n_faces: float) -> Cut:
 
 
 def _within(mesh: TriangleMesh, n_faces: int, max_bytes: int | None) -> TriangleMesh:
-    """A white mesh with at most `n_faces` faces in at most `max_bytes`.
+    """Return a white mesh reduced to at most `n_faces` faces and at most `max_bytes`.
 
-    Where edges cannot be collapsed that far, as in a surface of many small parts, vertices in ever larger
-    cubes are made one. Raises DataError: nothing is left.
+    Where edges cannot be collapsed that far, as in a surface of many small parts, vertices are merged in
+    larger and larger cubes. Raises DataError: nothing is left.
     """
     cube = 0.0
     while True:

@@ -1,12 +1,12 @@
-"""Vertex colours that come nearest to what the training cameras see: least squares.
+"""Vertex colours fitted by least squares to what the training cameras see.
 
-Letters: a pixel whose ray meets a face shows sum b_k c_k, b its shares of the face's corners and c their
-colours; the picture that was played has y there. A has a row of shares for each such pixel. The colours are
-those of the smallest |A c - y|^2 + SMOOTH * sum over edges |c_i - c_j|^2; the second part decides only where
-hardly a pixel lands. It is quadratic: conjugate gradients, scaled by the diagonal, find it.
+Letters: a pixel whose ray hits a face shows sum b_k c_k, with b the weights of the face's corners at the hit
+and c their colours; the rendered picture has y there. A has a row of weights for each such pixel. The colours
+minimise |A c - y|^2 + SMOOTH * sum over edges |c_i - c_j|^2; the second term decides only where hardly a
+pixel lands. The minimum is found by conjugate gradients, preconditioned by the diagonal.
 
 A pixel does not count where the picture is less than half opaque or shows something that is not as far away
-as the mesh: there, the mesh misses something thin or has something too much.
+as the mesh: there, the mesh lacks something thin or has something that should not be there.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.depth_views import DepthView
 
 SMOOTH = 0.03
-"""The weight of an edge beside that of a pixel, which is 1."""
+"""Weight of an edge; a pixel has weight 1."""
 _ROUNDS = 40  # steps of the conjugate gradients; colours in 8 bits settle in about twenty
 
 
 def fit_colours(
     mesh: TriangleMesh, views: list[DepthView], tolerance: float, progress: Progress = silent
 ) -> KnownColours:
-    """Colours of a mesh's vertices, fitted to views.
+    """Fit the colours of a mesh's vertices to views.
 
     Args:
-        mesh: world frame; its own colours are not looked at.
+        mesh: world frame; its own colours are not used.
         views: cameras, and what they see.
-        tolerance: how far from the depth of a pixel the mesh may be there, world units.
+        tolerance: largest difference between the depth of a pixel and that of the mesh there, world units.
         progress: called with (done, of) after each view.
 
     Returns:
-        rgb [n_vertices, 3] float64; a vertex is known if a pixel counts for it, or for one that faces connect
-        it with.
+        rgb [n_vertices, 3] float64; a vertex is known if a pixel counts for it, or for a vertex that faces
+        connect it with.
 
     Raises MissingExtraError: Open3D or scipy is not installed.
     """
@@ -65,20 +65,21 @@ def fit_colours(
 
 
 def _smoothness(faces: np.ndarray, n: int) -> Any:
-    """The sparse matrix L [n, n] for which c^T L c is the sum over edges |c_i - c_j|^2."""
+    """Return the sparse matrix L [n, n] for which c^T L c is the sum over edges |c_i - c_j|^2."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import laplacian
 
     start, end = faces[:, [0, 1, 2]].T.reshape(-1), faces[:, [1, 2, 0]].T.reshape(-1)
     half = csr_matrix((np.ones(len(start)), (start, end)), (n, n))
     edges = half + half.T
-    edges.data[:] = 1  # an edge of two faces is one edge
+    edges.data[:] = 1  # an edge that two faces share counts once
     return laplacian(edges).tocsr()
 
 
 def _solved(square: Any, right: np.ndarray, count: np.ndarray) -> KnownColours:
-    """The rgb for which `square` [n, n] @ rgb is `right` [n, 3]; known is what a pixel decides, there being
-    `count` [n] of them at each vertex, or edges that lead to such a vertex."""
+    """Solve `square` [n, n] @ rgb = `right` [n, 3] for the rgb. `count` [n] is the sum of the weights of the
+    pixels that count for each vertex; a vertex is known if its count, or that of a vertex connected with it
+    by edges, is not 0."""
     from scipy.sparse.csgraph import connected_components
 
     part = connected_components(square, directed=False)[1]

@@ -1,9 +1,9 @@
-"""What of an asset has a shape, on one level: of an unbounded scene what lies in the unit ball of the model
-frame.
+"""The part of an asset that surfaces and volumes are made of, on one level: all of an object, and of an
+unbounded scene what lies in the unit ball of the model frame.
 
-There contracted coordinates are those of the model, so that the same vertices on the same grid are a volume
-like an object's. What is around it has been contracted, and would be a ball of warped surroundings in any
-other program.
+In the unit ball contracted coordinates equal those of the model, so that the same vertices on the same grid
+are a volume like an object's. What lies around it is contracted, and would be a ball of warped surroundings
+in any other program.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from player.files.memory import allowed_bytes
 
 
 def inner_region(asset: Asset, max_memory: float | None = None) -> Asset:
-    """The asset as exporters of surfaces and volumes take it: its densities on one level, and of an unbounded
-    scene those in the unit ball, whose grid is a box's.
+    """Return the asset as exporters of surfaces and volumes take it: its densities on one level, and of an
+    unbounded scene only those in the unit ball, on the grid of a box.
 
     Args:
         asset: an open asset.
         max_memory: gigabytes that the densities may take, as `Asset.open` has it.
 
     Raises:
-        DataError: an unbounded scene that has nothing there.
-        ConfigError: it takes more memory than it may.
+        DataError: an unbounded scene has nothing in its unit ball.
+        ConfigError: the densities take more memory than they may.
     """
     m, stored = asset.manifest, asset.arrays.densities
     if not m.contracted and len(stored.pyramid.levels) == 1:
@@ -49,11 +49,10 @@ def inner_region(asset: Asset, max_memory: float | None = None) -> Asset:
 
 
 def _inside(grid: PyramidValues) -> PyramidValues:
-    """The cells of a grid of one level whose corners are all in the unit ball."""
+    """Return the cells of a grid of one level whose corners are all in the unit ball."""
     (cells,), (vertices,), (values,) = grid.pyramid.levels, grid.pyramid.vertices, grid.values
-    edge = (
-        grid.pyramid.resolution / 4
-    )  # cells along a model unit; the middle is two model units from the corner
+    # Cells along a model unit; the middle of the box is two model units from its corner along each axis.
+    edge = grid.pyramid.resolution / 4
     coords = vertices.bricks.coords
     inside = stored_bits(vertices.bricks.masks)
     inside[inside] = np.linalg.norm(vertices.index / edge - 2, axis=-1) <= 1

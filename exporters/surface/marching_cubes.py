@@ -2,15 +2,14 @@
 
 Letters: c, the interpolated density code; sigma, the density, whose logarithm is linear in c
 (`player.asset.density`); v, the size of a voxel; dt, the step of the march. The default level is the density
-that is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)): fields
-are soft at their surface, and of the levels tried this one has the player's outlines and lies on known
-geometry in the middle (docs/export.md). Only live cells are cut, those whose eight corners are stored: what
-no training view has seen is neither empty nor full, and no surface is made up there. The mesh is open where
-they end.
+that is half opaque over two voxels or two steps, whichever are longer, sigma = ln 2 / (2 max(v, dt)). Fields
+are soft at their surface, and of the levels that were tried this one is nearest to the player's outlines and
+to known geometry (docs/notes/2026-11-21-surfaces.md). Only live cells are cut, which are those whose eight
+corners are stored. Elsewhere no training view has seen anything, so it is unknown whether space is empty or
+full; no surface is invented there, and the mesh is open where the live cells end.
 
 Blocks are `BLOCK` cells wide and share the vertices of their faces, so that memory is bounded by the mesh and
-not by the box. A corner of the mesh lies on an edge of the grid, and the edge's number is what joins it
-between blocks.
+not by the box. A vertex of the mesh lies on an edge of the grid, whose number identifies it in other blocks.
 """
 
 from __future__ import annotations
@@ -29,17 +28,16 @@ from player.errors import ConfigError, DataError, ShapeError
 
 BLOCK = 64
 """Cells along each side of a block, whose codes take 1 MB."""
-_CLIP = math.log(
-    50.0
-)  # |log(sigma / level)| is clipped to this: what is empty does not pull the surface to it
-_NUDGE = 1e-2  # least distance of a cell's corner from the level, codes: no vertex of the mesh is on one
+# |log(sigma / level)| is clipped to this, so that empty space does not pull the surface towards it.
+_CLIP = math.log(50.0)
+_NUDGE = 1e-2  # least difference of a corner's code from the level, so that no vertex lies on a corner
 _ROUNDS = 4  # steps of Newton's iteration; two reach 1e-3 of a voxel nearly everywhere
-_REACH = 0.5  # the most voxels that a vertex is moved by
-_AT_ONCE = 1 << 18  # points looked at together
+_REACH = 0.5  # most voxels that a vertex is moved by, at a stride of 1
+_AT_ONCE = 1 << 18  # points processed at a time
 
 
 class Cut(NamedTuple):
-    """A surface as marching cubes cuts it, before its corners are moved onto the level."""
+    """A surface as marching cubes cuts it, before its vertices are moved onto the level."""
 
     g: np.ndarray
     """[n_vertices, 3] float64, grid coordinates."""
@@ -48,7 +46,7 @@ class Cut(NamedTuple):
     code_level: float
     """The level, as a density code."""
     stride: int
-    """Voxels between the vertices of the grid that were looked at."""
+    """Voxels between the vertices of the grid that were used."""
 
 
 def cut_surface(
@@ -57,20 +55,20 @@ def cut_surface(
     progress: Callable[[float], object] = silent,
     stride: int = 1,
 ) -> Cut:
-    """Where a grid's density equals `level`, roughly: `settled` makes the surface of it.
+    """Return roughly the surface where a grid's density equals `level`; `settled` moves it onto the level.
 
     Args:
         grid: the sparse grid, of one level.
-        level: density in 1/model unit; None is `half_opaque`, or the middle of what is stored if
-            nothing is that dense.
+        level: density in 1/model unit; None is `half_opaque`, or the geometric mean of the least and largest
+            stored density if `half_opaque` is not between them.
         progress: called with the share done in (0, 1] after each block.
-        stride: 2 looks at every second vertex along each axis only, and makes a quarter of the faces; a power
-            of two up to BLOCK.
+        stride: 2 uses only every second vertex along each axis and makes a quarter of the faces; a power of
+            two up to BLOCK.
 
     Raises:
-        ConfigError: a level outside the stored densities; the message has their range.
-        ShapeError: a grid of several levels, which `exporters.surface.one_level` makes one of.
-        DataError: no live cell, or no surface in those that there are.
+        ConfigError: the level is outside the stored densities; the message has their range.
+        ShapeError: the grid has several levels (`exporters.surface.one_level` makes one of them).
+        DataError: there is no live cell, or no surface in the live cells.
         MissingExtraError: scikit-image is not installed.
     """
     if grid.n_levels > 1:
@@ -93,9 +91,9 @@ def cut_surface(
 
 
 def settled(grid: SparseGrid, cut: Cut) -> Surface:
-    """The surface of a cut, in the model frame: its vertices on the level to a hundredth of a voxel where the
-    density has a slope there, its normals along the falling density; where it does not fall, the mean of the
-    faces around, by area."""
+    """Return the surface of a cut, in the model frame. Its vertices are on the level to a hundredth of a
+    voxel where the density has a slope. Its normals point along the falling density or, where it does not
+    fall, along the mean normal of the faces around, weighted by area."""
     g = onto_level(grid, cut.g, cut.code_level, cut.stride)
     vertices = grid.aabb_min.astype(np.float64) + g / grid.cells_per_unit.astype(np.float64)
     normals = unit_normals(_slopes(grid, g, cut.code_level), vertices, cut.faces, 0.1)
@@ -103,20 +101,21 @@ def settled(grid: SparseGrid, cut: Cut) -> Surface:
 
 
 def voxel_size(grid: SparseGrid) -> float:
-    """Edge of a voxel along x, model units."""
+    """Return the edge of a voxel along x, model units."""
     return 1 / float(grid.cells_per_unit[0])
 
 
 def half_opaque(grid: SparseGrid) -> float:
-    """The density, in 1/model unit, that is half opaque over two voxels or steps, whichever are longer."""
+    """Return the density, in 1/model unit, that is half opaque over two voxels or two
+    steps, whichever are longer."""
     return math.log(2) / (2 * max(voxel_size(grid), float(grid.step)))
 
 
 def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int = 1) -> np.ndarray:
-    """Points [n, 3] float64 (grid coordinates), moved along the gradient of the code onto `code_level`.
+    """Move points [n, 3] float64 (grid coordinates) along the gradient of the code onto `code_level`.
 
-    Newton's iteration, at most half of `stride` voxels in all; a point that leaves the live cells stays where
-    it was.
+    Newton's iteration moves a point by at most half of `stride` voxels in all. A point that leaves the live
+    cells, or does not come nearer to the level, stays where it was.
     """
     moved = g.copy()
     for start in range(0, len(g), _AT_ONCE):
@@ -127,7 +126,7 @@ def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int =
             codes, slopes, known = code_and_slope(grid, here)
             square = np.sum(slopes**2, axis=-1)
             apart = code_level - codes
-            usable = known & (square > 1.0) & ~settled  # a slope below a code a voxel points anywhere
+            usable = known & (square > 1.0) & ~settled  # a slope below a code per voxel may point anywhere
             step = np.where(usable, apart / np.where(usable, square, 1), 0)[:, None] * slopes
             candidate = here + step
             near = np.linalg.norm(candidate - first, axis=-1) <= _REACH * stride
@@ -141,8 +140,8 @@ def onto_level(grid: SparseGrid, g: np.ndarray, code_level: float, stride: int =
 
 
 def code_and_slope(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The interpolated code [n] at points [n, 3] (grid coordinates), its gradient [n, 3] in codes a voxel,
-    and whether the point is in a live cell [n] bool: elsewhere both are 0."""
+    """Return the interpolated code [n] at points [n, 3] (grid coordinates), its gradient [n, 3] in codes per
+    voxel, and whether the point is in a live cell, [n] bool. Outside live cells code and gradient are 0."""
     found = grid.find(g.T)
     known = np.all((g >= 0) & (g <= grid.resolution), axis=-1) & found.live
     at = found.corners
@@ -176,7 +175,8 @@ def _code_level(grid: SparseGrid, level: float | None) -> float:
 
 
 def _blocks(grid: SparseGrid) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The blocks that hold something: their places [3], counted in blocks, and the slots of their bricks."""
+    """Return the blocks that hold bricks: their places [3], counted in blocks, and
+    the slots of their bricks."""
     owners, which = np.unique(grid.slot_coords // (BLOCK // 8), axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(which.reshape(-1), minlength=len(owners)))
@@ -186,7 +186,7 @@ def _blocks(grid: SparseGrid) -> list[tuple[np.ndarray, np.ndarray]]:
 def _cut(
     grid: SparseGrid, block: np.ndarray, slots: np.ndarray, code_level: float, stride: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The corners (grid coordinates over `stride`) and faces of the surface in a block, or None."""
+    """Return the vertices (grid coordinates over `stride`) and faces of the surface in a block, or None."""
     with needs("the mesh", "scikit-image"):
         from skimage.measure import marching_cubes
 
@@ -200,10 +200,10 @@ def _cut(
         values[near] = np.where(values[near] < 0, -_NUDGE, _NUDGE)
         volume[x : x + 9, y : y + 9, z : z + 9] = values
         bits = grid.live[slot * 64 : (slot + 1) * 64].reshape(8, 8, 1)
-        # marching_cubes asks at a cell's last corner whether the cell is to be cut
+        # marching_cubes reads the mask at a cell's last corner to decide whether the cell is cut
         cells = np.unpackbits(bits, axis=2, bitorder="little")
         live[x + 1 : x + 9, y + 1 : y + 9, z + 1 : z + 9] = cells.astype(bool)
-    if stride > 1:  # a cell of the coarser grid is live if one in it is; what is not stored is empty
+    if stride > 1:  # a coarser cell is live if a fine cell in it is; what is not stored is empty
         volume = np.ascontiguousarray(volume[::stride, ::stride, ::stride])
         n = BLOCK // stride
         cells = live[1:, 1:, 1:].reshape(n, stride, n, stride, n, stride).any(axis=(1, 3, 5))
@@ -218,9 +218,10 @@ def _cut(
 
 
 def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of all blocks with those on the same edge of the grid made one, and the faces of three corners.
+    """Merge the vertices of all blocks that lie on the same edge of the grid; return them, and the faces that
+    keep three different corners.
 
-    A corner that is on no edge is inside a cell, and belongs to that block alone.
+    A vertex that is on no edge is inside a cell, and belongs to its block alone.
     """
     nearest = np.rint(g)
     whole = np.abs(g - nearest) < 3e-5
@@ -235,11 +236,11 @@ def _joined(g: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slopes(grid: SparseGrid, g: np.ndarray, code_level: float) -> np.ndarray:
-    """How the code falls along the axes of the model frame [n, 3] at points `g` [n, 3], in codes over the
-    shortest edge of a voxel.
+    """Return how steeply the code falls along the axes of the model frame [n, 3] at points `g` [n, 3], in
+    codes per shortest edge of a voxel.
 
-    They are differences of the clipped code over half a voxel to both sides, or to the one side that is
-    stored.
+    The slopes are differences of the clipped code over half a voxel to both sides, or
+    to the only stored side.
     """
     limit = _CLIP / float(grid.density_slope)
     slopes = np.zeros_like(g)

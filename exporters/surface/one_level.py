@@ -1,8 +1,8 @@
-"""What a pyramid shows, as one grid of its finest level: surfaces and volumes are cut out of cells of one
-size.
+"""Conversion of a pyramid to one grid of its finest level: surfaces and volumes are
+made from cells of one size.
 
-A coarse cell becomes the fine ones in its place, whose corners are interpolated as the format predicts them,
-in whole codes.
+A coarse cell is replaced by the fine cells in its place. The codes at their corners are interpolated as the
+format predicts them, in whole codes.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from player.files.memory import check_memory
 
 _OCTANTS = np.array(list(itertools.product((0, 1), repeat=3)))
 _BYTES_A_BRICK = 4096
-"""Memory that masks and coordinates of a brick take while it is made."""
+"""Bytes of memory that masks and coordinates of a brick take while it is made."""
 _BYTES_A_VERTEX = 80
-"""Memory that a vertex takes while its density is interpolated; 69 to 70 were measured on objects and
-captures."""
+"""Bytes of memory that a vertex takes while its density is interpolated; 69 to 70 were measured on objects
+and on captures."""
 
 
 def one_level(stored: PyramidValues, allowed: int, where: str) -> PyramidValues:
-    """The pyramid of one level that shows what `stored` does, of as many cells an axis.
+    """Return the pyramid of one level that shows what `stored` shows, with as many cells along each axis.
 
     Args:
-        stored: a pyramid of any number of levels, and codes.
-        allowed: bytes that it may take.
+        stored: a pyramid of any number of levels, and its codes.
+        allowed: bytes of memory that the result may take.
         where: the beginning of an error message.
 
-    Raises ConfigError: it takes more memory than is allowed.
+    Raises ConfigError: the result takes more memory than is allowed.
     """
     pyramid = stored.pyramid
     last = len(pyramid.levels) - 1
@@ -48,7 +48,8 @@ def one_level(stored: PyramidValues, allowed: int, where: str) -> PyramidValues:
 
 
 def _refined(pyramid: Pyramid, level: int, coarser: Bricks, allowed: int, where: str) -> Bricks:
-    """The bricks of `level` that hold what is shown there and in the bricks of the next coarser level."""
+    """Return the bricks of `level` that cover what is shown there and in `coarser`, the
+    bricks of the next level."""
     check_memory(_BYTES_A_BRICK * 8 * len(coarser), allowed, where)
     n_cells = pyramid.cells_per_axis(level)
     coords = (2 * coarser.coords.astype(np.int64)[:, None] + _OCTANTS).reshape(-1, 3)

@@ -1,9 +1,9 @@
-"""The colour of a surface: what the asset's head says of short rays onto it.
+"""Colours of a surface, computed by the asset's head for short rays onto it.
 
-A ray starts a few voxels above the point and is marched as the player marches, so that a point that is a
-little beside the surface still gets the surface's colour. A point has one colour for all directions: it is
-the mean over the directions of training cameras that see the point, or, where none does, the view along the
-normal. docs/export.md has the measurement that chose between them.
+A ray starts a few voxels above the point and is marched as in the player, so that a point that lies slightly
+off the surface still gets the surface's colour. A point has one colour for all directions: the mean over the
+directions of training cameras that see the point, or, if none does, the colour seen along the normal.
+docs/notes/2026-11-21-surfaces.md has the measurement that led to this choice.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from player.render import choose_march
 from player.threads import default_threads
 
 STAND_OFF = 3.0
-"""How many voxels above the surface a ray starts."""
+"""Distance above the surface at which a ray starts, voxels."""
 MAX_DIRECTIONS = 4
-"""The most cameras that count for a point: eight are no nearer to the player's pictures (docs/export.md)."""
+"""Largest number of cameras that count for a point: eight are no nearer to the player's pictures
+(docs/notes/2026-11-21-surfaces.md)."""
 _RAYS = 1 << 14  # rays that a thread marches at a time
-_LEAST = 0.1  # a ray of less opacity has met too little to have a colour
+_LEAST = 0.1  # least opacity of a ray that has a colour
 
 
 def surface_colours(
@@ -38,17 +39,17 @@ def surface_colours(
     views: list[DepthView],
     progress: Progress = silent,
 ) -> KnownColours:
-    """Colours of points on a surface.
+    """Return colours of points on a surface.
 
     Args:
-        asset: its grid and its head are asked.
+        asset: the asset whose grid and head give the colours.
         points: [n, 3] world frame, within a few voxels of the surface.
         normals: [n, 3] unit, world frame, outwards.
-        views: the training cameras that may be averaged over; none for the view along the normal alone.
+        views: the training cameras that may be averaged over; an empty list for views along the normal alone.
         progress: called with (done, of) after each view and at the end.
 
     Returns:
-        rgb [n, 3] float32; a point is known if a ray met something there.
+        rgb [n, 3] float32; a point is known if a ray hit something there.
     """
     with ThreadPoolExecutor(default_threads(), thread_name_prefix="vfr-export") as pool:
         shade = _Shader(asset, pool)
@@ -76,18 +77,18 @@ def surface_colours(
 
 
 class _Shader:
-    """Colours of rays, as tasks of a pool of threads."""
+    """Callable that computes the colours of rays in tasks of a thread pool."""
 
     def __init__(self, asset: Asset, pool: ThreadPoolExecutor) -> None:
         self._asset = asset
-        self._grid = replace(asset.grid, contracted=False)  # where surfaces are, space is not contracted
+        self._grid = replace(asset.grid, contracted=False)  # space is not contracted where surfaces are made
         self._march = choose_march("auto")[1].march
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         self._model_from_world = np.linalg.inv(asset.world_from_model)
         self._pool = pool
 
     def __call__(self, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """rgb [n, 3] float32 and opacity [n] float32 seen along `dirs` [n, 3] (world) at `points` [n, 3]."""
+        """Return rgb [n, 3] and opacity [n], float32, seen along `dirs` [n, 3] (world) at `points` [n, 3]."""
         parts = [slice(start, start + _RAYS) for start in range(0, len(points), _RAYS)]
         found = list(self._pool.map(lambda part: self._task(points[part], dirs[part]), parts))
         if not found:
@@ -109,7 +110,7 @@ class _Shader:
 
 
 def _spread(n: int) -> list[int]:
-    """0..n - 1 in an order whose every beginning is spread evenly: steps of the golden section.
+    """Return 0..n - 1 in an order of which every beginning is spread evenly, by steps of the golden section.
 
     >>> _spread(5)
     [0, 2, 4, 1, 3]

@@ -1,8 +1,9 @@
-"""A second way to a surface: training cameras' depth pictures, fused by Open3D (Curless and Levoy 1996).
+"""An alternative surface: depth pictures of the training cameras, fused by Open3D
+(Curless and Levoy 1996).
 
-Marching cubes asks what the density is at a place; this asks how far the cameras see. Fog in front of a
-surface then counts for less, and thin parts that few pixels hit for nothing. Pixels of less than half opacity
-are left out, and so are those beside a jump in depth, whose mean lies between two surfaces.
+Marching cubes uses the density at a place; fusion uses how far the cameras see. Fog in front of a surface
+then counts for less, and thin parts that few pixels hit are lost. Pixels of less than half opacity are left
+out. So are pixels beside a jump in depth, because their mean depth lies between two surfaces.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
 
 TRUNCATION = 3.0
-"""How many voxels before and behind a depth it is believed for."""
+"""Truncation distance in voxels: a depth takes effect up to so far before and behind it."""
 JUMP = 5.0
-"""Neighbouring pixels whose depths differ by more voxels see two surfaces; a surface seen at 80 degrees stays
-below."""
-_BLOCKS = 50_000  # blocks of 8^3 voxels that room is made for at first; Open3D makes more when it needs them
-_LEAST_WEIGHT = 1.0  # how many views must have seen a voxel
+"""Largest difference in voxels between the depths of neighbouring pixels that see one surface; a surface seen
+at 80 degrees stays below it."""
+_BLOCKS = 50_000  # blocks of 8^3 voxels that are allocated at first; Open3D adds more when it needs them
+_LEAST_WEIGHT = 1.0  # least number of views that have seen a voxel
 
 
 def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent) -> Surface:
-    """The surface that depth pictures agree on.
+    """Fuse depth pictures into the surface that they agree on.
 
     Args:
-        views: cameras and pictures of depth, world frame.
+        views: cameras and depth pictures, world frame.
         voxel: edge of the voxels, world units.
         progress: called with (done, of) after each view.
 
@@ -69,8 +70,8 @@ def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent
 
 
 def reliable_depth(view: DepthView, jump: float) -> np.ndarray:
-    """Depth along the camera's axis [height, width] float32, 0 where there is none to believe: nothing hit,
-    or a neighbour that is farther or nearer by more than `jump` (world units)."""
+    """Return the depth along the camera's axis, [height, width] float32. It is 0 where it is not reliable:
+    nothing is hit, or a neighbouring pixel is farther or nearer by more than `jump` (world units)."""
     camera = view.camera
     columns, rows = np.meshgrid(
         (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
@@ -82,17 +83,17 @@ def reliable_depth(view: DepthView, jump: float) -> np.ndarray:
     good = hit.copy()
     for row, column in ((0, 1), (2, 1), (1, 0), (1, 2)):
         beside = padded[row : row + z.shape[0], column : column + z.shape[1]]
-        good &= ~(np.abs(beside - z) > jump)  # NaN, where nothing was hit, is no neighbour
+        good &= ~(np.abs(beside - z) > jump)  # NaN, where nothing is hit, is no jump
     return np.where(good, z, 0).astype(np.float32)
 
 
 def _in_order(vertices: np.ndarray, faces: np.ndarray) -> Surface:
-    """The surface with its vertices sorted by place and its faces by number, whatever order they came in, and
-    the mean of the faces around, by area, for normals."""
+    """Return the surface with its vertices sorted by place and its faces by number, whatever order they came
+    in. Its normals are the mean normals of the faces around, weighted by area."""
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     corners = number.reshape(-1)[faces]
     corners = corners[has_three_corners(corners)]
-    order = (np.argmin(corners, axis=1)[:, None] + np.arange(3)) % 3  # the smallest number of a face first
+    order = (np.argmin(corners, axis=1)[:, None] + np.arange(3)) % 3  # a face's smallest number comes first
     triangles = np.unique(np.take_along_axis(corners, order, axis=1), axis=0)
     normals = unit_normals(np.zeros_like(places), places, triangles)
     return Surface(places, triangles.astype(np.int32), normals)
