@@ -1,7 +1,8 @@
-"""`vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench`: settings from the command line, bars on stderr,
-results on stdout.
+"""Commands `vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench`: settings from the command line, progress bars
+on stderr, results on stdout.
 
-Exit codes: 0 done, 1 an error in one message, 2 usage, 130 Ctrl-C, 141 output that nobody reads.
+Exit codes: 0 done, 1 an error (stated in one message), 2 wrong usage, 130 Ctrl-C, 141 nobody reads the
+output.
 """
 
 from __future__ import annotations
@@ -31,29 +32,29 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 EVAL_VIEWS = {False: 10, True: 3}
-"""Number of test views rendered at the end, by whether the scene is unbounded, where none is asked for."""
+"""Number of test views rendered at the end if none is asked for, by whether the scene is unbounded."""
 
 GLANCED_AT = 24
-"""Pictures that a run looks at before it begins; `--check` looks at all that ten seconds allow."""
+"""Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `vfr-train`."""
+    """Run `vfr-train`; return the exit code."""
     return run("vfr-train", lambda: _train(_parse("vfr-train", "Train", argv)))
 
 
 def bake_main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `vfr-bake`."""
+    """Run `vfr-bake`; return the exit code."""
     return run("vfr-bake", lambda: _bake(_parse("vfr-bake", "Bake", argv)))
 
 
 def eval_main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `vfr-eval`."""
+    """Run `vfr-eval`; return the exit code."""
     return run("vfr-eval", lambda: _eval(_parse("vfr-eval", "Eval", argv)))
 
 
 def bench_main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `vfr-bench`."""
+    """Run `vfr-bench`; return the exit code."""
     return run("vfr-bench", lambda: _bench(_parse("vfr-bench", "Bench", argv)))
 
 
@@ -89,14 +90,14 @@ def _train(options: Any) -> int:
     check_target(options.model, options.force, is_file=True)
     config = options.config
     processes = Processes.from_environment()
-    # The pictures of a ZIP or a video are looked at when they are there.
+    # The pictures of a ZIP or a video can be looked at only once they are unpacked.
     packed = not Path(options.data).is_dir()
     glance = _glance(options.data, config) if processes.first and not packed else None
     data = processes.in_turn(lambda: _with_cameras(options.data))
     if processes.first and packed:
         glance = _glance(data, config)
     if glance is not None:
-        glance()  # pictures that were no good have found their cameras all the same
+        glance()  # the pictures are bad, but their cameras were found nevertheless
     say = partial(_say, options.data) if processes.first else None
     reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
     with Bar("reading pictures", processes.first) as bar:
@@ -152,10 +153,10 @@ def _check(options: Any) -> int:
 
 
 def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
-    """The first lines of a run: what a glance at some of the pictures tells.
+    """Look at some of the pictures, and print what that shows as the first lines of a run.
 
-    Where that is bad, it is returned as something to be said later: the estimation of cameras looks at all
-    pictures, and refuses them in one line if they are.
+    If the verdict is bad, print nothing, but return a function that prints these lines later: the estimation
+    of cameras looks at all pictures, and refuses them in one line if they are bad.
     """
     from vfr_bake.data import working_size
     from vfr_bake.data.check.check import check_data
@@ -165,7 +166,7 @@ def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
         return None
     try:
         check = check_data(data, working_size(config), seconds=3, most=GLANCED_AT)
-    except VfrError:  # said by what reads the pictures
+    except VfrError:  # whatever reads the pictures will report it
         return None
 
     def say() -> None:
@@ -183,8 +184,8 @@ def _say(data: str, text: str) -> None:
 
 
 def _with_cameras(data: str) -> str:
-    """The folder to load; a ZIP is unpacked, and for photographs or a video without cameras these are
-    estimated first."""
+    """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
+    have none."""
     from vfr_bake.data import needs_cameras, unpacked
     from vfr_bake.data.poses import estimate_cameras
 
@@ -202,7 +203,7 @@ def _with_cameras(data: str) -> str:
 
 
 def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[str]]:
-    """The scene without training pictures that are blurred, and the names of these; says which."""
+    """Return the scene without blurred training pictures, and the names of these; print which they are."""
     from vfr_bake.data.quality.sharpness import without_blurred
 
     with Bar("looking for blur", processes.first) as bar:
@@ -243,7 +244,7 @@ def _preview(options: Any, scene: Scene) -> Preview:
 
 
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
-    """Train to the end or to Ctrl-C, with a checkpoint now and then; returns the figures to report."""
+    """Train to the end or to Ctrl-C, with a checkpoint now and then; return the figures to report."""
     from vfr_bake.training.checkpoint import save_checkpoint
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
     from vfr_bake.training.scores.metrics import decibels
@@ -295,7 +296,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
 
 
 def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
-    """Say what is likely to come out, on a line of its own."""
+    """Print, on a line of its own, what the training is likely to reach."""
     from vfr_bake.training.length.expectation import expectation
 
     psnr = trainer.witness_psnr() if trainer.processes.first and trainer.device.type == "cpu" else None
@@ -361,7 +362,7 @@ def _bake(options: Any) -> int:
         f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )
-    prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # at its end the bake plays the asset
+    prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # the bake will play the asset at its end
     with Bars() as bars:
         result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6
@@ -481,5 +482,5 @@ def _bench(options: Any) -> int:
 
 
 def _finite(figures: dict[str, Any]) -> dict[str, Any]:
-    """The figures with None for infinite ones: the PSNR of equal pictures has no number in JSON."""
+    """Replace infinite figures by None, because JSON has no number for the PSNR of equal pictures."""
     return {key: None if value == math.inf else value for key, value in figures.items()}

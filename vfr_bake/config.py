@@ -1,5 +1,5 @@
-"""Every setting, one frozen dataclass a command. The attribute docstrings are the help texts and carry the
-units."""
+"""All settings, in a frozen dataclass for each command. The attribute docstrings are shown as help texts, and
+state the units."""
 
 from __future__ import annotations
 
@@ -32,18 +32,19 @@ UNBOUNDED_FIELD = {
     "sh_degree": 7,
     "n_sh_features": 8,
 }
-"""Settings of the paper's real-world scenes where they differ from those of objects (table 2), but for the
-number of levels: 32 double the time of a step on a CPU, most of which is spent on the grid's memory."""
+"""Architecture settings of the paper's real-world scenes that differ from those of objects (table 2), except
+the number of levels: the paper's 32 would double the time of a step on a CPU, most of which is spent on the
+grid's memory."""
 
 
 FIELD_BY_DEVICE: dict[str, dict[str, Any]] = {"cpu": {"head_width": 128}, "cuda": {"log2_table_size": 19}}
-"""Settings of the architecture that follow from the device. A GPU has tables as large as the paper's. On a
-CPU, the paper's head takes about half of a step's time, and one of half its width leaves room for nearly
-twice as many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
+"""Architecture settings that follow from the device. On a GPU, tables are as large as the paper's. On a CPU,
+the paper's head would take about half of a step's time, and a head of half its width allows nearly twice as
+many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
-    """Raises ConfigError, with what was expected, if the setting `name` does not fit."""
+    """Raise ConfigError, which says what was `expected`, unless the setting `name` `fits`."""
     if not fits:
         raise ConfigError(f"{name}: expected {expected}, got {brief(getattr(settings, name))}")
 
@@ -95,13 +96,13 @@ class FieldConfig:
 
     @property
     def n_channels(self) -> int:
-        """Feature channels of a point: two per level."""
+        """Number of feature channels of a point: two per level."""
         return 2 * self.n_levels
 
 
 def field_config_from(values: dict[str, Any], where: str) -> FieldConfig:
-    """A FieldConfig from plain values as a model file keeps them. Raises ConfigError on unknown or missing
-    names and wrong kinds."""
+    """Return a FieldConfig from plain values as a model file keeps them. Raises ConfigError for unknown or
+    missing names and for values of a wrong type."""
     defaults = asdict(FieldConfig())
     if set(values) != set(defaults):
         raise ConfigError(f"{where}: expected the settings {sorted(defaults)}, got {brief([*values])}")
@@ -147,14 +148,15 @@ class FieldOptions:
     """Features that multiply each basis function; objects 4, scenes 8, as in the paper."""
 
     def resolved(self, unbounded: bool, device: str = "cpu") -> FieldConfig:
-        """With every open setting filled in. Raises ConfigError for a value out of range."""
+        """Return the architecture with every open setting filled in. Raises ConfigError for values out of
+        range."""
         given = {name: value for name, value in asdict(self).items() if value is not None}
         return FieldConfig(**((UNBOUNDED_FIELD if unbounded else {}) | FIELD_BY_DEVICE[device] | given))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceSettings:
-    """Settings of a training that follow from the device and the kind of scene where they are not given.
+    """Settings of a training that follow from the device and the kind of scene if they are not given.
     `TrainConfig` says what each of them means."""
 
     steps: int = 1_000_000
@@ -182,7 +184,7 @@ GPU_SETTINGS = {
     "grid_rate": 1e-2,
     "network_rate": 1e-2,
 }
-"""The paper's settings for a GPU, but for `max_rays`, which is ours: most rays of an object meet nothing."""
+"""The paper's settings for a GPU. Only `max_rays` is not the paper's: most rays of an object meet nothing."""
 GPU_STEPS = {False: 20_000, True: 40_000}
 """The paper's number of steps, by whether the scene is unbounded."""
 
@@ -190,7 +192,7 @@ GPU_STEPS = {False: 20_000, True: 40_000}
 SCENE_DISTORTION = 0.002
 """Weight of an unbounded scene's distortion loss."""
 EFFORT_MINUTES = {"draft": (2.0, 2.0), "good": (10.0, 12.0), "best": (60.0, 60.0)}
-"""Minutes of training on a CPU at most, of an object and of an unbounded scene, by the effort."""
+"""Most minutes of training on a CPU, for an object and for an unbounded scene, by the effort."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,10 +279,10 @@ class TrainConfig:
         check(self, "near_gradients", 0 <= self.near_gradients < 1e3, "0 to 1000")
         check(self, "eval_views", self.eval_views is None or self.eval_views >= 0, "at least 0")
         check(self, "checkpoint_minutes", self.checkpoint_minutes > 0, "more than 0")
-        self.for_device("cpu", False)  # so that what is out of range is refused before pictures are read
+        self.for_device("cpu", False)  # so that values out of range are refused before pictures are read
 
     def minutes_for(self, device: str, unbounded: bool) -> float:
-        """Minutes of training at most on `device` ("cpu" or "cuda").
+        """Return the largest number of minutes of training on `device` ("cpu" or "cuda").
 
         >>> TrainConfig().minutes_for("cpu", True), TrainConfig(effort="draft").minutes_for("cuda", True)
         (12.0, 2.0)
@@ -292,7 +294,7 @@ class TrainConfig:
         return EFFORT_MINUTES[self.effort][unbounded]
 
     def for_device(self, device: str, unbounded: bool) -> DeviceSettings:
-        """What is given, and for the rest what `device` ("cpu" or "cuda") and the kind of scene suggest.
+        """Return the given settings, and those that `device` ("cpu" or "cuda") and kind of scene suggest.
 
         >>> TrainConfig(steps=7).for_device("cuda", False).steps, TrainConfig().for_device("cuda", True).steps
         (7, 40000)
@@ -384,7 +386,7 @@ class BakeConfig:
         check(choice, "mesh_resolution", fits, "0 or 8 to 1024")
 
     def choice(self, unbounded: bool = False) -> BakeChoice:
-        """The preset for an object or an unbounded scene, with what is given in its place.
+        """Return the preset's choice for an object or an unbounded scene; settings that are given replace it.
 
         >>> BakeConfig(preset="fast", n_channels=5).choice().n_channels, BakeConfig().choice().head_width
         (5, 64)
@@ -404,7 +406,7 @@ class BakeConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchConfig:
-    """What `vfr-bench` is to measure."""
+    """Settings of `vfr-bench`: what it measures."""
 
     assets: tuple[Path, ...]
     """Folders of assets of one scene."""
@@ -427,7 +429,7 @@ class BenchConfig:
     """Gigabytes of memory that each asset may take when it is opened; half of the machine's if not given."""
 
     def check(self) -> None:
-        """Raises ConfigError for what cannot be measured."""
+        """Check the settings; raises ConfigError for what cannot be measured."""
         if not self.assets:
             raise ConfigError("assets: expected at least one folder, got none")
         if len(set(self.assets)) < len(self.assets):
@@ -442,7 +444,7 @@ class BenchConfig:
         self.frame_sizes()
 
     def frame_sizes(self) -> list[tuple[int, int]]:
-        """`sizes` as pairs of width and height in pixels. Raises ConfigError."""
+        """Return `sizes` as pairs of width and height in pixels. Raises ConfigError."""
         try:
             return [size(text) for text in self.sizes]
         except ArgumentTypeError as error:

@@ -25,16 +25,17 @@ from player.child import python_command
 from player.files.files import check_target, write_bytes
 
 TRAIN_MINUTES = 2.25
-"""Training time by default, compiling included: two cores with AVX2 reach 34 dB in it."""
+"""Default training time in minutes, compiling included: two cores with AVX2 reach 34 dB in it."""
 REFINE_STEPS = 750
-"""Steps of each round of refinement, between 500 and 1,000: the latter lose 0.1 dB less here and take eight
-seconds longer with AVX-512."""
+"""Steps of each round of refinement, a compromise between 500 and 1,000: with 1,000 the loss is 0.1 dB less
+here, and the bake takes eight seconds longer with AVX-512."""
 N_SHOWN = 4
 """Number of test views in the side-by-side picture."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train, bake and play the demo scene into a folder; the last lines on stdout say where and how good."""
+    """Train, bake and play the demo scene into a folder; the last lines on stdout say where the results are
+    and how good they are."""
     parser = argparse.ArgumentParser("python -m vfr_bake.demo", description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("demo"), help="folder to write (default: demo)")
     parser.add_argument(
@@ -94,14 +95,15 @@ def _demo(output: Path, minutes: float, force: bool) -> int:
 
 @contextmanager
 def bake_compiled_beside() -> Iterator[None]:
-    """On a fresh machine training compiles for most of a minute, on one core; another process compiles
-    meanwhile what the bake will run. What it has not done in the end, the bake does."""
+    """Compile what the bake will run, in another process, while this context lasts. On a fresh machine,
+    training itself compiles for most of a minute, on one core. What is not compiled at the end of the
+    context, the bake compiles itself."""
     from vfr_bake.baking.plan import is_compiled
 
     if is_compiled():
         yield
         return
-    with TemporaryDirectory() as folder:  # what is ended in the middle cannot remove its own files
+    with TemporaryDirectory() as folder:  # a process that is terminated cannot remove its files
         rehearsal = subprocess.Popen(
             python_command("vfr_bake.rehearsal"),
             env=os.environ | {"TMPDIR": folder},
@@ -116,8 +118,8 @@ def bake_compiled_beside() -> Iterator[None]:
 
 
 def _side_by_side(scene: Any, background: np.ndarray, frames: Path, target: Path) -> float:
-    """Write photographs over the `background` [3] above played frames as one picture; returns the mean PSNR
-    in dB of all played test frames."""
+    """Write one picture with photographs, over the `background` [3], above the played frames; return the mean
+    PSNR in dB of all played test frames."""
     from PIL import Image
 
     from player.cameras.transforms import frame_names
@@ -142,7 +144,7 @@ def _summary(
     bake: dict[str, Any],
     play: dict[str, Any],
 ) -> str:
-    """Where the results are and how good; `seconds` and figures are those of the commands."""
+    """Return lines that say where the results are and how good; `seconds` and figures are the commands'."""
     full = f", full model {train['test_psnr']:.2f} dB" if "test_psnr" in train else ""
     return (
         f"\npictures   {output / 'frames'} ({play['frames']} frames)\n"

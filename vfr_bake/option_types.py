@@ -1,4 +1,4 @@
-"""Options of the command lines that `tyro` makes: how `--help` describes them, and errors of numbers that say
+"""Command-line options as `tyro` makes them: how `--help` describes them, and errors for numbers that say
 what is expected."""
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _METAVARS = {str: "NAME", float: "FLOAT"}
 
 
 def registry() -> Any:
-    """tyro's rules, with one for an option that is a number: of type `int`, `float | None`, `int |
-    Literal["auto"]` or `tuple[int, ...]`."""
+    """Return tyro's rules, with one more for options that are numbers, of the type `int`, `float | None`,
+    `int | Literal["auto"]` or `tuple[int, ...]`."""
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
     rules = ConstructorRegistry()
@@ -61,7 +61,7 @@ def registry() -> Any:
 
 
 def _parts(kind: Any) -> tuple[type, tuple[str, ...]] | None:
-    """The number and the words that an annotation allows.
+    """Return the type of number and the words that an annotation allows; None if it is not for a number.
 
     >>> _parts(int), _parts(float | None), _parts(int | Literal["auto"]), _parts(str | None), _parts(bool)
     ((<class 'int'>, ()), (<class 'float'>, ()), (<class 'int'>, ('auto',)), None, None)
@@ -76,10 +76,11 @@ def _parts(kind: Any) -> tuple[type, tuple[str, ...]] | None:
 
 @cache
 def described(options: type) -> type:
-    """The dataclass of options itself, annotated so that its help has whole paragraphs and no word None.
+    """Return the dataclass of options itself, annotated so that its help has whole paragraphs and no word
+    None.
 
-    tyro keeps the line breaks of attribute docstrings, and gives None as a value and as a default. Where the
-    default is None, False or nothing, the text alone says what happens without the option.
+    By itself, tyro keeps the line breaks of attribute docstrings, and shows None as a value and as a default.
+    If the default is None, False or empty, the help text alone says what happens without the option.
     """
     from docstring_parser import parse_from_object
     from tyro.conf import arg
@@ -100,7 +101,7 @@ def described(options: type) -> type:
 
 
 def _metavar(kind: Any) -> str | None:
-    """What stands for the value of an option that may be None; None for other options, and for numbers.
+    """Return the placeholder for the value of an option that may be None; None for other options and numbers.
 
     >>> _metavar(Path | None), _metavar(Literal["alex", "vgg"] | None), _metavar(tuple[str, float] | None)
     ('PATH', '{alex,vgg}', 'NAME FLOAT')

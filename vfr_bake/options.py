@@ -1,5 +1,5 @@
-"""What the command lines of `vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench` take; `tyro` makes the
-parsers out of it."""
+"""Command-line options of `vfr-train`, `vfr-bake`, `vfr-eval` and `vfr-bench`; `tyro` makes the parsers from
+these classes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the presets of `vfr-bake` decide."""
+"""Presets of `vfr-bake`: the settings that each of them chooses."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ Preset = Literal["fidelity", "balanced", "fast", "phone"]
 
 @dataclass(frozen=True, kw_only=True)
 class BakeChoice:
-    """What a preset decides; settings that were given replace it."""
+    """Settings that a preset chooses; those that the user gives replace them."""
 
     cells_per_pixel: float
-    """Resolution of the densities where none is given: cells for each pixel that the training pictures see
-    across the middle of the box, at most half again the field's finest level."""
+    """Resolution of the densities if none is given: cells for each pixel that the training pictures have
+    across the middle of the box; at most one and a half times the field's finest level."""
     contracted_resolution: int
-    """Resolution of the densities of an unbounded scene where none is given: cells along an axis of
-    contracted space, which is four model units wide; few of the cells hold anything."""
+    """Resolution of the densities of an unbounded scene if none is given: cells along an axis of contracted
+    space, which is four model units wide; few of the cells hold anything."""
     feature_share: float
-    """Cells of the features' grid for a cell of the densities', along an axis; at most the field's finest
-    level."""
+    """Resolution of the features, as a share of that of the densities; at most the field's finest level."""
     culled_loss_db: float
-    """Cells are left out where leaving them out, alone, loses no more than this, dB."""
+    """Largest loss in dB for which cells are left out; the loss from that alone."""
     n_channels: int
     """Largest number of feature channels."""
     channel_loss_db: float
-    """Fewer channels are taken where they lose no more than this, before refinement, dB."""
+    """Largest loss in dB, before refinement, for which fewer channels are stored."""
     n_fetches: int
     """Largest number of feature lookups per ray, k; 0 for every sample."""
     sample_loss_db: float
-    """Fewer lookups are taken where they lose no more than this, dB."""
+    """Largest loss in dB for which fewer lookups are taken."""
     code_loss_db: float
-    """Stored values are chosen that lose about this by themselves, dB: the more, the fewer bytes."""
+    """Approximate loss in dB from the choice of stored values alone: the more, the fewer bytes."""
     density_step: int
-    """Density codes, of 256, from one that is stored to the next."""
+    """Quantization step of the densities: difference between neighbouring codes that are stored, of 0 to
+    255."""
     code_levels: int
     """Largest feature code, 7 to 127."""
     head_width: int
@@ -42,24 +42,24 @@ class BakeChoice:
     head_layers: int
     """Directional layers of a smaller head after the first."""
     head_bands: int
-    """Bands of spherical harmonics of a smaller head, at most the model's; 1 where nothing depends on the
+    """Bands of spherical harmonics of a smaller head, at most the model's; with 1, nothing depends on the
     direction."""
     head_bits: int
     """Bits of the head's wide layers, 8 or 32."""
     refine_steps: int
     """Steps of each round of refinement."""
     minutes: float = 8
-    """Wall-clock minutes of a bake, roughly: refinement takes fewer steps where the machine is too slow for
-    all of them, unless their number was asked for."""
+    """Wall-clock minutes of a bake, roughly: refinement takes fewer steps if the machine is too slow for all
+    of them, unless their number was asked for."""
     mesh_resolution: int
-    """The mesh gets the faces that a grid of so many voxels along the box would give it; 0: as many as its
-    bytes allow."""
+    """Sets the number of the mesh's faces: as many as a grid of this many voxels along the box would give it;
+    0: as many as its bytes allow."""
     target_loss_db: float
-    """Loss that the preset aims at, dB."""
+    """Loss in dB that the preset aims at."""
     page_mb: float
-    """Graphics memory that a page of the grids may take before any detail is dropped, MB, roughly: they are
-    as fine as fits, unless their resolution was given. The phone's pages are to take 256: more than half of
-    its features' detail is dropped."""
+    """Graphics memory in MB, roughly, that the grids may take in a page before any detail is dropped: they
+    are as fine as fits, unless their resolution was given. Pages of the phone preset are meant to take 256
+    MB, because more than half of their features' detail is dropped."""
 
 
 PRESETS: dict[Preset, BakeChoice] = {
@@ -117,5 +117,6 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
     },
     "phone": {"refine_steps": 1200, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
 }
-"""What the presets decide differently for an unbounded scene: its rays have several times as many fetches,
-which take their time; its features are most of what a grid of so few cells loses."""
+"""Settings that the presets choose differently for an unbounded scene. Its rays have several times as many
+fetches, which take more time; and most of the loss comes from the features, because the grid has so few
+cells."""

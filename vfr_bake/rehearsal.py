@@ -1,4 +1,4 @@
-"""A bake of next to nothing: whatever a bake compiles is compiled by it and kept, while other work goes on.
+"""Bake of a tiny model, so that all code that a bake compiles is compiled and kept while other work goes on.
 
 python -m vfr_bake.rehearsal
 """
@@ -20,13 +20,13 @@ from vfr_bake.training.trainer import Trainer
 RADIUS = 0.4
 """Radius of the ball that is baked, in model units."""
 CELLS = 32
-"""Cells along an axis of what marks it and of what is stored."""
+"""Cells along an axis of the occupancy grid that marks the ball, and of the stored grid."""
 LATER = 10
-"""Nice value, where the system has them: what goes on beside comes first."""
+"""Nice value, on systems that have one, so that the other work comes first."""
 
 
 def untrained_model() -> Model:
-    """A ball of an untrained field, seen by small cameras."""
+    """Make the model of a ball: an untrained field, seen by small cameras."""
     scene = demo_scene(size=32, n_train=8, n_test=1)
     options = FieldOptions(log2_table_size=12)
     config = TrainConfig(device="cpu", field=options, occupancy_resolution=CELLS)
@@ -37,11 +37,12 @@ def untrained_model() -> Model:
 
 
 def main() -> None:
-    """Bake it, and throw that away."""
+    """Bake the untrained model, and throw the asset away."""
     if hasattr(os, "nice"):
         os.nice(LATER)
     with TemporaryDirectory() as folder:
-        # What this preset may lose lets coarser levels show some of so rough a ball: their code runs, too.
+        # The loss that this preset allows lets coarser levels show parts of the ball, so their code runs,
+        # too.
         config = BakeConfig(preset="fast", resolution=CELLS, refine_steps=2, check_views=1)
         bake(untrained_model(), Path(folder) / "asset", config, lambda *_: None)
 

@@ -1,2 +1,2 @@
-"""From a trained field to an asset: what is seen, stored in few bytes, with the head as ONNX and the surface
-as a mesh."""
+"""Turn a trained field into an asset: the visible part of the field in few bytes, the head as ONNX, and the
+surface as a mesh."""

@@ -1,7 +1,8 @@
-"""The bake, step by step: what is seen, what of it is stored, the head, the mesh, and what each step loses.
+"""The bake, step by step: find the visible cells, choose the values to store, train the head, make the mesh,
+and measure the loss of each step.
 
-Everything is measured on photographs' pixels and on views that nothing else looks at
-(`vfr_bake.baking.held_out`), the end result by playing the written files.
+All losses are measured on pixels of photographs and on views that nothing else uses
+(`vfr_bake.baking.held_out`). The final result is measured by playing the written files.
 """
 
 from __future__ import annotations
@@ -84,31 +85,33 @@ from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
 Report = Callable[[str, int, int], object]
-"""Called with (stage, done, of)."""
+"""Progress callback, called with (stage, steps done, steps in all)."""
 N_PROJECTED = 100_000
-"""Rays that decide which directions of the features the colours depend on, and how much of each there is."""
+"""Number of rays from which the projection to fewer feature channels is computed: they give the directions in
+feature space that the colours depend on, and the second moment of the features."""
 
 
 @dataclass(frozen=True)
 class BakeResult:
-    """What was written and what it cost."""
+    """Size, time and loss of a finished bake."""
 
     n_vertices: int
     n_bytes: int
-    """Without the report."""
+    """Bytes of all files but the report."""
     seconds: float
     loss: Loss
     """Loss against photographs, compared with the trained model."""
     figures: dict[str, Any]
     missed: list[str]
-    """What the preset aims at and was not reached, in words."""
+    """The targets of the preset that were missed, in words."""
 
 
 def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
     """Bake `model` into the asset `folder`.
 
-    Raises OutputError, ConfigError, or TrainingError: nothing is visible, the result does not show what the
-    model shows, or misses `max_loss_db`, `max_mb` or `target_ms`; then nothing is written.
+    Raises OutputError, ConfigError, or TrainingError; nothing is written then. A TrainingError means that
+    nothing is visible, that the baked grid does not show what the model shows, or that the result misses
+    `max_loss_db`, `max_mb` or `target_ms`.
     """
     check_target(folder, force)
     check_bakeable(model, config)
@@ -117,7 +120,7 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
 
 
 def check_bakeable(model: Model, config: BakeConfig) -> None:
-    """Raises ConfigError for a field that an asset cannot hold."""
+    """Raise ConfigError if the model's field cannot be stored in an asset."""
     field = model.field.config
     for name, needed in (("compositing", "features"), ("activation", "gelu")):
         if getattr(field, name) != needed:
@@ -127,15 +130,15 @@ def check_bakeable(model: Model, config: BakeConfig) -> None:
 
 
 class _Bake:
-    """One bake: what its steps share."""
+    """One bake: the state that its steps share."""
 
     def __init__(self, model: Model, config: BakeConfig, report: Report) -> None:
         self.model, self.config = model, config
         self.choice = config.choice(model.field.config.unbounded)
         self.seconds: dict[str, float] = {}
-        """Wall-clock time of each part."""
+        """Wall-clock seconds of each part of the bake."""
         self.left_out: dict[str, str] = {}
-        """What is not in the asset, and what that changed."""
+        """Descriptions, by topic, of what was left out of the asset and what that changed."""
         self.lookups: dict[str, float] = {}
         self.n_fetches = self.choice.n_fetches
         self.plan = make_plan(model, config)
@@ -164,12 +167,12 @@ class _Bake:
             needed = self._needed(detail, layout, stored, teacher)
         self.left_out |= detail.left_out
         layout, weights = needed.layout, stored.head
-        del stored, again  # they hold the features, and the cells that hardly anything sees
+        del stored, again  # free the features, and the cells that were just dropped
         with self._part("codes"):
             arrays = self._spend(weights, needed, teacher, tuning.ranges, len(head))
             level_steps = detail.level_steps(layout.played(arrays), self.config.max_loss_db)
         manifest = self._manifest(layout, arrays, level_steps)
-        del teacher, needed, layout  # what is written is played and meshed in their room
+        del teacher, needed, layout  # free memory for playing and meshing the asset
         with self._part("qualities"):
             found = self._qualities(manifest, arrays, head, tuning.kept)
             manifest = replace(manifest, agreement=found.agreement, quality_fetches=found.fetches)
@@ -181,8 +184,8 @@ class _Bake:
         missed: list[str] = []
 
         def finish(new: Path) -> dict[str, bytes]:
-            """The mesh, which may take a part of the bytes that the other files take, and the report.
-            `figures` are in the manifest, which is written again after this."""
+            """Return the mesh and the report as files; the mesh comes last because its size limit depends on
+            the other files. `figures` is part of the manifest, which is written again after this."""
             asset = Asset.open(new, verify=True, max_memory=self.config.max_memory)
             mesh, removed = self._mesh(asset, file_sizes(new))
             figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
@@ -203,8 +206,8 @@ class _Bake:
         return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, missed)
 
     def _cells(self) -> tuple[Layout, int]:
-        """Where densities and features are stored, and the number of training rays for which that leaves
-        room."""
+        """Return the layout of the stored densities and features, and the number of training rays for which
+        it leaves memory."""
         model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = self._progress("visibility")
@@ -228,7 +231,7 @@ class _Bake:
         return layout, plan.n_rays(fitted.n_cells)
 
     def _room_for_cells(self) -> Iterator[tuple[int, str]]:
-        """How many cells of the features fit, and into what."""
+        """Yield pairs: the number of feature cells that fit, and the name of the limit they fit into."""
         config, choice, plan = self.config, self.choice, self.plan
         yield plan.most_cells, f"{config.max_memory:g} GB of memory"
         if config.max_mb is not None:
@@ -237,7 +240,7 @@ class _Bake:
             yield int(plan.page_cells), f"a page that takes {choice.page_mb:g} MB of graphics memory"
 
     def _mesh(self, asset: Asset, sizes: dict[str, int]) -> tuple[TriangleMesh, Removed]:
-        """The mesh of an asset that has everything else, whose files have these sizes."""
+        """Make the mesh of an asset that is complete but for it, and whose files have these `sizes`."""
         most = mesh_bytes(sum(sizes.values()) - sizes["mesh.ply"], self.config.max_mb)
         resolution = self.choice.mesh_resolution or asset.manifest.resolution
         with self._part("mesh"):
@@ -247,8 +250,11 @@ class _Bake:
         return baked.mesh, baked.removed
 
     def _store(self, layout: Layout, n_rays: int) -> tuple[Stored, TeacherRays, Callable[[], Parts]]:
-        """Projected, scaled codes at every vertex, and the head that takes them, as the field has them; what
-        refinement learns from; and what finds the codes again once they are refined."""
+        """Compute the values to store, before refinement.
+
+        Returns the codes of the field's densities and projected features with the head that takes them, the
+        training rays of the refinement, and a function that computes the unrefined feature codes again.
+        """
         model, choice, held_out = self.model, self.choice, self.held_out
         cameras = model.model_cameras()
         with self._part("teacher"):
@@ -284,13 +290,15 @@ class _Bake:
         return Stored(head, features, density), teacher, again
 
     def _needed(self, detail: Detail, layout: Layout, stored: Stored, teacher: TeacherRays) -> Needed:
-        """No more detail of the refined values than the pictures need. Changes the features of `stored`."""
+        """Drop the detail of the refined values that the pictures do not need. Changes the features of
+        `stored` in place."""
         cameras = [] if self.config.no_cull else self.model.model_cameras()
         cameras += views_between(self.model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
         return detail.needed(layout, stored.density, stored.features, cameras, teacher)
 
     def _projection(self, teacher: TeacherRays) -> Projection:
-        """To as many channels as were asked for, or the fewest that lose no more than the preset allows."""
+        """Return the projection to the number of channels that was asked for, or to the fewest that lose no
+        more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
         some = teacher.some(N_PROJECTED)
         features, opacity, _ = self.model.sampler.composited_features(
@@ -305,7 +313,7 @@ class _Bake:
             some = every.first(n)
             return self.held_out.channel_loss(some.back @ some.matrix).most <= self.choice.channel_loss_db
 
-        # What is lost falls with each channel, and measuring it takes the model's own head.
+        # The loss falls with every added channel, so bisect: each measurement runs the model's own slow head.
         return every.first(1 + bisect_left(range(1, most), True, key=enough))
 
     def _spend(
@@ -316,7 +324,8 @@ class _Bake:
         ranges: tuple[Range, ...] | None,
         head_bytes: int,
     ) -> GridArrays:
-        """What is stored of the refined values: as little as the witnesses allow, and as fits."""
+        """Choose the codes to store: the fewest bits whose loss on the witnesses stays within the limit and
+        that fit the bytes asked for."""
         held_out, config, layout = self.held_out, self.config, needed.layout
         head, progress = runner(weights, ranges), self._progress("codes")
         stored = Stored(weights, needed.features, needed.density)
@@ -330,9 +339,9 @@ class _Bake:
         others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
         tried: list[float] = []
         kept: dict[float, Spent] = {}
-        """What is stored at the price that is the best so far, which is not found again."""
+        """The result at the best price so far, so that it need not be computed again."""
         losses: dict[float, float] = {}
-        """dB that are lost at the prices that were tried."""
+        """Loss in dB at each price that was tried."""
 
         def at(price: float) -> Spent:
             if price in kept:
@@ -340,7 +349,7 @@ class _Bake:
             tried.append(price)
             progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
             spent = prices.at(price)
-            give_back()  # what its threads have used, before there is a grid of it
+            give_back()  # free what the threads of `at` have used before a grid is built of the result
             return spent
 
         def keep(price: float, spent: Spent) -> None:
@@ -348,7 +357,7 @@ class _Bake:
             kept[price] = spent
 
         def lost(price: float) -> float:
-            """What is lost, as a share of what may be."""
+            """Return the loss at a price as a share of the allowed loss."""
             if price not in losses:
                 spent = at(price)
                 after = held_out.look("codes", layout.played(spent.arrays), head, self.n_fetches)
@@ -361,7 +370,7 @@ class _Bake:
             return losses[price] / most if most > 0 else np.inf
 
         def taken(price: float, max_mb: float) -> float:
-            """What the files take, as a share of what they may."""
+            """Return the bytes of all files at a price as a share of the allowed bytes."""
             spent = at(price)
             n_bytes = others + spent.n_bytes
             share = (n_bytes + mesh_bytes(round(n_bytes), None)) / (1e6 * max_mb)
@@ -375,16 +384,16 @@ class _Bake:
         first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
         price = highest_price(lost, first, 0.0 if left is not None and left > 0 else lowest)
         if left is None and losses[price] > most:
-            # Rounding to whole codes alone loses more. What is allowed is then what a price may add to that.
+            # Rounding to whole codes alone loses more than `most`. Allow that loss plus what a price may add.
             most = losses[price] + allowed
             price = highest_price(lost, first, lowest)
         if (max_mb := config.max_mb) is not None and (share := taken(price, max_mb)) > 1:
-            # Bytes fall about with the square root of the price.
+            # The bytes fall roughly as the square root of the price.
             price = 1 / highest_price(lambda rate: taken(1 / rate, max_mb), (AIM / share) ** 2 / price)
         return at(price).arrays
 
     def _qualities(self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage) -> Qualities:
-        """What `high` and `fast` pictures of the asset may leave out."""
+        """Choose the settings of `high` and `fast` pictures of the asset."""
         views = compared_views(self.model, self.config.check_views)
         error = self.held_out.model_error * 10 ** (refined.loss.db / 10)
         with TemporaryDirectory() as folder:
@@ -392,15 +401,15 @@ class _Bake:
             return fitting_qualities(asset, views, error)
 
     def _other_bytes(self, max_mb: float) -> int:
-        """What the files of an asset of `max_mb` megabytes take beside the stored values and the
-        manifest."""
+        """Estimate the bytes of an asset of `max_mb` megabytes other than stored values and manifest."""
         mesh = mesh_bytes(round(max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
         n_weights = sum(array.numel() for array in self.model.field.head.parameters())
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
         return mesh + len(write_cameras(self.model.cameras)) + head
 
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
-        """The choice, with no wider a head and no more lookups than a frame in `target_ms` allows."""
+        """Return the preset's choice with the head narrowed and the feature lookups reduced as far as it
+        takes to render a frame in `target_ms`."""
         arrays = layout.finest(stored.density, stored.features)
         scale = np.ones(arrays.features.n_channels)
 
@@ -421,7 +430,7 @@ class _Bake:
         return keep_to_time(self.choice, target_ms, measure, same_head, self.config.k != "auto")
 
     def _manifest(self, layout: Layout, arrays: GridArrays, level_steps: tuple[int, ...]) -> Manifest:
-        """What a player needs to know; what the bake measures is added once it is known."""
+        """Build the manifest; the figures that the bake measures are added to it later."""
         model = self.model
         camera = model.cameras[0]
         return Manifest(
@@ -449,8 +458,8 @@ class _Bake:
         )
 
     def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
-        """Play the written files, which have these sizes; raises TrainingError where they miss what was
-        asked."""
+        """Play the written files, which have the sizes `n_bytes`, and report the result. Raises TrainingError
+        if it misses a limit that was asked for."""
         head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
         last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
         megabytes = sum(n_bytes.values()) / 1e6
@@ -475,8 +484,8 @@ class _Bake:
 
     @contextmanager
     def _part(self, name: str) -> Iterator[None]:
-        """Time what is done here, and give back what it no longer needs; parts within this one are not
-        counted twice."""
+        """Time the body as part `name`, and return freed memory to the system at its end. The time of parts
+        nested in this one is not counted twice."""
         begin, others = time.monotonic(), sum(self.seconds.values())
         try:
             yield

@@ -1,12 +1,12 @@
-"""Which cells of the grid a bake stores, and how long the player's steps through them are.
+"""Find the cells of the grid that a bake stores, and the length of the player's steps through them.
 
-In an object's box, cells are stored that matter to the pictures. A sample's own weight says little about
-that: in a fog every sample of a ray weighs next to nothing, and all of them together are the picture. What
-counts is the sum along a ray. So cells whose samples weigh less than a floor in every view are left out only
-where the pictures without them lose next to nothing, measured on what nothing is learned from.
+In an object's box, the cells that matter to the pictures are stored. The weight of a single sample says
+little about that: in a fog every sample of a ray weighs next to nothing, but their sum is the picture. So
+cells whose samples weigh less than a floor in every view are left out only if the pictures without them lose
+next to nothing, measured on pixels that nothing is trained on.
 
-An unbounded scene has no occupancy grid: where no view has ever put a sample, the field holds untrained
-values. A cell is stored only if the samples that the model's sampler chose on some ray have weight in it.
+An unbounded scene has no occupancy grid, and the field holds untrained values where no view has ever put a
+sample. So a cell is stored only if samples that the model's sampler chose on some ray have weight in it.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from vfr_bake.rendering.compositing import composite
 from vfr_bake.training.model_file import Model
 
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
-"""Weights that a sample must have in some view for its cell to be stored; the first that loses little enough
-is taken, and where none does, nothing is left out."""
+"""Weight floors: the weight that a sample must have in some view for its cell to be stored. They are tried in
+this order; the first that loses little enough is used. If none does, nothing is left out."""
 HITS, CONTRACTED_HITS = 8, 24
-"""Rays that meet a surface cell of a box, and a block of cells at the unit sphere of an unbounded scene, over
-all views, on average. The cells of a box that still escape are gaps to be closed."""
+"""Mean number of rays, over all views, that meet a surface cell of a box, and a block of cells at the unit
+sphere of an unbounded scene. Cells of a box that are missed nevertheless are gaps, which are closed."""
 MOST_SEEING = 2_000_000
-"""Rays that look for the cells of an unbounded scene, at most: so its minutes are bounded, however many views
-there are and wherever they stand. Fox needs 1.2 million for as many hits."""
+"""Most rays that search for the cells of an unbounded scene. It bounds the time, however many views there are
+and wherever they stand. Fox needs 1.2 million rays for CONTRACTED_HITS hits."""
 VIEWS_OF_A_CELL = 0.4
-"""Share of the training views that see a given piece of surface, roughly."""
+"""Rough share of the training views that see a given piece of surface."""
 BLOCK = 2
-"""Cells along each edge of a block. Blocks are found whole in an unbounded scene: samples take their time (of
-a model with proposals 4,000 rays a second of one core), and so a quarter of the rays is enough. Surfaces are
-some cells thick anyway."""
+"""Cells along each edge of a block. In an unbounded scene whole blocks are marked, not cells, so that a
+quarter of the rays is enough: sampling is slow (4,000 rays a second on one core for a model with proposals).
+Surfaces are some cells thick anyway."""
 FASTEST_CELLS = 2.0
-"""Cells between two samples of a ray where it is fastest in contracted space; where it is slowest there are
-two fifths of that."""
+"""Cells between two samples of a ray where it is fastest in contracted space; where it is slowest, two fifths
+of that."""
 CONTRACTED_RAYS_AT_ONCE = 1 << 14
 WEIGHT_FLOOR = 0.01
-"""Weight that a cell of an unbounded scene must have on some ray where no floor is given. Fox at 1088 cells
-loses nothing to it; it would have half again as many vertices with 0.003."""
+"""Default weight that a cell of an unbounded scene must have on some ray. Fox at 1088 cells loses nothing by
+it; with 0.003 it would have half again as many vertices."""
 CELL_SHARE = 0.008
-"""Share of all cells of contracted space that is stored, before anything is known of a scene."""
+"""Share of the cells of contracted space that is expected to be stored, before a scene is examined."""
 
 Progress = Callable[[int, int], object]
-"""Called with (done, of)."""
+"""Progress callback, called with (steps done, steps in all)."""
 
 
 class Resolutions(NamedTuple):
@@ -65,29 +65,30 @@ class Resolutions(NamedTuple):
 
 
 class StoredCells(NamedTuple):
-    """What is stored."""
+    """The cells to store, and the march step through them."""
 
     visible: np.ndarray
     """[n, n, n] bool: cells of the features' grid, or blocks of them."""
     step: float
     """Length of a march step: model units in a box, dphi of `player.march.contracted` in contracted space."""
     left_out: str | None
-    """What is not stored, in words."""
+    """Description of the cells that are not stored; None without culling."""
 
 
 class FittedCells(NamedTuple):
-    """Cells of which no more are stored than there is room for."""
+    """Cells to store, and resolutions that are low enough for them to fit into the room there is."""
 
     cells: np.ndarray
     """[n, n, n] bool: cells of the features' grid, or blocks of them."""
     resolutions: Resolutions
     n_cells: int
-    """Cells of the features' grid, roughly."""
+    """Rough number of stored cells of the features' grid."""
 
 
 def fit_cells(cells: np.ndarray, resolutions: Resolutions, most: int) -> FittedCells:
-    """The finest grids of which no more than `most` cells of the features lie in `cells`, [n, n, n] bool over
-    the same box: those asked for, or coarser ones.
+    """Choose the finest grids, up to `resolutions`, with at most `most` feature cells inside `cells`.
+
+    `cells` [n, n, n] bool covers the same box; it becomes coarser if the features' grid must be coarser.
 
     >>> fog = np.ones((8, 8, 8), bool)
     >>> fit_cells(fog, Resolutions(20, 16), 5000)[1:]
@@ -107,8 +108,8 @@ def fit_cells(cells: np.ndarray, resolutions: Resolutions, most: int) -> FittedC
 
 
 def _halved(cells: np.ndarray) -> np.ndarray:
-    """Half as many cells along each axis, rounded up, which are those that overlap one of `cells` [n, n, n]
-    bool."""
+    """Halve the resolution of `cells` [n, n, n] bool, rounded up: a coarse cell is marked if it overlaps a
+    marked one."""
     n, half = len(cells), -(-len(cells) // 2)
     first = np.arange(half) * n // half
     last = -(-(np.arange(half) + 1) * n // half)
@@ -123,9 +124,9 @@ def _halved(cells: np.ndarray) -> np.ndarray:
 def find_cells(
     model: Model, config: BakeConfig, resolutions: Resolutions, held_out: HeldOut, progress: Progress
 ) -> StoredCells:
-    """The cells of an object's box, or of contracted space, that matter in some view.
+    """Find the cells of an object's box, or of contracted space, that matter in some view.
 
-    Raises TrainingError when nothing is seen.
+    Raises TrainingError if nothing is seen.
     """
     if model.field.config.unbounded:
         floor = config.weight_floor or WEIGHT_FLOOR
@@ -145,19 +146,19 @@ def find_cells(
 
 @dataclass(frozen=True, eq=False)
 class CulledCells:
-    """The stored cells of a box, and what decided."""
+    """The stored cells of a box, and the figures by which they were chosen."""
 
     visible: np.ndarray
-    """[n, n, n] bool."""
+    """[n, n, n] bool: the stored cells."""
     floor: float = 0.0
-    """The weight that a sample must have; 0 where every cell that may hold matter is stored."""
+    """The weight that a sample must have; 0 if every cell that may hold matter is stored."""
     lost: dict[float, float] = field(default_factory=dict)
-    """Loss in dB of each floor that was tried, on its own."""
+    """Loss in dB by each floor that was tried, taken alone."""
     removed: float = 0.0
-    """Share of the cells that may hold matter which are not stored."""
+    """Number of cells that are not stored, as a share of all cells that may hold matter."""
 
     def report(self) -> str:
-        """What was left out and what that changed, in words."""
+        """Describe in words which cells were left out and what that changed."""
         tried = ", ".join(f"{loss:.3f} dB at {floor:g}" for floor, loss in self.lost.items())
         if not self.floor:
             return f"none: leaving out what weighs little loses too much ({tried or 'nothing weighs enough'})"
@@ -170,12 +171,13 @@ class CulledCells:
 def cull(
     model: Model, resolution: int, held_out: HeldOut, floor: float | None, most_db: float, progress: Progress
 ) -> CulledCells:
-    """The cells of a grid of `resolution` that weigh something in some view, gaps of one cell between them
-    closed, and the cells beside those in which the model may hold matter.
+    """Find the cells of a grid of `resolution` that weigh enough in some view.
 
-    `floor` is the weight that they must have, or None for the highest of FLOORS with which no more than
-    `most_db` is lost of what all cells show. Raises TrainingError when no cell weighs a `floor` that was
-    asked for.
+    Gaps of one cell between them are closed. Cells beside them in which the model may hold matter are added.
+
+    `floor` is the weight that the cells must have; None takes the highest of FLOORS that loses at most
+    `most_db`, compared with storing all cells. Raises TrainingError if a `floor` was given and no cell
+    reaches it.
     """
     held = occupied_cells(model, resolution)
     floors = FLOORS if floor is None else (floor,)
@@ -205,7 +207,7 @@ def _nothing_seen(floor: float) -> TrainingError:
 
 
 def _shown(model: Model, held_out: HeldOut, cells: np.ndarray) -> Shown:
-    """What the model shows where only `cells` [n, n, n] bool hold matter."""
+    """Return what the model shows if only `cells` [n, n, n] bool hold matter."""
     distance = np.empty(cells.shape, np.uint8)
     chebyshev_distance(cells, distance)
     features = np.zeros((len(held_out.rays_o), model.field.config.n_channels), np.float32)
@@ -220,17 +222,17 @@ def _shown(model: Model, held_out: HeldOut, cells: np.ndarray) -> Shown:
 def marked_cells(
     model: Model, resolution: int, weight_floors: tuple[float, ...], progress: Progress
 ) -> np.ndarray:
-    """[resolution, resolution, resolution, n_floors] uint8, 1 for cells in which a sample of some view's ray
-    weighs at least each floor. Views are the training cameras and as many between them.
+    """Return [resolution, resolution, resolution, n_floors] uint8: 1 for each cell and floor for which a
+    sample in the cell, on a ray of some view, weighs at least the floor.
 
-    Rays leave each camera as densely as it takes for every surface cell to be met HITS times over
-    all views, whatever the pictures' size.
+    Views are the training cameras and as many between them. Whatever the size of the pictures, rays are as
+    dense as it takes for every surface cell to be met about HITS times over all views.
     """
     marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
     cameras = model.model_cameras()
     cameras += views_between(model, len(cameras), seed=0)
     density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
-    # No cell between two samples may be missed: other rays than these will be played.
+    # A step no longer than a cell: samples must not skip cells, because other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
         size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
@@ -244,7 +246,8 @@ def marked_cells(
 
 
 def occupied_cells(model: Model, resolution: int) -> np.ndarray:
-    """[resolution]^3 bool: cells in some part of which the training's occupancy grid allows matter."""
+    """Return [resolution]^3 bool: the cells that overlap an occupied cell of the training's occupancy
+    grid."""
     cells = model.occupancy.occupied
     n = len(cells)
     first = np.arange(resolution) * n // resolution
@@ -256,26 +259,26 @@ def occupied_cells(model: Model, resolution: int) -> np.ndarray:
 
 
 def pixel_footprints(model: Model) -> np.ndarray:
-    """[n_views] size of each training camera's pixels at the middle of the box, model units."""
+    """Return [n_views]: the size of each training camera's pixels at the middle of the box, model units."""
     cameras = model.model_cameras()
     return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), 1e-6) / c.fx for c in cameras])
 
 
 def rays_of_views(model: Model, resolution: int) -> float:
-    """Rays that `marked_cells` sends out."""
+    """Return the expected number of rays that `marked_cells` marches."""
     density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
     return 2 * density**2 * sum(camera.width * camera.height for camera in model.cameras)
 
 
 def _ray_density(footprints: np.ndarray, cell: float) -> float:
-    """Rays per pixel along each axis that let HITS rays meet each surface cell at the middle of the box."""
+    """Return the rays per pixel, along each image axis, with which HITS rays meet each surface cell at the
+    middle of the box; 0.25 to 4."""
     hits = VIEWS_OF_A_CELL * float(np.sum((cell / footprints) ** 2))
     return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
 
 
 def close_gaps(cells: np.ndarray) -> np.ndarray:
-    """Morphological closing of [n, n, n] bool with a cube of 3 cells: holes and cracks of one cell are
-    filled.
+    """Fill holes and cracks of one cell in [n, n, n] bool, by morphological closing with a cube of 3 cells.
 
     >>> row = np.zeros((5, 5, 5), bool)
     >>> row[1:4, 1:4, 1:4] = True
@@ -288,15 +291,15 @@ def close_gaps(cells: np.ndarray) -> np.ndarray:
         padded = _any_of_three(padded, axis)
     for axis in range(3):
         padded = ~_any_of_three(~padded, axis)
-    # Outside the box nothing is known to be empty or full: what was marked stays.
+    # Outside the box, cells are neither known to be empty nor full: keep all cells that were marked.
     return padded[1:-1, 1:-1, 1:-1] | cells
 
 
 def beside(cells: np.ndarray) -> np.ndarray:
-    """[n, n, n] bool: cells that share a face with one of `cells` [n, n, n] bool, and those themselves.
+    """Return [n, n, n] bool: the marked `cells` [n, n, n] bool, and those that share a face with one.
 
-    Refinement needs them: it moves a surface by densities within a cell of it, and where there is none the
-    surface has a hole.
+    Refinement needs the added cells. It moves a surface by changing densities up to a cell away from it;
+    where no density is stored there, the surface would have a hole.
 
     >>> one = np.zeros((5, 5, 5), bool)
     >>> one[2, 2, 2] = True
@@ -307,7 +310,7 @@ def beside(cells: np.ndarray) -> np.ndarray:
 
 
 def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
-    """[n, n, n] bool: whether a cell or either of its neighbours along an axis is marked."""
+    """Return [n, n, n] bool: True if a cell or either of its neighbours along `axis` is marked."""
     out = cells.copy()
     found, given = np.moveaxis(out, axis, 0), np.moveaxis(cells, axis, 0)
     found[:-1] |= given[1:]
@@ -316,7 +319,7 @@ def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
 
 
 def corners_of(cells: np.ndarray) -> np.ndarray:
-    """[n + 1, n + 1, n + 1] bool: the corners of the marked cells [n, n, n] bool.
+    """Return [n + 1, n + 1, n + 1] bool: the corners of the marked cells [n, n, n] bool.
 
     >>> int(corners_of(np.ones((1, 1, 1), bool)).sum())
     8
@@ -329,8 +332,8 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
 
 
 def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) -> np.ndarray:
-    """[n_planes, resolution, resolution] bool: cells of a grid of `resolution` over the same box whose middle
-    is in one of `cells` [n, n, n] bool, in some of its planes along x.
+    """Resample `cells` [n, n, n] bool to a grid of `resolution` over the same box: a cell is marked if its
+    centre is in a marked cell. Returns [n_planes, resolution, resolution] bool, the `planes` along x.
 
     >>> subdivided(np.array([True, False]).reshape(2, 1, 1).repeat(2, 1).repeat(2, 2), 5)[:, 0, 0].tolist()
     [True, True, False, False, False]
@@ -340,7 +343,7 @@ def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) 
 
 
 def lattice_step(resolution: int) -> float:
-    """The step dphi of `player.march.contracted` for densities on a grid of `resolution` cells per axis.
+    """Return the step dphi of `player.march.contracted` for a density grid of `resolution` cells per axis.
 
     >>> round(lattice_step(512), 5)
     0.00699
@@ -349,14 +352,14 @@ def lattice_step(resolution: int) -> float:
 
 
 def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: Progress) -> np.ndarray:
-    """[resolution / BLOCK]^3 bool: blocks of cells of contracted space in which some ray of a view has at
-    least the weight `weight_floor`, and the gaps of one block between them. Views are the training cameras
-    and BETWEEN times as many between them.
+    """Return [resolution / BLOCK]^3 bool: the blocks of cells of contracted space in which some ray of a view
+    has at least the weight `weight_floor`, with gaps of one block between them closed.
 
-    `resolution` is a multiple of BLOCK. Rays are as many as let a block at the unit sphere be met
-    CONTRACTED_HITS times over all views, but no more than MOST_SEEING. Pictures are taken a little wider than
-    they are: another camera of the scene sees beyond their border, where the model goes on. Raises
-    TrainingError when nothing is seen.
+    Views are the training cameras and BETWEEN times as many between them. `resolution` is a multiple of
+    BLOCK. There are as many rays as it takes for a block at the unit sphere to be met CONTRACTED_HITS times
+    over all views, but at most MOST_SEEING. Pictures are widened a little, because another camera of the
+    scene will see beyond their border, where the model has content, too. Raises TrainingError if nothing is
+    seen.
     """
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
@@ -378,7 +381,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
 
 
 def rays_of_contracted_views(model: Model, resolution: int) -> float:
-    """Rays that `weighty_cells` sends out."""
+    """Return the expected number of rays that `weighty_cells` samples."""
     return _share_of_pixels(model, resolution) * _pixels_of_contracted_views(model)
 
 

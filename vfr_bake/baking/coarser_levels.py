@@ -1,5 +1,5 @@
-"""Coarser levels beneath a grid of one level: nothing is read from them while that is there, but they are
-what its first part shows, and what its values are predicted from."""
+"""Add coarser levels beneath a grid of one level. Once the whole asset is loaded, nothing is read from them.
+They are what the asset's first part shows, and what the values of the finest level are predicted from."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from player.asset.pyramid import (
 from player.asset.sections import Grid
 
 COARSEST = 16
-"""Cells along each axis that the coarsest level has at most, if there are levels enough."""
+"""Most cells along each axis of the coarsest level, unless MAX_LEVELS are too few to get there."""
 
 
 def pyramid_beneath(finest: Pyramid) -> Pyramid:
-    """The pyramid of a grid of one level, `finest`, and coarser ones.
+    """Return the pyramid of a grid of one level, `finest`, with coarser levels added.
 
     >>> one = Bricks(np.zeros((1, 3), np.uint16), np.ones((1, 8), np.uint64))
     >>> [len(level) for level in pyramid_beneath(Pyramid(64, (one,))).levels]
@@ -39,11 +39,11 @@ def pyramid_beneath(finest: Pyramid) -> Pyramid:
 
 
 def values_beneath(pyramid: Pyramid, finest: np.ndarray, grid: Grid, step: int = 1) -> PyramidValues:
-    """A pyramid with the values `finest` [n_vertices, n_channels] on its finest level, which has all that is
-    shown, as close to them as a `step` of the symbols allows.
+    """Fill a pyramid that is shown by its finest level alone with the values `finest` [n_vertices,
+    n_channels] of that level, as exactly as the quantization step `step` of the symbols allows.
 
-    A coarser vertex has the value of the finer one at its place; where none is stored there, the mean of
-    those around it.
+    A coarser vertex gets the value of the finer vertex at the same place; if none is stored there, the mean
+    of the finer vertices around it.
     """
     low, high = LIMITS[grid]
     values = [np.clip(finest, low, high)]
@@ -58,14 +58,14 @@ def values_beneath(pyramid: Pyramid, finest: np.ndarray, grid: Grid, step: int =
 
 
 def with_coarser_levels(stored: PyramidValues, grid: Grid) -> PyramidValues:
-    """What is stored, with coarser levels if it has only one."""
+    """Return `stored`, with coarser levels added if it has only one level."""
     finest, *coarser = stored.values
     return stored if coarser else values_beneath(pyramid_beneath(stored.pyramid), finest, grid)
 
 
 def _sampled(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray:
-    """The values [n_coarse, n_channels] of the next coarser level: those of the finer vertices at the same
-    places; where none is there, the mean of those around."""
+    """Return the values [n_coarse, n_channels] of the next coarser level: those of the finer vertices at the
+    same places; if none is stored there, the mean of the finer vertices around, rounded."""
     places = coarse.index * 2
     rows = fine.rows(places)
     out = values[rows]
@@ -76,5 +76,5 @@ def _sampled(fine: Vertices, coarse: Vertices, values: np.ndarray) -> np.ndarray
         there = beside >= 0
         total[there] += values[beside[there]]
         n[there] += 1
-    out[alone] = np.rint(total / n)  # a cell with this corner is live, and a finer one in it
+    out[alone] = np.rint(total / n)  # n > 0: a live cell has this corner, and has a live finer cell in it
     return out

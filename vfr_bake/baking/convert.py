@@ -1,5 +1,5 @@
-"""An asset rewritten in the current version of the format, without the model: the same values, in fewer
-bytes, with coarser levels beneath so that its first part is a picture."""
+"""Convert an asset to the current version of the format, without the model. The values stay the same, take
+fewer bytes, and get coarser levels beneath, so that the asset's first part already shows a picture."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from player.files.files import check_target
 from vfr_bake.baking.coarser_levels import with_coarser_levels
 
 STEPS = 6
-"""Steps that `progress` is told of."""
+"""Number of steps that are reported to `progress`."""
 
 Progress = Callable[[int, int], object]
+"""Progress callback, called with (steps done, steps in all)."""
 
 
 @dataclass(frozen=True)
 class Converted:
-    """What came of it."""
+    """The result of a conversion."""
 
     asset: Asset
     """The asset that was read."""
     n_bytes: int
-    """Bytes of all files of the new one."""
+    """Bytes of all files of the new asset."""
     seconds: float
 
 
@@ -34,18 +35,18 @@ def convert(
 ) -> Converted:
     """Write the asset in `old`, of version 3 or 4, to the folder `new` as version 4.
 
-    Head, mesh, cameras, reports and settings stay what they are, and so does every value of the finest level.
+    Head, mesh, cameras, reports and settings stay unchanged, and so does every value of the finest level.
 
     Args:
-        old: the folder of an asset; every file of it has to be whole.
+        old: the folder of an asset; every file in it has to be complete.
         new: the folder to write.
-        max_memory: gigabytes that the asset may take; half of the machine's if None.
+        max_memory: gigabytes that the asset may take in memory; None allows half of the machine's memory.
         force: replace `new` if it exists.
-        progress: called with the steps that are done and their number.
+        progress: called with (steps done, steps in all).
 
     Raises:
-        FormatError, IntegrityError: not an asset, or a file that is broken.
-        ConfigError: more memory than is allowed.
+        FormatError, IntegrityError: `old` is not an asset, or one of its files is broken.
+        ConfigError: the asset takes more memory than is allowed.
         OutputError: `new` exists, or cannot be written.
     """
     begin = time.perf_counter()

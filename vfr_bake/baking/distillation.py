@@ -1,13 +1,13 @@
-"""Training data of the refinement: what the full model and photographs show on rays, and what the player
-composes there, taken apart so that it can be trained.
+"""Training data of the refinement (distillation): the colours that the full model and photographs show on
+rays, and the player's compositing on these rays, in a form in which the stored values can be trained.
 
-Where the player fetches features, and how much each fetch weighs, depends on the densities alone: with the
-densities fixed the composite of a ray is a fixed linear map of the stored feature codes,
-x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. The fetches of training rays hold that map, by
-the player's own choice of samples. Where the densities are trained too, at every sample, they also hold where
-their codes are.
+Where the player fetches features, and how much each fetch weighs, depends on the densities alone. With fixed
+densities, the composite of a ray is thus a fixed linear map of the stored feature codes,
+x = sum_j weights[j] sum_c shares[j, c] codes[rows[j, c]]. `Fetches` holds this map for training rays, at the
+places where the player itself fetches. If the densities are trained too, which needs every sample, `Fetches`
+also holds the places of the density codes.
 
-With the field's own features in place of the stored codes, the same map tells what the grid loses by itself.
+With the field's own features in place of the stored codes, the same map gives the loss by the grid alone.
 """
 
 from __future__ import annotations
@@ -32,57 +32,60 @@ from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.model_file import Model
 
 RAYS_AT_ONCE = 1 << 12
-"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
+"""Kept small: a ray through fog has hundreds of samples, and each takes 100 to 200 bytes while they are
+processed."""
 FIELD_RAYS_AT_ONCE = 1 << 13
-"""Rays on which the field is evaluated at once."""
+"""Rays on which the field is evaluated at a time."""
 MOST_KEPT = 20_000_000
-"""Samples of training rays that are kept at most: 320 MB. Memory is taken for those alone that there are."""
+"""Most samples of training rays that are kept in memory: 320 MB. Memory pages are only taken for the samples
+that there are."""
 N_TYPICAL = 4096
-"""Training rays that tell the typical size of composites."""
+"""Training rays from which the typical size of composites is computed."""
 
 
 class Corners(NamedTuple):
-    """The stored vertices around n places, each with its share in what is interpolated there."""
+    """The stored vertices around n points, with their shares in the trilinear interpolation."""
 
     rows: np.ndarray
     """[n, 8] int32 rows of the stored vertices."""
     shares: np.ndarray
-    """[n, 8] float32."""
+    """[n, 8] float32 shares of these vertices."""
 
 
 class Fetches(NamedTuple):
-    """What n rays fetch, as `vfr_bake.kernels.stored_features` takes it."""
+    """The fetches of n rays, in the form that `vfr_bake.kernels.stored_features` takes."""
 
     starts: np.ndarray
     """[n + 1] int64: ray i has the fetches starts[i] to starts[i + 1]."""
     features: Corners
-    """The stored features around each fetch; shares are 1 in all, or 0 where too little is stored."""
+    """The stored features around each fetch. Its shares add up to 1, or are all 0 if too little is stored."""
     densities: Corners
-    """The stored densities around each fetch; shares are 0 where none is stored. Empty, [0, 8], where
+    """The stored densities around each fetch. The shares of missing vertices are 0. Empty, [0, 8], if
     densities are not trained."""
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
-    were merged into."""
+    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
+    samples were merged into the fetch."""
     opacity: np.ndarray
     """[n] float32 opacity of the baked grid."""
 
     def compose(self, features: np.ndarray) -> np.ndarray:
-        """[n, n_channels] float32 composites of latent features [n_vertices, n_channels] int16, rounded to
-        codes."""
+        """Return the composites [n, n_channels] float32 of latent `features` [n_vertices, n_channels] int16,
+        rounded to codes."""
         out = np.empty((len(self.opacity), features.shape[1]), np.float32)
         compose(self.starts, *self.features, self.weights, features, out)
         return out
 
     def interpolate(self, features: np.ndarray) -> np.ndarray:
-        """[n_fetches, `padded(n_channels)`] float32: latent features at each fetch, rounded to codes."""
+        """Return [n_fetches, `padded(n_channels)`] float32: the latent `features`, rounded to codes and
+        interpolated at each fetch."""
         out = np.empty((len(self.weights), padded(features.shape[1])), np.float32)
         interpolate(*self.features, self.weights, features, out)
         return out
 
     def composite(self, values: np.ndarray, n_channels: int) -> np.ndarray:
-        """[n, n_channels] float32 composites of what `interpolate` gives."""
+        """Return the composites [n, n_channels] float32 of interpolated `values` from `interpolate`."""
         out = np.empty((len(self.opacity), n_channels), np.float32)
         composite(self.starts, self.weights, values, out)
         return out
@@ -90,8 +93,7 @@ class Fetches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TeacherRays:
-    """n rays and what is to be shown on them: what the full model shows there, alone or in the mean with a
-    photograph."""
+    """n rays and their target colours: those of the full model, or the mean of these and a photograph's."""
 
     rays_o: np.ndarray
     """[n, 3] float32, model frame."""
@@ -103,53 +105,56 @@ class TeacherRays:
     """[n] float32 opacity."""
 
     def some(self, n: int) -> TeacherRays:
-        """n of the rays, spread evenly; all where there are no more."""
+        """Return n of the rays, spread evenly; all of them if there are no more."""
         n_all = len(self.opacity)
         if n >= n_all:
             return self
         return self.chosen(np.arange(n) * n_all // n)
 
     def chosen(self, rays: np.ndarray | slice) -> TeacherRays:
-        """The rays with these numbers."""
+        """Return the rays with these numbers."""
         return TeacherRays(*(column[rays] for column in vars(self).values()))
 
     def and_those(self, others: TeacherRays) -> TeacherRays:
-        """These rays and the `others` behind them."""
+        """Return these rays, followed by the `others`."""
         both = zip(vars(self).values(), vars(others).values(), strict=True)
         return TeacherRays(*(np.concatenate(columns) for columns in both))
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingRays:
-    """n of the teacher's rays, and the baked grid, in which all of them meet something. What a ray fetches is
-    found whenever a batch needs it, for the samples of all rays would take more memory than the grid where
-    there is fog. Where there is none they are kept, which saves a quarter of a step's time."""
+    """n of the teacher's rays, all of which meet something in the baked grid.
+
+    The fetches of a ray are computed whenever a batch needs them: in fog, the samples of all rays would take
+    more memory than the grid. Samples can be kept where they are few, which saves a quarter of a step's time.
+    """
 
     teacher: TeacherRays
     grid: SparseGrid
-    """As the player has it."""
+    """The baked grid, as the player has it."""
     n_fetches: int
-    """The player's k, 0 for every sample."""
+    """Feature lookups of a ray (the player's k), 0 for every sample."""
     densities: VertexRows | None
-    """Rows of the stored densities where they are trained too."""
+    """Rows of the stored densities; None if densities are not trained."""
     samples: KeptSamples | None = None
-    """Where all rays have samples, if that is kept."""
+    """Kept samples of all rays; None if they are not kept."""
 
     def __len__(self) -> int:
         return len(self.teacher.opacity)
 
     def some(self, n: int) -> TrainingRays:
-        """n of the rays, spread evenly; all where there are no more."""
+        """Return n of the rays, spread evenly; all of them if there are no more."""
         return replace(self, teacher=self.teacher.some(n))
 
     def with_samples(self) -> TrainingRays:
-        """The rays with all their samples kept, for whoever needs them many times and weighs them himself.
-        Without where they are too many, and in contracted space, where the grid takes the memory."""
+        """Return the rays with all their samples kept, for callers that use them many times and compute the
+        weights themselves. Samples are not kept if they are too many, nor in contracted space, where the grid
+        takes the memory."""
         return self if self.grid.contracted else replace(self, samples=_all_samples(self))
 
     def fetches(self, some: np.ndarray) -> Fetches:
-        """The fetches of the rays whose numbers are in `some`, in that order. With kept `samples` the weights
-        and the opacity are left for `weigh` to fill in."""
+        """Return the fetches of the rays whose numbers are in `some`, in that order. With kept `samples`,
+        weights and opacity are left uninitialised, for `weigh` to fill in."""
         if self.samples is not None:
             starts, points, lengths = self.samples.of(some)
             weights, opacity = np.empty_like(lengths), np.empty(len(some), np.float32)
@@ -169,15 +174,17 @@ class TrainingRays:
         lengths: np.ndarray,
         opacity: np.ndarray,
     ) -> Fetches:
-        """The fetches at `points` [n_fetches, 3], cells of the densities' grid."""
+        """Return the fetches at `points` [n_fetches, 3], given in cells of the densities' grid."""
         of_features = corners(self.grid.rows, points * self.grid.feature_scale, MIN_TOTAL)
         none = Corners(np.zeros((0, 8), np.int32), np.zeros((0, 8), np.float32))
         of_densities = none if self.densities is None else corners(self.densities, points, np.float32(0))
         return Fetches(starts, of_features, of_densities, weights, lengths, opacity)
 
     def composed(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """([n, n_channels] float32 composites of `codes` [n_vertices, n_channels] float32, rounded; [n]
-        float32 opacity of the baked grid)."""
+        """Composite latent features `codes` [n_vertices, n_channels] int16, rounded to codes.
+
+        Returns the composites [n, n_channels] float32 and the opacity [n] float32 of the baked grid.
+        """
         out, opacity = np.empty((len(self), codes.shape[1]), np.float32), np.empty(len(self), np.float32)
         for first in range(0, len(self), RAYS_AT_ONCE):
             some = np.arange(first, min(first + RAYS_AT_ONCE, len(self)))
@@ -186,23 +193,24 @@ class TrainingRays:
         return out, opacity
 
     def typical(self, codes: np.ndarray) -> np.ndarray:
-        """[n_channels] mean size of the composites of `codes` over some of the rays; never 0."""
+        """Return [n_channels]: the mean magnitude of the composites of `codes` over some of the rays; never
+        0."""
         composites, _ = self.some(N_TYPICAL).composed(codes)
         return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
 
 
 class KeptSamples(NamedTuple):
-    """Where n rays have samples, at every one of which the player fetches."""
+    """The places of all samples of n rays, for fetches at every sample."""
 
     starts: np.ndarray
     """[n + 1] int64: ray i has the samples starts[i] to starts[i + 1]."""
     points: np.ndarray
-    """[n_samples, 3] float32 places, cells of the densities' grid."""
+    """[n_samples, 3] float32 places, in cells of the densities' grid."""
     lengths: np.ndarray
-    """[n_samples] float32 length of the ray that a sample stands for, model units."""
+    """[n_samples] float32 length of the piece of ray that a sample stands for, model units."""
 
     def of(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(starts, points, lengths) of the rays whose numbers are in `some`, in that order."""
+        """Return (starts, points, lengths) of the rays whose numbers are in `some`, in that order."""
         starts = np.concatenate([[0], np.cumsum(self.starts[some + 1] - self.starts[some])])
         points, lengths = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
         take_runs(some, self.starts, self.points, self.lengths, starts, points, lengths)
@@ -210,7 +218,7 @@ class KeptSamples(NamedTuple):
 
 
 def _all_samples(rays: TrainingRays) -> KeptSamples | None:
-    """All samples of `rays`; None where they are more than MOST_KEPT."""
+    """Return all samples of `rays`; None if there are more than MOST_KEPT."""
     n_rays, n = len(rays), 0
     counts = np.zeros(n_rays, np.int64)
     points, lengths = np.empty((MOST_KEPT, 3), np.float32), np.empty(MOST_KEPT, np.float32)
@@ -227,12 +235,12 @@ def _all_samples(rays: TrainingRays) -> KeptSamples | None:
 
 
 def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRays:
-    """At most `most` of the rays through the model's training pixels, spread evenly, and the mean of what the
-    photographs and the full model show there.
+    """Return at most `most` of the rays through the model's training pixels, spread evenly, with the mean of
+    the colours of the photographs and of the full model as targets.
 
-    A photograph has what the model has not learned, and what no other photograph shows: noise, or a camera
-    that is a little wrong. The model's errors are others, so that the mean of both is nearer to what other
-    views show than either (docs/notes/2026-11-26-photographs-in-refinement.md).
+    A photograph contains detail that the model has not learned, but also errors that no other photograph has:
+    noise, or a camera that is a little wrong. The model has different errors, so the mean of both is nearer
+    to what other views show than either alone (docs/notes/2026-11-26-photographs-in-refinement.md).
     """
     rays_o, rays_d, rgba = model.training_pixel_rays()
     shown = rgba.astype(np.float32) / 255
@@ -250,8 +258,8 @@ def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRay
 def render_teacher(
     model: Model, cameras: list[Camera], n_rays: int, seed: int, progress: Progress
 ) -> TeacherRays:
-    """The full model on about `n_rays` random pixels of `cameras` (model frame); those at which it has
-    nothing to show are left out."""
+    """Render the full model at about `n_rays` random pixels of `cameras` (model frame). Pixels at which it
+    shows nothing are left out."""
     random = np.random.default_rng(seed)
     parts = []
     for done, camera in enumerate(cameras):
@@ -266,7 +274,7 @@ def render_teacher(
 
 
 def _shown(model: Model, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The full model's colours times opacity [n, 3] and opacity [n] float32 on rays [n, 3]."""
+    """Return the full model's colours times opacity [n, 3] and opacity [n], float32, on rays [n, 3]."""
     features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
     colours, met = np.zeros((len(opacity), 3), np.float32), np.flatnonzero(opacity > 0)
     colours[met] = head_colours(model.field, features[met], rays_d[met]) * opacity[met, None]
@@ -276,15 +284,15 @@ def _shown(model: Model, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.nda
 def collect_training_rays(
     teacher: TeacherRays, grid: SparseGrid, n_fetches: int, densities: VertexRows | None = None
 ) -> TrainingRays:
-    """Those of the teacher's rays that meet something in the grid.
+    """Select those of the teacher's rays that meet something in the grid.
 
     Args:
-        teacher: rays and what the full model shows on them.
-        grid: as the player has it.
-        n_fetches: the player's k, 0 for every sample.
-        densities: rows of the stored densities, where they are trained too; needs every sample.
+        teacher: rays and their target colours.
+        grid: the baked grid, as the player has it.
+        n_fetches: feature lookups of a ray (the player's k), 0 for every sample.
+        densities: rows of the stored densities, if they are trained too; this needs `n_fetches` = 0.
 
-    Raises TrainingError where no ray meets anything.
+    Raises TrainingError if no ray meets anything.
     """
     meets = np.zeros(len(teacher.opacity), bool)
     for first in range(0, len(meets), RAYS_AT_ONCE):
@@ -297,26 +305,26 @@ def collect_training_rays(
 
 
 class PlayerFetches(NamedTuple):
-    """What the player fetches on the rays that hit."""
+    """The player's fetches on those rays that hit something."""
 
     hits: np.ndarray
-    """[n_hits] numbers of the rays that hit."""
+    """[n_hits] numbers of the rays that hit something."""
     opacity: np.ndarray
-    """[n_hits] float32."""
+    """[n_hits] float32 opacity of these rays."""
     counts: np.ndarray
     """[n_hits] number of fetches of each ray."""
     points: np.ndarray
-    """[n_fetches, 3] float32 places, cells of the densities' grid."""
+    """[n_fetches, 3] float32 places, in cells of the densities' grid."""
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the ray that a sample stands for, model units; 0 for what several samples
-    were merged into."""
+    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
+    samples were merged into the fetch."""
 
 
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
-    """Where the player fetches features on the rays [n, 3], and how much each fetch weighs, as
-    `player.march.march` composes them with k = `n_fetches`."""
+    """Find the places where the player fetches features on the rays [n, 3], and the fetches' weights, as
+    `player.march.march` has them with k = `n_fetches`."""
     samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
     opacity = -np.expm1(-tau)
     hits = np.flatnonzero(opacity > MIN_OPACITY)
@@ -343,8 +351,11 @@ def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_f
 
 
 def corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> Corners:
-    """The corners around `points` [n, 3] float32, in cells of the vertices' own grid. Shares are 0 where
-    those of the stored vertices are less than `least` in all."""
+    """Find the stored corners around `points` [n, 3] float32, in cells of the vertices' own grid.
+
+    With a `least` above 0, the shares of the stored corners are scaled to add up to 1; they are all set to 0
+    if their sum is below `least`.
+    """
     n = len(points)
     rows, shares = np.empty((n, 8), np.int32), np.empty((n, 8), np.float32)
     corner_rows(
@@ -361,9 +372,13 @@ def with_field_features(
     rays_d: np.ndarray,
     played: MarchResult,
 ) -> MarchResult:
-    """`played`, the march of the rays [n, 3] through `grid` at every sample, with all features of the field
-    as if the vertices stored them unrounded. They are evaluated where the rays meet them, because those of a
-    large grid would take gigabytes."""
+    """Return `played` with its features replaced by composites of the field's own features, as if the
+    vertices stored all channels unrounded.
+
+    `played` is the march of the rays [n, 3] through `grid` with a fetch at every sample. The field is
+    evaluated only at the vertices that each batch of rays meets, because the features of all vertices of a
+    large grid would take gigabytes.
+    """
     features = np.zeros((len(played.hits), model.field.config.n_channels), np.float32)
     numbers = np.empty(len(layout.features), np.int32)
     for first in range(0, len(features), FIELD_RAYS_AT_ONCE):
@@ -376,8 +391,8 @@ def with_field_features(
 def _field_features(
     model: Model, layout: Layout, grid: SparseGrid, fetches: PlayerFetches, numbers: np.ndarray
 ) -> np.ndarray:
-    """[n_hits, n_channels] composites of the field's features at the stored vertices. `numbers` [n_features]
-    int32 is worked in."""
+    """Return the composites [n_hits, n_channels] of the field's features at the stored vertices. `numbers`
+    [n_features] int32 is scratch memory."""
     rows, shares = corners(grid.rows, fetches.points * grid.feature_scale, MIN_TOTAL)
     numbers[:] = 0
     numbers[rows] = 1

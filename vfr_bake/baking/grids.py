@@ -1,15 +1,15 @@
-"""From cells to the arrays of an asset and back to a grid that can be marched.
+"""Make the arrays of an asset from its cells, and from the arrays a grid that can be marched.
 
-Densities and features are stored at the vertices of two grids over the same box. What a picture loses first
-is where a surface is: densities take the finer one, a byte a vertex; features, whose vertices take a byte a
-channel, the coarser one.
+Densities and features are stored at the vertices of two grids over the same box. Pictures suffer first from
+surfaces that are in the wrong place. So densities, which take one byte a vertex, are on the finer grid, and
+features, which take one byte a channel, on the coarser one.
 
-Fewer feature channels are stored than the field has, at the least loss for the colours. Compositing is
-linear, so a linear map of the features can be applied per vertex before it and undone after it:
-W1 sum w_i F_i ~ (W1 Q) sum w_i (P F_i). With the second moment G = E[x x^T] of the rendered features
-x = sum w_i F_i and the mean square M = E[J^T J] of the colours' derivatives J = A d rgb / dx, the colours'
-error E |J (x - Q P x)|^2 is least, J and x taken as independent, for P = U^T S and Q = S^-1 U, where
-S = M^(1/2) and U holds the first r eigenvectors of S G S (Eckart-Young).
+Fewer feature channels are stored than the field has, chosen for the least error of the colours. Compositing
+is linear, so a linear map of the features can be applied at each vertex before it and undone after it:
+W1 sum w_i F_i ~ (W1 Q) sum w_i (P F_i). Let G = E[x x^T] be the second moment of the rendered features
+x = sum w_i F_i, and M = E[J^T J] the mean square of the colours' derivatives J = A d rgb / dx. If J and x are
+independent, the colours' error E |J (x - Q P x)|^2 is least for P = U^T S and Q = S^-1 U, where S = M^(1/2)
+and U holds the first r eigenvectors of S G S (Eckart-Young).
 """
 
 from __future__ import annotations
@@ -36,30 +36,33 @@ from vfr_bake.kernels.stored_features import table
 from vfr_bake.training.model_file import Model
 
 SLAB = 64
-"""Planes of vertices that are found together."""
+"""Planes of vertices that are found at a time."""
 VERTEX_CHUNK = 1 << 18
-"""Vertices evaluated at once: 32 MB of features."""
+"""Vertices that are evaluated at a time: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
-"""Optical depths of one march step at codes 0 and 255: from invisible to opaque, in steps of 5.9 %."""
+"""Optical depths of one march step at density codes 0 and 255: from invisible to opaque, in steps of
+5.9 %."""
 FAR = 30.0
-"""Distance in model units, in contracted space: there a step is as long as dphi at the middle and as dphi
-times the square of the distance far away. The smallest density code is invisible even at this distance."""
+"""Distance in contracted space, model units, at which the smallest density code is still invisible. March
+steps become longer with the distance: dphi at the middle, dphi times the square of the distance far away."""
 ROWS_AT_ONCE = 1 << 18
-"""Vertices whose codes are rounded at once."""
+"""Vertices whose codes are rounded at a time."""
 FAR_OUT, N_RANKED = 1e-4, 250_000
-"""Share of the vertices whose features may have larger codes than was asked for, and vertices that decide it.
-The largest of ten million of a room was 2.5 times as large as all but a ten thousandth."""
+"""Share of the vertices whose features may exceed the largest code asked for, and number of vertices from
+which the code step is computed. In a room, the largest of ten million feature vectors was 2.5 times as large
+as the quantile that leaves out this share."""
 LEAST_SENSITIVITY = 1e-6
-"""Every eigenvalue of M is at least this share of their mean, so that S has an inverse."""
+"""Least eigenvalue of M, as a share of their mean: smaller ones are raised to it, so that S has an
+inverse."""
 
 
 Parts = Iterable[tuple[slice, np.ndarray]]
-"""Rows of a table, and what they hold [n, n_columns], part after part."""
+"""A table part by part: pairs of a slice of rows and the values [n, n_columns] in them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """The stored vertices of a grid, in the order of the rows on disk."""
+    """The stored vertices of a grid, in the order of their rows on disk."""
 
     coords: np.ndarray
     masks: np.ndarray
@@ -74,19 +77,19 @@ class Vertices:
 
     @cached_property
     def pyramid(self) -> Pyramid:
-        """The cells of which these are the corners, on one level."""
+        """The pyramid of one level whose live cells have these vertices as corners."""
         return self.values(np.zeros((len(self), 1), np.uint8)).pyramid
 
     def rows(self) -> VertexRows:
         return vertex_rows(self.pyramid)
 
     def values(self, codes: np.ndarray) -> PyramidValues:
-        """The pyramid of one level with the codes [n] or [n, n_channels] of these vertices."""
+        """Return the pyramid of one level with these vertices and their `codes` [n] or [n, n_channels]."""
         return from_vertices(VertexBricks(self.coords, self.masks, codes), self.resolution)
 
 
 class Pyramids(NamedTuple):
-    """The cells of an asset on all levels."""
+    """The cells of an asset's two grids on all levels."""
 
     densities: Pyramid
     features: Pyramid
@@ -94,55 +97,56 @@ class Pyramids(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which vertices are stored, and how their densities are coded."""
+    """The stored vertices, and the coding of their densities."""
 
     densities: Vertices
     features: Vertices
     step: float
     """Length of a march step, as in `StoredCells`."""
     density_range: tuple[float, float]
-    """Logarithms of the densities of codes 0 and 255."""
+    """Logarithms of the densities that the codes 0 and 255 stand for."""
     contracted: bool = False
     near: float = 0.0
     """Distance at which rays begin in contracted space, model units."""
     density_step: int = 1
-    """Density codes from one that is stored to the next."""
+    """Quantization step of the density codes, in codes."""
 
     @property
     def aabb(self) -> tuple[tuple[float, ...], ...]:
-        """The grids' box: that of an object, or of contracted space."""
+        """The box of both grids: the box of an object, or of contracted space."""
         edge = 2.0 if self.contracted else 1.0
         return (-edge,) * 3, (edge,) * 3
 
     @cached_property
     def pyramids(self) -> Pyramids:
-        """Densities and features with coarser levels; the same where they lie at the same vertices."""
+        """The pyramids of densities and features, with coarser levels. They are the same object if both have
+        the same vertices."""
         densities = pyramid_beneath(self.densities.pyramid)
         same = self.features is self.densities
         return Pyramids(densities, densities if same else pyramid_beneath(self.features.pyramid))
 
     def forget(self) -> None:
-        """Give up what was found of the vertices, some hundred megabytes; it is found again if asked for."""
+        """Free the cached pyramids, some hundred megabytes. They are computed again if they are needed."""
         vars(self).pop("pyramids", None)
         for vertices in (self.densities, self.features):
             vars(vertices).pop("pyramid", None)
 
     def _densities(self, codes: np.ndarray) -> PyramidValues:
-        """The pyramid of density codes [n] that need not be whole."""
+        """Return the pyramid of densities with the `codes` [n], which need not be whole, quantized."""
         whole = np.clip(np.rint(codes), 0, 255).astype(np.uint8)[:, None]
         return values_beneath(self.pyramids.densities, whole, "densities", self.density_step)
 
     def finest(self, density: np.ndarray, features: np.ndarray) -> GridArrays:
-        """The asset's finest level, from density codes [n] that need not be whole, and latent features
-        [n_features, n_channels] int16."""
+        """Return the asset's finest level, from density codes `density` [n], which need not be whole, and
+        latent `features` [n_features, n_channels] int16."""
         return GridArrays(_finest(self._densities(density)), self.features.values(whole_codes(features)))
 
     def grid(self, density: np.ndarray, features: np.ndarray) -> SparseGrid:
-        """The grid that a player makes of `finest`."""
+        """Return the grid that a player makes of `finest`."""
         return self.played(self.finest(density, features))
 
     def played(self, arrays: GridArrays) -> SparseGrid:
-        """The grid that a player makes of `arrays`, with single steps through all levels."""
+        """Return the grid that a player makes of `arrays`, marched in base steps on all levels."""
         return build_grid(
             arrays.densities,
             arrays.features,
@@ -156,9 +160,9 @@ class Layout:
 
 
 def _finest(stored: PyramidValues) -> PyramidValues:
-    """The finest level alone."""
+    """Return the finest level alone."""
     one = Pyramid(stored.pyramid.resolution, stored.pyramid.levels[:1])
-    vars(one)["vertices"] = stored.pyramid.vertices[:1]  # they need not be found again
+    vars(one)["vertices"] = stored.pyramid.vertices[:1]  # reuse the vertices that were already found
     return PyramidValues(one, stored.values[:1])
 
 
@@ -170,10 +174,11 @@ def make_layout(
     near: float = 0.0,
     density_step: int = 1,
 ) -> Layout:
-    """What is stored of the cells `visible` [n, n, n] bool, for march steps of `step`, from `near` on.
+    """Lay out the values to store for the cells `visible` [n, n, n] bool.
 
-    Densities and features are stored at the corners of those cells of their own grids that lie in visible
-    cells; `resolutions` are the cells along each axis of their grids.
+    Densities and features are stored at the corners of those cells of their own grids whose centre is in a
+    visible cell. `resolutions` are the cells along each axis of the two grids. `step` is the length of a
+    march step; in contracted space, rays begin at the distance `near`.
     """
     longest = step * FAR**2 if contracted else step
     density_range = (float(np.log(FAINTEST / longest)), float(np.log(DENSEST / step)))
@@ -184,7 +189,7 @@ def make_layout(
 
 
 def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.ndarray:
-    """The field's density codes [n_densities] float32."""
+    """Evaluate the field's densities at the stored vertices. Returns whole codes [n_densities] float32."""
     vertices = layout.densities
     codes = np.empty(len(vertices), np.float32)
     for rows, points in _chunks(vertices, layout.contracted):
@@ -194,8 +199,8 @@ def evaluate_densities(model: Model, layout: Layout, progress: Progress) -> np.n
 
 
 def some_features(model: Model, layout: Layout, matrix: np.ndarray) -> np.ndarray:
-    """[n, n_stored] float32: the field's features times `matrix` [n_stored, n_channels] at N_RANKED of the
-    vertices, spread evenly, or at all where there are no more."""
+    """Return [n, n_stored] float32: the field's features, multiplied by `matrix` [n_stored, n_channels], at
+    up to N_RANKED of the vertices, spread evenly."""
     vertices = layout.features
     index = vertices.index[:: max(-(-len(vertices) // N_RANKED), 1)]
     points = unit_points(index, vertices.resolution, layout.contracted)
@@ -203,8 +208,8 @@ def some_features(model: Model, layout: Layout, matrix: np.ndarray) -> np.ndarra
 
 
 def latent_features(model: Model, layout: Layout, matrix: np.ndarray, progress: Progress) -> np.ndarray:
-    """The field's features times `matrix` [n_stored, n_channels], which makes codes of them, as latent
-    features [n_features, n_stored] int16."""
+    """Return the field's features at all stored vertices as latent features [n_features, n_stored] int16.
+    `matrix` [n_stored, n_channels] maps the field's features to codes."""
     features = table(len(layout.features), len(matrix))
     for rows, values in features_of_field(model, layout, matrix):
         features[rows] = values
@@ -213,7 +218,7 @@ def latent_features(model: Model, layout: Layout, matrix: np.ndarray, progress: 
 
 
 def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts:
-    """The same a part at a time."""
+    """Yield the same latent features as `latent_features`, part by part."""
     back = matrix.T.astype(np.float32)
     for rows, points in _chunks(layout.features, layout.contracted):
         yield rows, latent(model.field.features(points) @ back)
@@ -226,13 +231,15 @@ def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.nd
 
 
 def _corners(cells: np.ndarray, resolution: int) -> Vertices:
-    """The corners of a grid's cells, `resolution` along each axis, that lie in `cells` [n, n, n] bool. They
-    are found and put in order slab by slab, because a fine grid as a whole takes gigabytes. Slabs are some
-    bricks thick, and bricks are ordered along x first."""
+    """Return the corners of those cells of a grid of `resolution` that lie in `cells` [n, n, n] bool.
+
+    They are found and sorted slab by slab, because a whole fine grid would take gigabytes. The result is in
+    order, because slabs are whole bricks thick and bricks are sorted along x first.
+    """
     parts = []
     for first in range(0, resolution + 1, SLAB):
         last = min(first + SLAB, resolution + 1)
-        before = max(first - 1, 0)  # a vertex is a corner of the cells on both its sides
+        before = max(first - 1, 0)  # a vertex is a corner of the cells on both sides of it
         corners = corners_of(subdivided(cells, resolution, slice(before, last)))
         index = np.argwhere(corners[first - before : last - before]).astype(np.int16)
         index[:, 0] += first
@@ -243,8 +250,9 @@ def _corners(cells: np.ndarray, resolution: int) -> Vertices:
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
-    """[n, 3] float32 points in the unit cube of the field at which vertices are evaluated. Corners of cells
-    that stick out of contracted space, where the field is not trained, take what is at its border."""
+    """Return [n, 3] float32: the points, in the unit cube of the field, at which the vertices `index` [n, 3]
+    are evaluated. Vertices outside contracted space, where the field is not trained, are moved to its
+    border."""
     points = index / resolution
     if contracted:
         centred = points - 0.5
@@ -255,7 +263,7 @@ def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndar
 
 @dataclass(frozen=True)
 class Projection:
-    """Stored channels are P F; the head is given Q P x."""
+    """The projection to fewer channels: P F is stored, and the head is given Q P x."""
 
     matrix: np.ndarray
     """P [n_stored, n_channels]."""
@@ -263,14 +271,15 @@ class Projection:
     """Q [n_channels, n_stored]."""
 
     def first(self, n: int) -> Projection:
-        """The best projection to the first n of its channels: the most important come first."""
+        """Return the best projection to `n` channels: the first ones, because they matter most."""
         return Projection(self.matrix[:n], self.back[:, :n])
 
 
 def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Projection:
-    """The best projection to `n_stored` channels, or to all channels where there are no more.
+    """Return the best projection to `n_stored` channels, or to all channels if there are fewer.
 
-    `sensitivity` [n_channels, n_channels] is M, `rendered` [n, n_channels] rendered features.
+    `sensitivity` [n_channels, n_channels] is M; `rendered` [n, n_channels] are rendered features, from which
+    G is computed.
 
     >>> p = project(np.eye(3), np.diag([3.0, 2.0, 1e-9]), 2)
     >>> bool(np.allclose(p.back @ p.matrix, np.diag([1, 1, 0]), atol=1e-6))
@@ -288,8 +297,8 @@ def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Pro
 
 
 def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """M [n_channels, n_channels]: mean square of the derivatives of the shown colours, at `rendered` features
-    [n, n_channels] seen along `dirs` [n, 3] with `opacity` [n]."""
+    """Return M [n_channels, n_channels], the mean square of the derivatives of the shown colours, at the
+    `rendered` features [n, n_channels] seen along `dirs` [n, 3] with `opacity` [n]."""
     features = torch.from_numpy(rendered).requires_grad_(True)
     colours = head(features, torch.from_numpy(dirs)) * torch.from_numpy(opacity)[:, None]
     total = np.zeros((rendered.shape[1],) * 2)
@@ -300,12 +309,14 @@ def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity
 
 
 def code_step(values: np.ndarray, levels: int = 127) -> float:
-    """The step between signed codes of projected `values` [n, n_stored]; 1 if all values are 0. In all but
-    FAR_OUT of the rows the largest magnitude has at most the code `levels`. The few others would make the
-    steps of all coarse; their codes end at 127.
+    """Return the quantization step of signed codes for the projected `values` [n, n_stored]; 1 if all are 0.
 
-    It is the same for all channels: P makes an error in any of them weigh alike in the colours, so that the
-    least bytes for a given error are those of one step, and a channel of little use takes few bits by itself.
+    With this step, all codes of a row have at most the magnitude `levels`, except in a share FAR_OUT of the
+    rows. Those few rows would make the step coarse for all; their codes are clipped at 127 instead.
+
+    All channels have the same step. P scales them such that an error in any channel counts alike in the
+    colours. For a given error, one common step then takes the fewest bytes, and a channel of little use takes
+    few bits by itself.
 
     >>> code_step(np.array([[127.0, 0.0], [-254.0, 1.0]]))
     2.0
@@ -318,9 +329,11 @@ def code_step(values: np.ndarray, levels: int = 127) -> float:
 
 
 def latent(values: np.ndarray) -> np.ndarray:
-    """Codes that need not be whole as latent features, int16 in parts of a code
-    (`vfr_bake.kernels.stored_features`), rounded down, so that `whole_codes` finds the nearest code; they end
-    at 127.
+    """Convert codes that need not be whole to latent features: int16, in parts of a code
+    (`vfr_bake.kernels.stored_features`).
+
+    Values are rounded down to parts, so that `whole_codes` finds the nearest code, and clipped at codes of
+    magnitude 127.
 
     >>> latent(np.array([1.25, -3.5, 200.0])).tolist()
     [320, -896, 32512]
@@ -330,7 +343,8 @@ def latent(values: np.ndarray) -> np.ndarray:
 
 
 def codes(values: np.ndarray) -> np.ndarray:
-    """Codes as float32, from any that need not be whole or from latent features as int16.
+    """Convert to codes as float32, which need not be whole, from latent features (int16) or from codes of any
+    other dtype.
 
     >>> codes(latent(np.array([1.25, -3.5]))).tolist(), codes(np.array([1.25])).tolist()
     ([1.25, -3.5], [1.25])
@@ -340,7 +354,7 @@ def codes(values: np.ndarray) -> np.ndarray:
 
 
 def whole_codes(features: np.ndarray) -> np.ndarray:
-    """The codes nearest to latent features [n_vertices, n_stored] int16, as signed bytes; ties upwards.
+    """Round latent features [n_vertices, n_stored] int16 to the nearest codes, int8; ties are rounded up.
 
     >>> whole_codes(latent(np.array([[1.25, -3.5, 200.0]]))).tolist()
     [[1, -3, 127]]
@@ -353,13 +367,14 @@ def whole_codes(features: np.ndarray) -> np.ndarray:
 
 
 def remainders(features: np.ndarray) -> np.ndarray:
-    """What `whole_codes` rounds away of latent features [n_vertices, n_stored], as signed bytes: their low
-    bytes."""
+    """Return what `whole_codes` rounds away from latent features [n_vertices, n_stored]: their low bytes, as
+    int8."""
     return features.astype(np.int8)
 
 
 def with_remainders(whole: np.ndarray, left: np.ndarray) -> Parts:
-    """The latent features of which `whole_codes` made `whole` and `remainders` made `left`, a part at a time.
+    """Yield, part by part, the latent features of which `whole` are the `whole_codes` and `left` the
+    `remainders`.
 
     >>> features = latent(np.array([[1.25, -3.5]]))
     >>> [part.tolist() for _, part in with_remainders(whole_codes(features), remainders(features))]
@@ -371,8 +386,9 @@ def with_remainders(whole: np.ndarray, left: np.ndarray) -> Parts:
 
 
 def move_towards(features: np.ndarray, others: Parts, share: float) -> None:
-    """Move latent features [n_vertices, n_stored], in place, by a `share` of the way to `others`, which are
-    given a part at a time: there may be no room for both.
+    """Move latent features [n_vertices, n_stored], in place, by a `share` of the way to `others`.
+
+    `others` are given part by part, because there may be no memory for both tables.
 
     >>> features = np.zeros((3, 1), np.int16)
     >>> move_towards(features, [(slice(0, 2), np.full((2, 1), 40, np.int16))], 0.25)

@@ -1,9 +1,9 @@
-"""The head as the exported graph takes it, with everything linear folded together, and the same graph in
-torch, which can be trained: in float32, or as it is played in 8 bits.
+"""The head in the form of the exported graph, with consecutive linear maps folded together, and the same
+graph in torch, where it can be trained: in float32, or as it is played in 8 bits.
 
-Letters as in `player.head.graph`. In 8 bits, activations are rounded to 256 levels of a fixed range, and
-weights as `exporters.head.onnx_head.weight_scales` says. Both are rounded in the same places here, and are
-trained as if they were not (straight through).
+Letters are as in `player.head.graph`. In 8 bits, activations are rounded to 256 levels of a fixed range, and
+weights as described in `exporters.head.onnx_head.weight_scales`. The torch graph rounds both in the same
+places as the exported one; gradients pass as if nothing were rounded (straight-through estimator).
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from player.head.graph import PAIR_LIMIT
 from vfr_bake.field.networks import Head, SphericalHarmonics
 
 ROWS_AT_ONCE = 8192
-"""Rays whose colours are computed at once."""
+"""Rays whose colours are computed at a time."""
 
 
 def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
-    """The head with `first_layer` [width, n_stored] in place of its first weights.
+    """Return the folded head, with `first_layer` [width, n_stored] in place of its first weights.
 
-    The bottleneck is a linear map followed by the linear part of the first directional layer; their product
-    is one map, which saves a sixth of the head's multiplications and changes nothing but rounding.
+    The bottleneck is a linear map that is followed by the linear part of the first directional layer. Both
+    are folded into their product, which saves a sixth of the head's multiplications and changes nothing but
+    rounding.
     """
 
     def layer(linear: torch.nn.Linear) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +40,7 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
     first, first_bias = layer(head.directional[0])  # type: ignore[arg-type]
     from_bottleneck, from_sh = first[:width], first[width:]
     to_sh = spatial[:, width:], spatial_bias[width:]
-    if head.plain_sh:  # one feature per basis function, which is always 1
+    if head.plain_sh:  # the features that multiply the basis functions are all 1
         to_sh = np.zeros((width, len(from_sh))), np.ones(len(from_sh))
     return HeadWeights(
         spatial=((first_layer.T, layer(head.spatial[0])[1]),),  # type: ignore[arg-type]
@@ -59,10 +60,10 @@ def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
 def small_head(
     like: HeadWeights, width: int, n_layers: int, n_bands: int, code_scale: np.ndarray
 ) -> HeadWeights:
-    """A head of `like`'s form with random weights, still to be trained.
+    """Make a head of `like`'s form with random weights, still to be trained.
 
-    It is `width` wide, has `n_layers` directional layers after the first and `n_bands` bands of spherical
-    harmonics; `code_scale` [n_channels] is the size of the features that it will be given, in codes.
+    It is `width` wide, and has `n_layers` directional layers after the first and `n_bands` bands of spherical
+    harmonics. `code_scale` [n_channels] is the typical size of its input features, in codes.
     """
     random = np.random.default_rng(0)
 
@@ -88,10 +89,10 @@ class FoldedHead(nn.Module):
 
     Args:
         weights: the weights before training.
-        units: [n_channels] units that composites are counted in, so that channels of small codes are trained
-            as fast as those of large ones.
-        ranges: those that `exporters.head.ranges` finds, where the wide layers are to be multiplied in 8
-            bits.
+        units: [n_channels] the input features are divided by these units, so that channels with small codes
+            train as fast as those with large ones; None divides by 1.
+        ranges: activation ranges from `exporters.head.ranges`, if the wide layers are to be multiplied in 8
+            bits; None for float32.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class FoldedHead(nn.Module):
         self._per_unit = torch.tensor(1 / self._units, dtype=torch.float32)
 
     def forward(self, codes: Tensor, dirs: Tensor) -> Tensor:
-        """Colours [n, 3] from composited codes [n, n_stored] and unit dirs [n, 3]."""
+        """Compute colours [n, 3] from composited codes [n, n_stored] and unit directions [n, 3]."""
         layers, (d_bottleneck, d_sh, bias) = self._layers()
         n_spatial = len(self._like.spatial)
         h = codes * self._per_unit
@@ -131,7 +132,7 @@ class FoldedHead(nn.Module):
         return torch.sigmoid(torch.addmm(b, h, weight))
 
     def _rounded(self, x: Tensor, index: int) -> Tensor:
-        """The activation `index` at its 256 levels."""
+        """Round activations `x` to the 256 levels of range number `index`, if the head is in 8 bits."""
         if self._ranges is None:
             return x
         scale, zero = levels(self._ranges[index])
@@ -151,7 +152,7 @@ class FoldedHead(nn.Module):
         return list(zip(a[:-3:2], a[1:-3:2], strict=True)), (a[-3], a[-2], a[-1])
 
     def weights(self) -> HeadWeights:
-        """Back to numpy, in the form that was given."""
+        """Return the weights as numpy arrays, in the form in which they were given."""
         layers, first = self._layers()
 
         def plain(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
@@ -175,8 +176,8 @@ class FoldedHead(nn.Module):
 def runner(
     weights: HeadWeights, ranges: tuple[Range, ...] | None = None
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The head as a function of composited features [n, n_channels] and unit dirs [n, 3]; in 8 bits with
-    `ranges`."""
+    """Return the head as a function from composited features [n, n_channels] and unit directions [n, 3] to
+    colours [n, 3]. With `ranges`, it computes in 8 bits."""
     head = FoldedHead(weights, ranges=ranges)
 
     @torch.no_grad()
@@ -191,8 +192,8 @@ def runner(
 
 
 def between(first: HeadWeights, second: HeadWeights, share: float) -> HeadWeights:
-    """The head whose weights lie a `share` of the way from those of `first` to those of `second`, which has
-    layers of the same sizes."""
+    """Interpolate the weights of two heads with layers of the same sizes: a `share` of the way from `first`
+    to `second`."""
 
     def mixed(a: Any, b: Any) -> Any:
         if isinstance(a, tuple):

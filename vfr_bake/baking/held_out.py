@@ -1,15 +1,16 @@
-"""What a bake is measured on: the model's witnesses, and views between the training cameras.
+"""Measure the stages of a bake on held-out pixels: the model's witnesses, and views between the training
+cameras.
 
-The *witnesses* are pixels of photographs that training has not learned from (`vfr_bake.data.witnesses`). What
-the asset loses there, compared with the model, is the loss of the bake, and the bake chooses by it.
+The *witnesses* are pixels of photographs that training has not learned from (`vfr_bake.data.witnesses`). The
+loss of a bake is what the asset loses on them, compared with the model. The bake chooses by this loss.
 
-On the *views between*, the model's own pictures are what should be seen. How well a stage agrees with them is
-told as a PSNR, and decides where the witnesses see no difference.
+On the *views between* the training cameras, the model's own pictures are the reference. The agreement of a
+stage with them is reported as a PSNR. It decides between stages where the witnesses see no difference.
 
-A model without witnesses was trained before there were any. Its loss can only be expected: the mean square
-difference to its pictures is e, and the model itself is off by E from photographs (its PSNR on what it was
-trained on). If the two errors have nothing to do with each other, the baked pictures are off by e + E, which
-is 10 log10(1 + e / E) dB worse.
+A model without witnesses was trained before they were introduced. Its loss can only be estimated: let e be
+the mean square difference to the model's pictures, and E the model's own mean square error to photographs
+(from its PSNR on the pictures it was trained on). If the two errors are independent, the baked pictures have
+the error e + E, which is a loss of 10 log10(1 + e / E) dB.
 """
 
 from __future__ import annotations
@@ -34,47 +35,48 @@ from vfr_bake.training.model_file import Model
 LARGEST_TURN = np.deg2rad(15.0)
 """Largest angle between a view and a training camera: farther away the model is not trained."""
 BETWEEN = 4
-"""Views between for each training camera, where the number of rays does not depend on that of the views."""
+"""Views between cameras for each training camera, wherever more views do not mean more rays."""
 NEIGHBOURS = 3
-"""Training cameras that count as beside one: on a walk the next, the last and one more."""
+"""Training cameras that count as a camera's neighbours: on a walk the next, the previous and one more."""
 PLACES = 64
-"""Places on the way between two cameras, one of which is taken."""
+"""Places on the way between two cameras, to which a view's place is rounded."""
 MARGIN = 0.1
 """Border that the bake adds on every side of a picture of an unbounded scene, as a share of its size. Fox's
-held-out views see there, and what was not stored cost them a decibel and more."""
+held-out views see beyond the training pictures, and lost more than a decibel to cells that were not stored
+there."""
 ASIDE = 1.0
-"""Views of an unbounded scene stand aside of the way between two cameras, by up to this share of its length.
-A held-out view of can, which stands that far from the others, lost 5 dB to cells that came into sight and
-were not stored."""
+"""Views of an unbounded scene are moved aside from the way between two cameras, by up to this share of its
+length. A held-out view of can, which stands that far from the others, lost 5 dB to cells that came into sight
+and were not stored."""
 RAYS_OF_A_VIEW = 20_000
-"""Most rays of a view that is measured."""
+"""Most rays of a view between cameras."""
 RAYS_BESIDE_WITNESSES = 5_000
-"""The same where there are witnesses: with them there are about as many rays."""
+"""Most rays of a view between cameras if the model has witnesses, whose rays make up for the difference."""
 RAYS_AT_ONCE = 1 << 13
 """Rays that a thread marches at a time."""
 N_DIRECTIONS = 6
-"""Other directions from which a colour is looked at, to see whether it depends on them."""
+"""Number of other directions by which it is tested whether colours depend on the direction."""
 SEED = 2
-"""Seed of the views that are kept for measuring; training uses others."""
+"""Seed of the views that are used for measuring only; views for training have other seeds."""
 FAR_OFF = 0.1
-"""By how much a pixel that stands out differs, in one of three channels of 0 to 1, as specks do in
+"""Difference of a pixel in one of the three channels, 0 to 1, above which it stands out, as for the specks of
 `vfr_bake.bench.specks`."""
 EXPECTED_SPREAD = 0.5
-"""Standard error of the loss that is expected of a small change, as a share of it."""
+"""Standard error of the expected loss of a small change, as a share of that loss."""
 DEFAULT_PSNR = 30.0
-"""PSNR that is assumed for a model whose training has measured nothing."""
+"""PSNR in dB that is assumed for a model whose training has measured none."""
 
 Head = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Composited features [n, n_channels] and unit dirs [n, 3] to colours [n, 3]."""
+"""A function from composited features [n, n_channels] and unit directions [n, 3] to colours [n, 3]."""
 
 
 def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> list[Camera]:
-    """`n_views` cameras (model frame) between the training cameras.
+    """Return `n_views` cameras (model frame) between the training cameras.
 
-    Each stands a quarter to half of the way from a training camera, of which all have their turn, to one of
-    its nearest, and is turned around what all cameras look at by up to a quarter of the angle between the
-    two. With `wide` they also stand aside of that way and see beyond their borders (`widened`). The views
-    follow from the seed.
+    Each stands a quarter to half of the way from a training camera to one of its nearest neighbours; the
+    training cameras take turns. It is then turned around the point that all cameras look at, by up to a
+    quarter of the angle between the two. With `wide`, cameras are also moved aside from that way, and see
+    beyond their borders (`widened`). The views are determined by the seed.
     """
     cameras = model.model_cameras()
     random = np.random.default_rng(seed)
@@ -104,14 +106,14 @@ def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> 
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """[3, 3] rotation by `angle` around the unit `axis` (Rodrigues)."""
+    """Return the rotation [3, 3] by `angle` around the unit vector `axis` (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def widened(camera: Camera) -> Camera:
-    """The camera with a border of MARGIN of its picture on every side.
+    """Return the camera with a border added on every side, MARGIN times the size of its picture.
 
     >>> wide = widened(Camera("a", np.eye(4), 100, 50, 80.0, 80.0, 50.0, 25.0))
     >>> wide.width, wide.height, wide.cx, wide.cy
@@ -123,40 +125,41 @@ def widened(camera: Camera) -> Camera:
 
 
 class Shown(NamedTuple):
-    """How far some pictures are off."""
+    """Pictures of all held-out rays, and their errors."""
 
     error: float
-    """Mean square error to the model's pictures on the views between; not rounded to 8 bits."""
+    """Mean square error to the model's pictures on the views between cameras; not rounded to 8 bits."""
     errors: np.ndarray | None
     """[n_witnesses] float64: mean square error of each witness to its photograph; None without witnesses."""
     rgb: np.ndarray
     """[n, 3] float32: the pictures' colours, 0 to 1."""
 
     def far_off(self, other: Shown) -> float:
-        """The share of the pixels that differ from `other`'s by more than FAR_OFF in a channel."""
+        """Return the share of the pixels that differ from those of `other` by more than FAR_OFF in a
+        channel."""
         return float(np.mean(np.abs(self.rgb - other.rgb).max(axis=1) > FAR_OFF))
 
 
 @dataclass(frozen=True)
 class Stage:
-    """The pictures after a step of the bake, compared with the model's."""
+    """The pictures after a step of the bake, and their errors compared with the model's."""
 
     name: str
     psnr: float
-    """PSNR in dB against the model's pictures on the views between, not rounded to 8 bits."""
+    """PSNR in dB against the model's pictures on the views between cameras, not rounded to 8 bits."""
     loss: Loss
-    """Loss against photographs, compared with the trained model; expected where there are no witnesses."""
+    """Loss against photographs, compared with the trained model; estimated if there are no witnesses."""
     samples_median: float
-    """Median number of density samples of a ray that hits."""
+    """Median number of density samples of the rays that hit something."""
     samples_p95: float
-    """95th percentile of the same."""
+    """95th percentile of the same number."""
     shown: Shown
-    """What the figures were made of."""
+    """The pictures from which the figures were computed."""
 
 
 class HeldOut:
-    """Rays of views between the training cameras, and then those of the witnesses, with the model's colours
-    over its background."""
+    """The rays on which a bake is measured (those of views between the training cameras first, then those of
+    the witnesses), with the model's colours over its background."""
 
     def __init__(self, model: Model, n_views: int) -> None:
         witnesses = model.neutral_witnesses()
@@ -185,17 +188,17 @@ class HeldOut:
         self.wanted[self._hits] += self._opacity * self._colours(self._features)
         self._witnesses = None if witnesses is None else WitnessLoss(witnesses, self.background)
         self.own = self._compared(self.wanted)
-        """The model's own pictures."""
+        """The model's own pictures, with their errors."""
         self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
         self.stages: list[Stage] = []
 
     @property
     def model_error(self) -> float:
-        """Mean square error of the model's pictures to those that it learned from."""
+        """Mean square error of the model's pictures to the pictures that it learned from."""
         return 10 ** (-self._model_psnr / 10)
 
     def measured_on(self) -> str:
-        """What losses are measured on, or estimated from, in a sentence."""
+        """Describe in a sentence or two what losses are measured on, or estimated from."""
         if self._witnesses is None:
             return (
                 "The model has no witnesses, which are pixels that it did not learn from. So the loss is "
@@ -204,26 +207,28 @@ class HeldOut:
         return self._witnesses.described()
 
     def lost(self, before: Shown, after: Shown) -> Loss:
-        """What `after` loses, compared with `before`."""
+        """Return the loss of `after`, compared with `before`."""
         if self._witnesses is not None and before.errors is not None and after.errors is not None:
             return self._witnesses.loss(before.errors, after.errors)
         first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
         return Loss(second - first, None)
 
     def shows(self, after: Shown, db: float) -> bool:
-        """Whether it is shown that `after` loses more than `db` dB; without witnesses, whether it is
-        expected."""
+        """Return whether the witnesses show that `after` loses more than `db` dB; without witnesses, whether
+        the estimated loss is larger."""
         if self._witnesses is None or self.own.errors is None or after.errors is None:
             return self.lost(self.own, after).least > db
         return self._witnesses.shows(self.own.errors, after.errors, db)
 
     def loss_of_change(self, before: Shown, after: Shown) -> float:
-        """The dB that a small change of the pictures loses, such as rounding, which knows no photographs.
+        """Return the loss in dB of a small change of the pictures that does not depend on the photographs,
+        such as rounding.
 
-        Its errors then have nothing to do with those that the pictures have already, and add up with them:
-        that is what is expected, give or take half of it (EXPECTED_SPREAD). It differs far less from pixel to
-        pixel than what the witnesses measure, where the two errors multiply. The mean of both is weighted
-        with 1 / spread^2.
+        The errors of such a change are independent of the errors that the pictures already have, so their
+        squares are expected to add up. The loss expected from this has a standard error of half its size
+        (EXPECTED_SPREAD). It varies far less from pixel to pixel than the loss measured on the witnesses,
+        which contains the product of the two errors. Returns the mean of both losses, each weighted with
+        1 / spread^2.
         """
         measured = self.lost(before, after)
         if self._witnesses is None or before.errors is None or not measured.spread:
@@ -235,8 +240,8 @@ class HeldOut:
         return measured.db + share * (expected - measured.db)
 
     def is_better(self, before: Shown, after: Shown) -> bool:
-        """Whether `after` loses less than `before`; where the witnesses see no difference beyond chance,
-        whether it agrees better with the model's pictures."""
+        """Return whether `after` loses less than `before`. If the witnesses see no difference beyond chance,
+        return whether it agrees better with the model's pictures."""
         loss = self.lost(before, after)
         measured = loss.spread is None or abs(loss.db) > loss.spread
         return loss.db < 0 if measured else after.error < before.error
@@ -245,12 +250,13 @@ class HeldOut:
         return head_colours(self._field, features, self.rays_d[self._hits])
 
     def channel_loss(self, kept: np.ndarray) -> Loss:
-        """The loss if the model's own rendered features x went through `kept` [n_channels, n_channels], a
-        projection of them."""
+        """Return the loss if the model's own rendered features were multiplied by `kept` [n_channels,
+        n_channels], a projection."""
         return self._loss_of_colours(self._colours((self._features @ kept.T).astype(np.float32)))
 
     def direction_loss(self) -> Loss:
-        """The loss if every colour were the mean of those seen from N_DIRECTIONS other rays' directions."""
+        """Return the loss if every colour were the mean of its colours along N_DIRECTIONS random other rays'
+        directions."""
         random = np.random.default_rng(SEED)
         mean = np.zeros((len(self._hits), 3), np.float32)
         for _ in range(N_DIRECTIONS):
@@ -259,33 +265,35 @@ class HeldOut:
         return self._loss_of_colours(mean)
 
     def _loss_of_colours(self, colours: np.ndarray) -> Loss:
-        """The loss if the rays that hit had these colours [n_hits, 3] instead of the model's."""
+        """Return the loss if the rays that hit something had these `colours` [n_hits, 3] instead of the
+        model's."""
         rgb = self.wanted.copy()
         rgb[self._hits] += self._opacity * (colours - self._colours(self._features))
         return self.lost(self.own, self._compared(rgb))
 
     def compare(self, features: np.ndarray, opacity: np.ndarray) -> Shown:
-        """What is seen if every ray composites `features` [n, n_channels] and `opacity` [n], with the model's
-        own head."""
+        """Return the pictures that the model's own head makes of the rays' composited `features` [n,
+        n_channels] and `opacity` [n]."""
         met = np.flatnonzero(opacity > 0)
         colours = head_colours(self._field, features[met], self.rays_d[met])
         return self._compared(self._pictures(met, colours, opacity))
 
     def _pictures(self, hits: np.ndarray, colours: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-        """[n, 3] over the background, with `colours` [n_hits, 3] at the rays `hits`, and `opacity` [n]."""
+        """Return colours [n, 3] over the background: those of the rays numbered `hits` are `colours`
+        [n_hits, 3] with `opacity` [n]."""
         rgb = (1 - opacity[:, None]) * self.background
         rgb[hits] += colours * opacity[hits, None]
         return rgb
 
     def _compared(self, rgb: np.ndarray) -> Shown:
-        """How far the pictures [n, 3] of all rays are off."""
+        """Compute the errors of the colours [n, 3] of all rays."""
         between, of_witnesses = slice(self._n_between), slice(self._n_between, None)
         error = float(np.mean((rgb[between].astype(np.float64) - self.wanted[between]) ** 2))
         errors = None if self._witnesses is None else self._witnesses.errors(rgb[of_witnesses])
         return Shown(error, errors, rgb)
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
-        """What the player composes on the rays."""
+        """March the rays through `grid` as the player does, with `n_fetches` feature lookups a ray."""
         march = choose_march("auto")[1].march
 
         def some(first: int) -> MarchResult:
@@ -298,16 +306,16 @@ class HeldOut:
         return MarchResult(*map(np.concatenate, zip(*parts, strict=True)))._replace(hits=np.concatenate(hits))
 
     def measure(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
-        """Play `grid` with `head`, and keep the result under `name`."""
+        """Play `grid` with `head`, and append the result to the stages as `name`."""
         return self.measure_march(name, self.march(grid, n_fetches), head)
 
     def measure_march(self, name: str, played: MarchResult, head: Head) -> Stage:
-        """Show what was composed, and keep the result under `name`."""
+        """Evaluate `head` on the composites of a march, and append the result to the stages as `name`."""
         self.stages.append(self._stage(name, played, head))
         return self.stages[-1]
 
     def look(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
-        """Play `grid` with `head`, without keeping the result."""
+        """Play `grid` with `head`, without appending the result to the stages."""
         return self._stage(name, self.march(grid, n_fetches), head)
 
     def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
@@ -325,7 +333,7 @@ class HeldOut:
         )
 
     def table(self) -> list[dict[str, Any]]:
-        """The stages so far, for a report."""
+        """Return the figures of the stages so far, for a report."""
         return [
             {
                 "name": stage.name,
@@ -340,8 +348,8 @@ class HeldOut:
 
 
 def expected_loss(error: float, model_psnr: float) -> float:
-    """dB that a mean square `error` to the model's pictures costs a model of `model_psnr` dB, if its own
-    errors have nothing to do with it.
+    """Return the loss in dB by a mean square `error` to the pictures of a model of `model_psnr` dB, if the
+    model's own errors are independent of it.
 
     >>> round(expected_loss(10 ** (-4.57), 29.53), 2)  # k = 5 of docs: 45.7 dB to the full render
     0.1

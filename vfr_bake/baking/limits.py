@@ -1,6 +1,6 @@
-"""What a bake was told to keep to, size, loss and the time of a frame: what fits, and whether it was met.
+"""The limits of a bake on size, loss and frame time: choose what fits them, and check whether they were met.
 
-The time of a frame is measured by the player on this machine, with an asset that is not written yet.
+The frame time is measured with the player on this machine, on an asset that is not written yet.
 """
 
 from __future__ import annotations
@@ -21,33 +21,34 @@ from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
 
 MANIFEST_BYTES = 20_000
-"""Bytes kept for the manifest where the asset has to fit into a budget."""
+"""Bytes reserved for the manifest if the asset has to fit into a number of bytes."""
 CELL_BYTES = 0.1
-"""Bytes that a stored cell of the features takes at least, with its densities: where there are fewer for
-each, coarser grids show more."""
+"""Least bytes for a stored feature cell with its densities: with fewer bytes per cell, coarser grids look
+better."""
 PAGE_CHANNEL_BYTES, PAGE_COLUMN_BYTES, PAGE_DENSITY_BYTES = 1.4, 5, 13
-"""Bytes of graphics memory that a page takes for each cell of the features, roughly: for a channel, because
-there are more vertices than cells; to find them; and for a density."""
+"""Rough bytes of graphics memory that a page takes for each feature cell: per channel (above 1, because there
+are more vertices than cells), for the index that finds the vertices, and per density."""
 FEWEST_CELLS = 4096
-"""Cells that an asset has in any case: with fewer it shows nothing."""
+"""Fewest cells of an asset: with fewer it shows nothing."""
 SIZE = 800
-"""Pixels along each side of the frame that is measured."""
+"""Pixels along each side of the measured frame."""
 N_FRAMES = 3
-"""Frames of which the median counts; one before them warms up."""
+"""Measured frames, of which the median is taken; one more frame before them warms up."""
 WIDTHS = (64, 48, 32, 16)
 """Widths of smaller heads that are tried."""
 LOOKUPS = (1, 2, 3, 4, 5, 8, 12, 16, 32)
-"""Numbers of lookups a ray that are tried."""
+"""Numbers of feature lookups a ray that are tried."""
 RESERVE = 0.9
-"""Share of the time asked for that a choice may take before refinement."""
+"""Share of the allowed frame time that may be taken before refinement."""
 
 Measure = Callable[[int, int], float]
-"""Milliseconds of a frame by (width of the head, 0 for the model's own; lookups a ray, 0 for all)."""
+"""A function that measures the milliseconds of a frame from (width of the head, 0 for the model's own;
+feature lookups a ray, 0 for every sample)."""
 
 
 def cells_that_fit(max_mb: float, others: int) -> int:
-    """How many cells of the features may be stored in `max_mb` megabytes, of which MANIFEST_BYTES and
-    `others` bytes are taken.
+    """Return how many feature cells may be stored in `max_mb` megabytes, of which MANIFEST_BYTES and `others`
+    bytes are taken by other data.
 
     >>> cells_that_fit(3.0, 300_000)
     26800000
@@ -56,8 +57,8 @@ def cells_that_fit(max_mb: float, others: int) -> int:
 
 
 def cells_of_page(page_mb: float, n_channels: int, densities_per_cell: float) -> int:
-    """How many cells of the features may be stored if a page of the asset is to take no more than `page_mb`
-    megabytes of graphics memory, roughly.
+    """Estimate how many feature cells may be stored if a page of the asset is to take at most `page_mb`
+    megabytes of graphics memory.
 
     >>> cells_of_page(512, 24, 1.0)
     9922480
@@ -67,14 +68,14 @@ def cells_of_page(page_mb: float, n_channels: int, densities_per_cell: float) ->
 
 
 def file_sizes(folder: Path) -> dict[str, int]:
-    """Bytes of each of the asset's files; the report is not among them."""
+    """Return the bytes of each of the asset's files, by name; the report is not included."""
     paths = sorted(path for path in folder.iterdir() if path.stem != "report")
     return {path.name: path.stat().st_size for path in paths}
 
 
 def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float | None) -> None:
-    """Raises TrainingError where the written files miss what was asked; it says what they reach. `ms` is the
-    time of a frame, or None where that was not asked."""
+    """Raise TrainingError if the written files miss a limit; the message says what they reach. `ms` is the
+    frame time, or None if it was not limited."""
     limits = (
         ("loss", config.max_loss_db, loss_db, "dB"),
         ("size", config.max_mb, megabytes, "MB"),
@@ -89,7 +90,8 @@ def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float
 
 
 def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:
-    """Milliseconds of a frame of SIZE x SIZE seen by `camera` (WORLD frame), as the player plays it here."""
+    """Measure the milliseconds that the player takes on this machine for a frame of SIZE x SIZE seen by
+    `camera` (WORLD frame)."""
     times = []
     with Renderer(asset) as renderer:
         for _ in range(N_FRAMES + 1):
@@ -102,10 +104,11 @@ def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:
 def keep_to_time(
     choice: BakeChoice, target_ms: float, measure: Measure, same_head: bool, same_lookups: bool
 ) -> BakeChoice:
-    """`choice` with the widest head, and then the most lookups, whose frames take no longer than `target_ms`.
+    """Return `choice` with the widest head, and then the most feature lookups, whose frames take at most
+    RESERVE times `target_ms`.
 
-    `same_head` and `same_lookups` say what stays because it was asked for by number. Raises TrainingError
-    where even the least takes longer; it says how long.
+    With `same_head` or `same_lookups`, the head or the number of lookups stays, because it was given. Raises
+    TrainingError if even the fastest choice takes longer; the message says how long.
 
     >>> from vfr_bake.presets import PRESETS
     >>> chosen = keep_to_time(PRESETS["balanced"], 100, lambda width, k: width + 6 * k, False, False)
@@ -130,17 +133,18 @@ def keep_to_time(
 
 
 def _downwards(most: int, tried: Sequence[int]) -> list[int]:
-    """`most` and those of `tried`, in falling order, that are less; 0 is more than any number."""
+    """Return `most`, followed by those of `tried`, which are in falling order, that are less than `most`. A
+    `most` of 0 counts as more than any number."""
     return [most, *(n for n in tried if n < most or not most)]
 
 
 def unwritten_asset(folder: Path, manifest: Manifest, arrays: GridArrays, files: dict[str, bytes]) -> Asset:
-    """The asset of `manifest` and `arrays`, which stay in memory.
+    """Return an asset made of `manifest` and `arrays`, which stay in memory.
 
     Args:
-        folder: an empty folder; it must live as long as the asset.
-        files: what is opened by its path, by name: `{"head.onnx": ..., "cameras.json": ...}`; only they are
-            written.
+        folder: an empty folder; it must exist as long as the asset is used.
+        files: contents by name of the files that are opened by their path: `{"head.onnx": ...,
+            "cameras.json": ...}`; only these are written.
     """
     for name, data in files.items():
         (folder / name).write_bytes(data)

@@ -1,5 +1,5 @@
-"""The asset's mesh: the surface of what was written, as `vfr-export` makes it, in so few faces that it is a
-small part of the asset."""
+"""Make the asset's mesh: the surface of the written values, as `vfr-export` makes it, with few enough faces
+to be a small part of the asset."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from player.asset.asset import Asset
 from player.errors import ConfigError, DataError
 
 VIEWS = 50
-"""Most views that are played for the mesh."""
+"""Most views that are rendered for the mesh."""
 OTHERS = 9
-"""Bytes of the other files for a byte of the mesh: it is at most a tenth of the asset."""
+"""Bytes of the other files for each byte of the mesh, which is thus at most a tenth of the asset."""
 FEWEST_BYTES = 43_000
-"""A mesh of about 2,000 faces, which every asset may have."""
+"""Bytes that the mesh of every asset may take: enough for about 2,000 faces."""
 
 
 class BakedMesh(NamedTuple):
@@ -31,19 +31,19 @@ class BakedMesh(NamedTuple):
     """WORLD frame."""
     removed: Removed
     left_out: str | None
-    """What is not in it, and why."""
+    """The surfaces that the mesh lacks, and why; None if it lacks none."""
 
 
 def bake_mesh(asset: Asset, resolution: int, max_bytes: int, max_memory: float, report: Report) -> BakedMesh:
-    """The mesh of an asset; an empty one where there is no surface, as in an even fog.
+    """Make the mesh of an asset; it is empty if there is no surface, as in an even fog.
 
     In an unbounded scene it covers the inner region.
 
     Args:
         asset: complete but for its mesh; it is played.
-        resolution: the mesh has at most the faces that a grid of so many voxels along the box would give it.
-        max_bytes: the most bytes of the mesh as it is written.
-        max_memory: gigabytes that the densities may take on one level.
+        resolution: the mesh has at most as many faces as a grid of this many voxels along the box would give.
+        max_bytes: the most bytes of the written mesh.
+        max_memory: gigabytes that the densities may take on a single level.
         report: called with (stage, done, of).
     """
     none = np.zeros((0, 3))
@@ -58,17 +58,18 @@ def bake_mesh(asset: Asset, resolution: int, max_bytes: int, max_memory: float, 
     try:
         surface = AssetSurface(inner, report, FEW_PIXELS, VIEWS)
         mesh, removed = few_faces(surface, resolution, max_bytes)
-    except (ConfigError, DataError):  # nowhere as dense as a level, everywhere, or seen by nobody
+    except (ConfigError, DataError):  # no surface at the density level, or no camera sees it
         return BakedMesh(*empty, "all of it: nowhere is the field dense enough for a surface")
     outside = "all surfaces outside the unit ball of the model frame" if asset.manifest.contracted else None
     return BakedMesh(surface.painted(mesh), removed, outside)
 
 
 def mesh_bytes(others: int, max_mb: float | None) -> int:
-    """The most bytes that the mesh may take beside `others` bytes of the asset's other files.
+    """Return the most bytes that the mesh may take beside `others` bytes of the asset's other files.
 
     Args:
-        max_mb: megabytes that the whole asset may take; None is any number.
+        others: bytes of the asset's other files.
+        max_mb: megabytes that the whole asset may take; None for no limit.
 
     >>> mesh_bytes(9_000_000, None), mesh_bytes(9_000_000, 9.5), mesh_bytes(9_000_000, 8.0)
     (1000000, 500000, 43000)

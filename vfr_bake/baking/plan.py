@@ -1,7 +1,7 @@
-"""What a bake will take, before it starts, and what has to be smaller to fit into the memory that is allowed.
+"""Plan a bake before it starts: estimate its memory and time, and choose sizes that fit the memory allowed.
 
-Bytes are counted from the arrays that are held at the same time; seconds follow from how fast the model
-answers rays on this machine.
+Bytes are counted from the arrays that are held at the same time. Seconds are estimated from the speed at
+which the model renders rays on this machine.
 """
 
 from __future__ import annotations
@@ -33,83 +33,86 @@ from vfr_bake.presets import BakeChoice
 from vfr_bake.training.model_file import Model
 
 PROGRAM_BYTES = 800_000_000
-"""Bytes that Python, torch, numba and the model itself take."""
+"""Bytes taken by Python, torch, numba and the model itself."""
 N_RAYS = 6_000_000
-"""Rays that head and stored values are trained on, where there is memory for them: most of them meet
-something. The fewer they are, the more what is stored suits them alone."""
+"""Training rays of an object's refinement, where there is memory for them; most of them meet something. With
+fewer rays, the head and the stored values overfit to them."""
 UNBOUNDED_RAYS = 2_500_000
-"""Such rays of an unbounded scene, where all rays meet something, and at many samples each."""
+"""Training rays of an unbounded scene's refinement, where there is memory for them: fewer than for an object,
+because every ray meets something, at many samples each."""
 RAYS_OF_DRAW, FEW_DRAWN = 1.2, 500_000
-"""Rays for each that the steps of refinement draw, at most: five of six meet something, so that each is
-drawn once. The least that this may leave: what is stored is chosen by some of them, too."""
+"""Limits on the number of training rays. At most RAYS_OF_DRAW rays are made for each ray that the steps of
+refinement draw: five of six rays meet something, so each of those is drawn about once. This limit never goes
+below FEW_DRAWN, because the stored values are also chosen by some of these rays."""
 PHOTOGRAPHED = 3 / 4
-"""Share of the rays that go through training pixels, where the model has so many. Those of an object all lie
-on it or close to it; of its other rays a third meet something."""
+"""Share of the training rays that go through training pixels, if the model has that many pixels. An object's
+training pixels all lie on it or close to it; of its other rays only a third meet something."""
 RAYS_SHARE = 0.3
-"""Share of the memory for cells and rays that rays may take at least, if they need it."""
+"""Share of the memory for cells and rays that is reserved for the rays, if they need it."""
 FEWEST_RAYS = 100_000
 RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
 RAY_BYTES = {False: 220, True: 120}
-"""Bytes that a training ray takes, by whether the scene is unbounded: 40 bytes for what is to be shown,
-twice that for those that meet something in the grid, too, and as much again while they are put together.
-Five of six of an object's rays meet something, and their samples are kept, eight or nine of 16 bytes."""
+"""Bytes that a training ray takes, by whether the scene is unbounded. The ray and its target colour take 40
+bytes; rays that meet something in the grid are copied, which takes 40 more; concatenating the rays takes
+another 40. Five of six of an object's rays meet something, and their samples are kept: eight or nine per ray,
+of 16 bytes each."""
 CHANNEL_BYTES = 8.5
-"""Bytes that a stored channel takes in a cell, which has about 1.3 vertices, when codes are chosen: the two
-of what was trained, and one each of the codes that are tried, of the best ones so far, and of those that are
-played; all with their coarser levels."""
+"""Bytes that a stored channel takes in a cell while codes are chosen. A cell has about 1.3 vertices. Each
+vertex has two bytes for the trained latent feature, and one each for the codes being tried, the best codes so
+far and the codes being played, all with their coarser levels."""
 DENSITY_BYTES = 40
-"""Bytes that a density takes; a cell of the features holds as many densities as finer cells."""
+"""Bytes that a density takes. A feature cell has as many densities as the density cells that fit into it."""
 REFINED_BY = 0.8
-"""Share of a bake's time after which refinement ends: then the mesh is made, and the written files are
-played."""
+"""Share of a bake's time after which refinement ends. The rest is for the mesh and for playing the written
+files."""
 LEAST_REFINED = 0.4
-"""Share of a bake's minutes that refinement may take however long everything before it took: a small head
-that is hardly trained is worse than a bake that takes longer."""
+"""Share of a bake's minutes that refinement may take in any case, however long everything before it took: a
+longer bake is better than a small head that is hardly trained."""
 VIEWS_TIMED = 4
-"""Views that are timed to tell how fast the teacher answers, with as many rays each as in the bake; other
-rays than those for which it was compiled. What these have read is in cache, which makes them several times as
-fast as the millions of a bake."""
+"""Views that are rendered to time the teacher, with as many rays each as in the bake. The timed rays differ
+from those of the run before, which compiles the code: the memory that those have read is in the cache, where
+rays are several times as fast as the millions of a bake."""
 STEP_COST, HEAD_COST = {False: 4.8, True: 0.7}, {False: 1.3, True: 0.6}
-"""Time of a training ray in a step of refinement, and in a step of the head alone, by whether the scene is
-unbounded; the unit is the time that the teacher takes for a ray, which is several times as long there. These
-and the following count what one thread waits for on two cores
+"""Time of a training ray in a step of refinement, and in a step that trains the head alone, by whether the
+scene is unbounded. The unit is the time that the teacher takes for a ray, which is several times as long in
+an unbounded scene. All costs here are times of the main thread, measured on two cores
 (docs/notes/2026-11-24-bakes-of-weak-models.md)."""
 VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
-"""Time of a vertex, and of a ray that marks the cells it sees, in the same unit."""
+"""Time to evaluate a vertex, and time of a ray that marks the cells it sees, in the same unit."""
 ROUNDS = {False: 1.0, True: 1.5}
-"""Rounds of refinement that are expected: a capture needs the one with the lookups and bits that are played
-about every second time, an object hardly ever."""
+"""Expected rounds of refinement. About every second capture needs a further round with the number of lookups
+and the bits that are played; an object hardly ever does."""
 OWN_HEAD = 2
-"""How many times as long a step takes with the model's own head."""
+"""Factor on the time of a step with the model's own head."""
 REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
-"""Time of all else, which hardly depends on the scene, in the same unit: what is measured, the mesh, the
-files; and by how much it is longer with the model's own head."""
+"""Time of everything else (measurements, mesh, files), which hardly depends on the scene, in the same unit;
+and the time to add with the model's own head."""
 CHOSEN_COST = {False: 0.36, True: 0.12}
-"""Time of a vertex when it is chosen what is stored of refined values, detail and codes, in the same unit."""
+"""Time of a vertex while its detail and codes are chosen after refinement, in the same unit."""
 COMPILE_SECONDS = 45.0
-"""Time in which the first bake after an installation compiles its code: about half a minute of the bake of
-`make demo` with AVX-512, and a minute without."""
+"""Seconds that the first bake after an installation spends on compiling its code: about half a minute of the
+bake of `make demo` with AVX-512, and a minute without."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Sizes that follow from the memory allowed, and the memory that the bake is expected to take."""
+    """Sizes chosen for the memory allowed, and the memory that the bake is expected to take."""
 
     resolutions: Resolutions
     n_cells: float
     """Cells of the features' grid that are expected to be stored."""
     cell_bytes: float
-    """Bytes that one of them takes, with its densities."""
+    """Bytes that a cell of the features' grid takes, with its densities."""
     unbounded: bool
     room: float
-    """Bytes for cells and rays."""
+    """Bytes available for cells and rays together."""
     marks: float
-    """Bytes while it is decided which cells are stored; the room is not taken yet."""
+    """Bytes of the marks by which the stored cells are found. They are freed before `room` is used."""
     page_cells: float
-    """Cells that fit into a page of the asset; infinitely many where the resolution was given."""
+    """Cells that fit into a page of the asset; infinite if the resolution was given."""
     most_rays: int
-    """Training rays that refinement has use for."""
+    """The most training rays that refinement has use for."""
 
     @property
     def ray_bytes(self) -> int:
@@ -117,28 +120,29 @@ class Plan:
 
     @property
     def most_cells(self) -> int:
-        """The number of cells that fit beside the rays that teach them. Where there is no room for all rays,
-        they have a share of it: with few of them refinement gains little."""
+        """The number of cells that fit beside the training rays. If not all rays fit, they get a share of the
+        room (RAYS_SHARE), because refinement gains little with few rays."""
         every = self.most_rays * self.ray_bytes
         rays = max(min(every, RAYS_SHARE * self.room), FEWEST_RAYS * self.ray_bytes)
         return int((self.room - rays) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
-        """Training rays for so many cells, as many as they need and for which there is room beside them."""
+        """Return the number of training rays for `n_cells` cells: as many as the cells need and as fit beside
+        them."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
         return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, self.most_rays))
 
     @property
     def n_bytes(self) -> int:
-        """Peak of memory that is expected."""
+        """Expected peak of memory, bytes."""
         held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * self.ray_bytes
         return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
 
 
 def make_plan(model: Model, config: BakeConfig) -> Plan:
-    """The plan of a bake that takes at most `config.max_memory` gigabytes.
+    """Plan a bake that takes at most `config.max_memory` gigabytes.
 
-    Raises ConfigError where even the fewest rays and the marks of the cells do not fit.
+    Raises ConfigError if even the fewest rays, or the marks of the cells, do not fit.
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
     resolutions = _resolutions(model, config)
@@ -174,19 +178,19 @@ def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
     room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
-    most = int(np.cbrt(room / _marks_bytes(model, config)))  # cells of the features' grid along an axis
+    most = int(np.cbrt(room / _marks_bytes(model, config)))  # feature cells per axis whose marks fit
     if not config.resolution:
         resolution = min(resolution, int(most / choice.feature_share))
     resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
     coarse = config.feature_resolution or round(choice.feature_share * resolution)
     if not (config.resolution or config.feature_resolution):
-        coarse = min(coarse, most)  # rounding may have gone beyond it
+        coarse = min(coarse, most)  # rounding above may have exceeded `most`
     coarse = int(np.clip(coarse, 8, min(field.max_resolution, resolution)))
     return Resolutions(resolution, coarse - coarse % BLOCK if field.unbounded else coarse)
 
 
 def _marks_bytes(model: Model, config: BakeConfig) -> float:
-    """Bytes for each cell of the features' grid while it is decided which of them are stored."""
+    """Return the bytes that each cell of the features' grid takes while the stored cells are found."""
     unbounded = model.field.config.unbounded
     n_floors = len(FLOORS) if config.weight_floor is None and not unbounded else 1
     n_bytes = 4 + (0 if config.no_cull else n_floors)
@@ -194,25 +198,25 @@ def _marks_bytes(model: Model, config: BakeConfig) -> float:
 
 
 def _cells(model: Model, resolution: int) -> float:
-    """How many cells of the features' grid will be stored, roughly."""
+    """Estimate how many cells of the features' grid will be stored."""
     if model.field.config.unbounded:
         return CELL_SHARE * resolution**3
     return float(np.count_nonzero(occupied_cells(model, resolution)))
 
 
 def photographed(model: Model, n_rays: int) -> int:
-    """How many of so many training rays go through training pixels of the model."""
+    """Return how many of `n_rays` training rays go through training pixels of the model."""
     n_pixels = 0 if model.training_pixels is None else len(model.training_pixels.pixels)
     return min(int(PHOTOGRAPHED * n_rays), n_pixels)
 
 
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
-    """How long the bake will take, seconds, from how long the teacher takes for some rays here."""
+    """Estimate the seconds that the bake will take, by timing the teacher on some rays on this machine."""
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
     every = model.model_cameras()
     views = every[:: -(-len(every) // VIEWS_TIMED)]
     n_rays = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1) * len(views)
-    render_teacher(model, views, n_rays, 0, lambda done, of: None)  # compiles
+    render_teacher(model, views, n_rays, 0, lambda done, of: None)  # compiles the code
     begin = time.perf_counter()
     shown = render_teacher(model, views, n_rays, 1, lambda done, of: None)
     ray_seconds = (time.perf_counter() - begin) / n_rays
@@ -239,12 +243,12 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
 
 
 def is_compiled() -> bool:
-    """Whether an earlier bake has compiled its code and kept it."""
+    """Return whether an earlier bake has compiled the code and cached it."""
     return is_kept("descend", *SOURCES)
 
 
 def refinement_seconds(choice: BakeChoice, before: float) -> float:
-    """Seconds that all rounds of refinement may take, where everything before them took so many.
+    """Return the seconds that all rounds of refinement may take if everything before took `before` seconds.
 
     >>> from vfr_bake.presets import PRESETS
     >>> refinement_seconds(PRESETS["balanced"], 100.0), refinement_seconds(PRESETS["balanced"], 1000.0)

@@ -1,15 +1,16 @@
-"""What `high` and `fast` pictures of an asset leave out: how nearly pixels have to agree for another to
-become their mean, and at how many places a ray fetches features.
+"""Choose what `high` and `fast` pictures of an asset leave out. There are two settings: by how much four
+pixels may differ for the pixel between them to become their mean, and the number of feature lookups a ray.
 
-What that costs in decibels depends on the asset: the sharper it is and the nearer to the photographs, the
-more the same levels lose. So both are chosen for each asset, by pixels of whole photographs that training has
-not learned from (`vfr_bake.data.witnesses`). Where there are none, pictures between the training views are
-compared with exact ones: these are off by E from photographs, and with a mean square difference e to them,
-which has nothing to do with that, 10 log10(1 + e / E) dB are lost.
+The loss in decibels of such a setting depends on the asset: the sharper the asset is, and the closer to the
+photographs, the more it loses by the same setting. So both settings are chosen for each asset, on pixels of
+whole photographs that training has not learned from (`vfr_bake.data.witnesses`). Without such photographs,
+pictures from between the training views are compared with exact pictures. If exact pictures have the mean
+square error E to photographs, and the others differ from exact ones by the mean square e, independent of
+those errors, then the loss is 10 log10(1 + e / E) dB.
 
-An interpolated picture is marched in stages, whose rays lie apart: they share neither steps nor cache lines,
-and take about APART times as long. Where most of them are left to march, pictures with fewer fetches, all of
-whose pixels are marched at once, are faster.
+An interpolated picture is marched in stages (`player.march.interpolation`). The rays of a stage lie apart, so
+that they share neither steps nor cache lines, and take about APART times as long. If most pixels have to be
+marched all the same, a picture with fewer lookups, all of whose pixels are marched at once, is faster.
 """
 
 from __future__ import annotations
@@ -34,39 +35,40 @@ from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import over_background
 
 ALLOWED_DB: dict[Quality, float] = {"high": 0.03, "fast": 0.3}
-"""Loss in dB of pictures, on average. `high` pictures may lose 0.05: a few views know that little only
-roughly, and with 0.05 lego's test views lost 0.06."""
+"""Allowed mean loss of the compared pictures, dB. The aim for `high` is 0.05 dB. The limit is lower because a
+few views measure so small a loss only roughly: with a limit of 0.05, lego's test views lost 0.06."""
 SPREADS, OF_ONE = 2.0, 1.5
-"""How many standard errors above the mean of a few views' losses is allowed that; of one view, which has
-none, so many times its loss."""
+"""Safety margins on the loss that is compared with ALLOWED_DB. With several views, this is their mean loss
+plus SPREADS standard errors; with one view, which has no standard error, OF_ONE times its loss."""
 WORST = 3.0
-"""How many times as much a single picture may lose."""
+"""The loss of a single picture may be this many times the allowed mean loss."""
 SHARES = tuple(0.85**n for n in range(16))
-"""Shares of the usual levels that are tried; behind the last, every pixel is marched."""
+"""Shares of the usual levels that are tried, in this order; if all lose too much, every pixel is marched."""
 MOST_PIXELS = 1_500_000
-"""Pixels of all pictures that are compared, at most, but for the first picture."""
+"""Most pixels of all compared pictures together; the first picture is compared whatever its size."""
 MARCH = 70_000
-"""A ray takes about as long as a head of so many weights for a pixel."""
+"""Cost of marching a ray, in weights of a head: evaluating a head of this many weights takes as long."""
 APART, FEWER = 2.0, 0.8
-"""How many times as long it takes beside rays that lie apart, and with fewer fetches."""
+"""Factors on the time of a ray: if the rays around it lie apart, and with fewer feature lookups."""
 LONGEST_SIDE = 640
-"""Pixels along a side of pictures between views, at most: larger ones are smoother, and lose less."""
+"""Most pixels along a side of pictures between views: larger pictures are smoother, and lose less."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a picture is compared at."""
+    """A camera and those of its pixels at which pictures are compared."""
 
     camera: Camera
     """WORLD frame."""
     pixels: np.ndarray
-    """[n] numbers of pixels, row by row."""
+    """[n] numbers of the compared pixels, counted row by row."""
     photograph: np.ndarray | None
-    """[n, 3] their colours in the photograph, 0 to 1; None where there is none."""
+    """[n, 3] colours of these pixels in the photograph, 0 to 1; None if there is no photograph."""
 
 
 def compared_views(model: Model, n_views: int) -> list[View]:
-    """The whole witnesses; where there are none, `n_views` views between the training cameras."""
+    """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none,
+    return `n_views` views between the training cameras."""
     witnesses = model.neutral_witnesses()
     if witnesses is None or not len(witnesses.whole):
         between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
@@ -84,21 +86,23 @@ def compared_views(model: Model, n_views: int) -> list[View]:
 
 
 class Qualities(NamedTuple):
-    """What `high` and `fast` pictures leave out."""
+    """The settings of `high` and `fast` pictures, in this order."""
 
     agreement: tuple[float, ...]
-    """By how many 8-bit levels pixels may differ of which another becomes the mean; 0: all are marched."""
+    """By how many 8-bit levels four pixels may differ for another one to become their mean; 0: all pixels are
+    marched."""
     fetches: tuple[int, ...]
-    """Feature fetches of a ray, at most; 0: as many as in exact pictures."""
+    """Most feature lookups of a ray; 0: as many as in exact pictures."""
 
 
 def fitting_qualities(asset: Asset, views: Sequence[View], error: float) -> Qualities:
-    """What `high` and `fast` pictures may leave out to lose what is allowed.
+    """Choose the settings with which `high` and `fast` pictures lose at most ALLOWED_DB.
 
     Args:
-        asset: which is played.
-        views: what is compared.
-        error: mean square error of exact pictures to photographs that are not there, above 0.
+        asset: the asset to play.
+        views: views at which pictures are compared.
+        error: expected mean square error of exact pictures to photographs, above 0; used for views without a
+            photograph.
     """
     with Renderer(asset) as renderer:
         played = _Played(renderer, views, error)
@@ -109,7 +113,7 @@ def fitting_qualities(asset: Asset, views: Sequence[View], error: float) -> Qual
 
 
 class _Played:
-    """An asset's pictures of some views, compared with its exact ones."""
+    """Pictures of an asset from some views, compared with its exact pictures."""
 
     def __init__(self, renderer: Renderer, views: Sequence[View], error: float) -> None:
         self._renderer, self._asset, self._views, self._error = renderer, renderer.asset, views, error
@@ -122,8 +126,9 @@ class _Played:
         return self._asset.manifest
 
     def levels(self, quality: Quality, usual: float) -> float:
-        """The most levels with which pictures of the quality lose what is allowed, the fewer, the less; 0
-        where so many pixels would be marched all the same that it does not pay."""
+        """Return the largest tried number of 8-bit levels whose pictures lose no more than is allowed;
+        fewer levels are taken to lose less. Returns 0 if so many pixels would have to be marched all the
+        same that interpolation saves no time."""
         tried = [round(usual * share, 1) for share in SHARES]
         found = [*tried, 0.0][bisect_left(tried, True, key=lambda levels: self._fits(quality, levels, 0))]
         self._leave_out(found, 0)
@@ -132,21 +137,22 @@ class _Played:
         return found if pays else 0.0
 
     def fetches(self, quality: Quality, levels: float) -> int:
-        """The fewest fetches of a ray with which pictures of the quality lose what is allowed, but no less
-        than half of them; 0 where all lose more, because rays end earlier."""
+        """Return the fewest feature lookups a ray whose pictures lose no more than is allowed, but at least
+        half of the asset's own. Returns 0 if all of them lose more, which can be because rays of this quality
+        end earlier."""
         own = self._manifest.n_fetches
         tried = sorted({n for n in (*LOOKUPS, own) if own <= 2 * n and 0 < n <= own})
         return [*tried, 0][bisect_left(tried, True, key=lambda n: self._fits(quality, levels, n))]
 
     def _leave_out(self, levels: float, n_fetches: int) -> None:
-        """Have pictures of either quality leave out so much."""
+        """Let the renderer use these settings for both qualities."""
         manifest = replace(self._manifest, agreement=(levels,) * 2, quality_fetches=(n_fetches,) * 2)
         changed = replace(self._asset, manifest=manifest)
-        vars(changed)["grid"] = self._asset.grid  # it need not be built again
+        vars(changed)["grid"] = self._asset.grid  # reuse the grid, which need not be built again
         self._renderer.show(changed)
 
     def _fits(self, quality: Quality, levels: float, n_fetches: int) -> bool:
-        """Whether pictures of a quality that leave out so much lose at most what is allowed."""
+        """Return whether pictures of the quality with these settings lose no more than is allowed."""
         self._leave_out(levels, n_fetches)
         errors = self._off(self._pictures(quality)[0])
         lost, allowed = 10 * np.log10(errors / self._errors), ALLOWED_DB[quality]
@@ -156,8 +162,8 @@ class _Played:
         return bool(most <= allowed and lost.max() <= WORST * allowed)
 
     def _pictures(self, quality: Quality) -> tuple[list[np.ndarray], int]:
-        """[n, 3] the colours of each view's pixels, rounded to 8 bits; and how many pixels of all views were
-        marched, and met something."""
+        """Render all views. Returns for each view its pixels' colours [n, 3], rounded to 8 bits, and the
+        number of pixels of all views that were marched and met something."""
         colours, n_marched = [], 0
         for view in self._views:
             frame = self._renderer.render(view.camera, quality=quality)
@@ -166,7 +172,8 @@ class _Played:
         return colours, n_marched
 
     def _off(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """[n_views] the mean square errors of pictures to photographs."""
+        """Return the mean square errors [n_views] of pictures to photographs, expected where there are
+        none."""
         found = []
         for view, exact, picture in zip(self._views, self._exact, pictures, strict=True):
             if view.photograph is None:

@@ -1,20 +1,22 @@
-"""What an asset stores of refined values: as much of each as a picture shows of it, for a price of bits.
+"""Rate-distortion optimisation of the stored codes: choose the symbols that an asset stores, at a price for
+each bit.
 
-A level of a pyramid stores by how many steps its values differ from what the next coarser level says
-(`player.asset.pyramid`). With the *importance* w_v of a vertex, the mean square by which a unit of its value
-changes the colours of training rays, and d_v for how far the stored value is from the refined one, symbols
-are chosen such that
+A symbol is the number of quantization steps by which a value of a pyramid's level differs from its prediction
+by the next coarser level (`player.asset.pyramid`). Let the *importance* w_v of a vertex be the mean square by
+which a unit of its value changes the colours of training rays, and d_v the difference between the stored and
+the refined value. Symbols are chosen such that
 
     D + price R,    D = sum_v w_v d_v^2,    R = the bits of all symbols,
 
-is small, level by level and vertex by vertex in the order in which they are coded. D leaves out that errors
-of vertices which a ray meets together add up or cancel: the price is chosen by what pictures lose. It is the
-highest at which they lose no more than they may, or the lowest at which the asset fits into the bytes that
-were asked for.
+is small, level by level and vertex by vertex in the order in which they are coded. D ignores that errors of
+vertices that lie on the same ray add up or cancel. So the price is chosen by the measured loss of pictures:
+the highest price at which they lose no more than allowed, or the lowest one at which the asset fits into the
+bytes that were asked for.
 
-Coarser levels that show nothing predict: their vertices weigh as much as all finer ones that they predict
-together, each by its share. Of features they want the weighted mean of those; of densities the value at the
-same place, because the density changes too fast at a surface for a mean to tell anything.
+Vertices of coarser levels that are not shown serve as predictors. Their importance is the sum of that of all
+finer vertices that they predict, by their shares in the prediction. The value wanted for a coarser feature is
+the weighted mean of the finer ones; for a coarser density it is the value at the same place, because density
+changes too fast at a surface for a mean to predict anything.
 """
 
 from __future__ import annotations
@@ -48,57 +50,60 @@ from vfr_bake.kernels.stored_features import padded, slants
 from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_coarser
 
 RAYS_AT_ONCE = 1 << 12
-"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
+"""Kept small: a ray through fog has hundreds of samples, and each takes 100 to 200 bytes while they are
+processed."""
 N_RAYS = 500_000
-"""Rays that tell how much vertices change what is seen, at most: more of them tell it better."""
+"""Most rays from which the importance is computed; more rays make it more exact."""
 AROUND: dict[Grid, float] = {"densities": 5.0, "features": 1.0}
-"""What a vertex has more importance than those rays say, because others will meet it: a share of the mean
-around it. What a density does depends more on the ray."""
+"""Importance added to each vertex, as a share of the mean importance around it, because rays that were not
+drawn will meet it, too. It is larger for densities, whose effect depends more on the ray."""
 EVERYWHERE: dict[Grid, float] = {"densities": 0.1, "features": 0.02}
-"""The same as a share of the mean of all vertices."""
+"""Importance added to each vertex, as a share of the mean importance of all vertices."""
 TURNS = 2
-"""How often the symbols of a level are chosen: each time with what the ones before cost."""
+"""Times that a level's symbols are chosen, each time with the bit costs that follow from the last choice."""
 STRENGTH = 16.0
-"""How many symbols of a context it takes until they count as much as those of all contexts together."""
+"""Weight of the statistics of all contexts in those of a single context, as a number of symbols: a context
+with this many symbols of its own weighs both alike."""
 DECAY = (0.05, 0.12, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.88)
-"""Before any symbol is chosen: how much rarer a symbol is than the next smaller one, by the magnitudes of the
-neighbours (the first factor of `player.asset.coder.tables.context`)."""
+"""Assumed before any symbol is chosen: the frequency of a symbol relative to that of the next smaller
+magnitude, by the magnitudes of the neighbours (the first factor of `player.asset.coder.tables.context`)."""
 
 
 TABLES = 1.04
-"""How many times as much symbols take in a file as they would with tables that are known: the tables."""
+"""Factor on the bytes of the symbols in a file that accounts for the probability tables stored with them."""
 
 
 FIRST_PRICE = 1.5e-9
-"""Price that is tried first, as a share of the model's mean square error: balanced objects end at
-2e-9 to 5e-9, captures at 4e-10."""
+"""Price that is tried first, as a share of the model's mean square error. The final prices are 2e-9 to 5e-9
+for balanced objects, and 4e-10 for captures."""
 LOWEST_PRICE = 1e-10
-"""Price below which more bytes show next to nothing, as a share of the model's mean square error: at 3e-10 of
-it fox's values take 8.0 MB, at 6e-11 of it 12.5 MB, which lose 0.02 dB less on test views."""
+"""Lowest price, as a share of the model's mean square error: below it, more bytes show next to nothing. Fox's
+values take 8.0 MB at 3e-10, and 12.5 MB at 6e-11, where they lose 0.02 dB less on test views."""
 SLOPE, SLOPES = 0.7, (0.25, 2.0)
-"""What a price loses grows with this power of it, before two prices tell the power; the least and the most
-that it may be."""
+"""The loss is taken to grow with a power of the price: with the exponent SLOPE at first, then with the one
+that follows from two prices, limited to the range SLOPES."""
 FURTHEST = 16.0
-"""Factor from one price to the next, at most."""
+"""Largest factor from one tried price to the next."""
 AIM, CLOSE = 0.9, 0.8
-"""The next price is to lose this share of what it may; one that loses so much of it is near enough."""
+"""Share of the allowed loss that the next price aims at; and share from which a price is near enough."""
 NEAR = 1.4
-"""So are two prices with this factor between them, of which the higher one loses too much."""
+"""The search also ends at two prices with at most this factor between them, if the higher one loses too
+much."""
 MOST_PRICES = 12
 PRICES_TRIED = 3
-"""How many prices are tried, mostly."""
+"""Typical number of prices that are tried."""
 
 
 class Importance(NamedTuple):
-    """By how much a unit of stored values changes colours in [0, 1]: mean squares over rays and colour
-    channels."""
+    """The importance of stored values: the squares by which a unit of a value changes colours in [0, 1],
+    averaged over rays and colour channels."""
 
     densities: np.ndarray
-    """[n_densities] float32, for a unit of the code."""
+    """[n_densities] float32, for a unit of the density code."""
     features: np.ndarray
-    """[n_features] float32, for a unit in all channels, one after the other: the sum of the squares."""
+    """[n_features] float32, the sum over channels of the importance of a unit of each channel's code."""
     channels: np.ndarray
-    """[n_channels] float64: the share of each channel in that; they add up to 1."""
+    """[n_channels] float64: the share of each channel in `features`; they add up to 1."""
 
 
 def importance(
@@ -109,19 +114,21 @@ def importance(
     ranges: tuple[Range, ...] | None,
     background: np.ndarray,
 ) -> Importance:
-    """How much each stored value matters on some of the teacher's rays, at every sample.
+    """Compute the importance of each stored value on up to N_RAYS of the teacher's rays, with feature lookups
+    at every sample.
 
-    The derivatives of a ray's three colours are not taken one by one: those of their sum with random signs
-    have the same mean square.
+    The three colour channels of a ray are not differentiated one by one. Instead, their sum with random signs
+    is: its derivatives have the same mean square.
 
     Args:
         stored: refined values and head.
-        layout, grid: where they are, and the grid of the finest level that is played.
+        layout: the layout of the values.
+        grid: the grid that the player makes of the finest level.
         teacher: rays.
-        ranges: of the head's activations, where it multiplies in 8 bits.
-        background: [3] behind the scene.
+        ranges: ranges of the head's activations, if it multiplies in 8 bits.
+        background: [3] colour behind the scene.
 
-    Raises TrainingError where no ray meets anything.
+    Raises TrainingError if no ray meets anything.
     """
     densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
     rays = collect_training_rays(teacher.some(N_RAYS), grid, 0, densities)
@@ -161,17 +168,17 @@ def importance(
 
 
 class Chosen(NamedTuple):
-    """What is stored at some price."""
+    """The values of a pyramid that are stored at some price."""
 
     stored: PyramidValues
     distortion: float
-    """D of the finest level: mean square error of colours that is expected."""
+    """D of the finest level: the expected mean square error of colours."""
     n_bytes: float
-    """What the symbols take."""
+    """Expected bytes of the symbols in the file."""
 
 
 class Choices:
-    """The values of a pyramid as they should be, and what is stored of them at different prices."""
+    """The wanted values of a pyramid, from which the values to store are chosen at any price."""
 
     def __init__(
         self,
@@ -183,11 +190,11 @@ class Choices:
     ) -> None:
         """
         Args:
-            grid: what the pyramid holds.
-            wanted: its cells, and the values of all levels; not copied.
-            importance: [n] float32 of the vertices of each level.
-            channels: [n_channels] factors of the importance.
-            step: of the symbols of all levels.
+            grid: the grid that the pyramid belongs to: densities or features.
+            wanted: the pyramid's cells, and the wanted values of all levels; not copied.
+            importance: for each level [n] float32, the importance of its vertices.
+            channels: [n_channels] factors on the importance.
+            step: quantization step of the symbols of all levels.
         """
         self._limits, self._kind = LIMITS[grid], DTYPES[grid]
         self._pyramid, self._channels = wanted.pyramid, channels
@@ -197,7 +204,7 @@ class Choices:
         self._rows = [_all_rows(level_rows(of_level)) for of_level in vertices]
 
     def at(self, price: float) -> Chosen:
-        """What is stored where a bit is worth a mean square error of `price`."""
+        """Choose the values to store if saving a bit is worth a mean square error of `price`."""
         n_channels = self._wanted[0].shape[1]
         values = tuple(np.empty((len(wanted), n_channels), self._kind) for wanted in self._wanted)
 
@@ -210,7 +217,8 @@ class Choices:
         return Chosen(PyramidValues(self._pyramid, values), distortion, TABLES * bits / 8)
 
     def _choose_channel(self, number: int, price: float, out: Sequence[np.ndarray]) -> tuple[float, float]:
-        """The distortion of the finest level and the bits of all."""
+        """Choose channel `number` of all levels into `out`. Returns the distortion of the finest level and
+        the bits of all levels."""
         bits, distortion, coarse = 0.0, 0.0, np.zeros((0, 1), np.int16)
         factor = np.float32(self._channels[number] / price)
         none = np.zeros((0, 1), np.int16)
@@ -223,7 +231,7 @@ class Choices:
                 )[:, 0]  # fmt: skip
             else:
                 predicted = np.zeros(vertices.n, np.int16)
-            inside = ~vertices.on_border  # what is on the border has no symbol
+            inside = ~vertices.on_border  # vertices on the border have no symbols
             wanted = np.clip(codes(self._wanted[level][inside, number]), *self._limits)
             weights, near = self._weights[level][inside] * factor, np.zeros(len(wanted) + 1, np.int16)
             values, cost = np.empty(len(wanted), np.int16), first_bits()
@@ -242,13 +250,14 @@ class Choices:
 
 
 def _all_rows(rows: LevelRows) -> tuple[np.ndarray, np.ndarray]:
-    """[3, n] int32 neighbours, n for one that is not there, and [n] uint8 classes."""
+    """Return [3, n] int32 rows of the neighbours, n for a missing one, and [n] uint8 classes."""
     neighbours = rows.neighbours.rows
     return np.where(neighbours < 0, np.int32(len(rows.classes)), neighbours), rows.classes
 
 
 def first_bits() -> np.ndarray:
-    """[n_classes * 81, 127] float32: what the symbols -63 to 63 may cost, before any is chosen."""
+    """Return [n_classes * 81, 127] float32: the assumed bits of the symbols -63 to 63 in each context, before
+    any symbol is chosen."""
     lean = N_CONTEXTS // len(DECAY)
     powers = np.array(DECAY)[:, None] ** np.abs(np.arange(-END, END + 1))
     bits = -np.log2(powers / powers.sum(axis=1, keepdims=True))
@@ -256,25 +265,26 @@ def first_bits() -> np.ndarray:
 
 
 def bits_of(seen: np.ndarray) -> np.ndarray:
-    """What each symbol costs in each context [n_contexts, 127] float32, from how often it was `seen` there;
-    contexts that hardly were follow the others."""
+    """Return [n_contexts, 127] float32: the bits of each symbol in each context, from the number of times it
+    was `seen` there. Contexts with few symbols follow the statistics of all contexts."""
     every = seen.sum(axis=0) + 1e-4 * max(seen.sum(), 1) * 0.7 ** np.abs(np.arange(-END, END + 1))
     chance = seen + STRENGTH * every / every.sum()
     bits = -np.log2(chance / chance.sum(axis=1, keepdims=True))
-    bits[:, [0, N_SYMBOLS - 1]] += 8  # and a byte for how much further from 0
+    bits[:, [0, N_SYMBOLS - 1]] += 8  # the end symbols are followed by a byte for the rest
     return bits.astype(np.float32)
 
 
 class Spent(NamedTuple):
-    """What is stored at some price."""
+    """The densities and features that are stored at some price."""
 
     arrays: GridArrays
     n_bytes: float
-    """What densities and features take in the asset's files, roughly."""
+    """Expected bytes of densities and features in the asset's files."""
 
 
 def expected_importance(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -> np.ndarray:
-    """The importance [n] float32 of the finest level's vertices for other rays than those that it is from."""
+    """Return the expected importance [n] float32 of the finest level's vertices for rays other than those
+    from which `importance` was computed."""
     mean = importance.mean(dtype=np.float64)
     everywhere, share = np.float32(EVERYWHERE[grid] * mean), np.float32(AROUND[grid])
     if len(pyramid.levels) == 1:
@@ -293,8 +303,9 @@ def expected_importance(grid: Grid, pyramid: Pyramid, importance: np.ndarray) ->
 
 
 def importance_of_levels(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -> list[np.ndarray]:
-    """The importance [n] float32 of the vertices of all levels of a whole pyramid, from that of the finest:
-    those of a coarser level weigh as much as all that they predict together."""
+    """Return for each level of a whole pyramid the importance [n] float32 of its vertices, from the
+    `importance` of the finest level. The importance of finer vertices is passed on to the coarser vertices
+    that predict them."""
     found = [expected_importance(grid, pyramid, importance)]
     for fine, coarse in pairwise(pyramid.vertices):
         found.append(np.zeros(coarse.n, np.float32))
@@ -303,14 +314,14 @@ def importance_of_levels(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -
 
 
 class Prices:
-    """Refined values, and what is stored of them at each price."""
+    """The refined densities and features, from which the values to store are chosen at any price."""
 
     def __init__(self, layout: Layout, densities: Wanted, features: Wanted, matters: Importance) -> None:
         """
         Args:
-            layout: the finest level.
-            densities, features: what of it is shown, and what it should be.
-            matters: how much the finest level's values matter.
+            layout: the layout of the finest level.
+            densities, features: the cells that are shown, and the wanted values.
+            matters: importance of the finest level's values.
         """
         pyramids = layout.pyramids
         self._densities = Choices(
@@ -333,7 +344,7 @@ class Prices:
         )
 
     def at(self, price: float) -> Spent:
-        """What is stored where a bit is worth a mean square error of `price`."""
+        """Choose the values to store if saving a bit is worth a mean square error of `price`."""
         densities, features = self._densities.at(price), self._features.at(price)
         return Spent(
             GridArrays(densities.stored, features.stored),
@@ -342,7 +353,8 @@ class Prices:
 
 
 def _shown_importance(grid: Grid, wanted: Wanted, whole: Pyramid, finest: np.ndarray) -> list[np.ndarray]:
-    """The importance of the vertices that are left of the pyramid `whole`."""
+    """Return for each level the importance of the vertices of `wanted`, which is a part of the pyramid
+    `whole`, from the importance `finest` of the whole finest level."""
     return [
         of_level[vertices.rows_of(left.bricks)]
         for of_level, vertices, left in zip(
@@ -352,10 +364,11 @@ def _shown_importance(grid: Grid, wanted: Wanted, whole: Pyramid, finest: np.nda
 
 
 def highest_price(share: Callable[[float], float], first: float, lowest: float = 0.0) -> float:
-    """A price of which `share`, what is lost at it as a share of what may be, is little below 1.
+    """Search for a price at which `share`, such as the loss divided by the allowed loss, is little below 1.
 
-    It rises with the price, about as a power of it, so that few of them have to be tried. Where it is above 1
-    at all prices, or below it, the price found is far from `first`, but not below `lowest`.
+    The share is taken to rise with the price, roughly as a power of it, so that few prices have to be tried.
+    If it is above 1 at all prices, or below 1 at all, the price returned is far from `first`, but not below
+    `lowest`.
 
     >>> 0.2 < highest_price(lambda price: (price / 0.3) ** 0.5, 1.0) <= 0.3
     True
@@ -370,15 +383,18 @@ def highest_price(share: Callable[[float], float], first: float, lowest: float =
         if CLOSE <= found <= 1 or high <= max(NEAR * low, lowest):
             break
         if lowest and not low and len(tried) > 1:
-            price = lowest  # does any price fit?
+            price = lowest  # check whether any price fits
         else:
             price = max(_next_price(tried, low, high, price), lowest)
     return low or min(tried)
 
 
 def _next_price(tried: dict[float, float], low: float, high: float, last: float) -> float:
-    """Where the share is about AIM; it is known at `last`, and at `low` and `high` on either side of 1 where
-    these are not 0 and infinite."""
+    """Return a price at which the share is expected to be about AIM.
+
+    The share is known at the prices in `tried`, of which `last` is the latest. It is at most 1 at `low`,
+    unless that is 0, and above 1 at `high`, unless that is infinite.
+    """
     if low and high < math.inf:
         little, much = tried[low], tried[high]
         way = math.log(AIM / little) / math.log(much / little) if little > 0 else 0.5

@@ -1,11 +1,11 @@
-"""Head, stored features and densities adapted to each other, and what they are tuned for: how many lookups a
-ray, and a head in 8 bits or not.
+"""Refinement: train head, stored features and densities together, and choose the number of feature lookups a
+ray and whether the head computes in 8 bits.
 
 Grid, projection, 8-bit codes and the choice of k samples change the composited features a little. So the
-folded head is trained, from its exact weights on, to give the colours of the full model, and those of
-photographs, from the features that the player composes out of the baked arrays, and the stored
-features with it. Codes are rounded where they are composed, and are trained as if they were not (straight
-through).
+folded head is trained further, starting from its exact weights, together with the stored features. Its input
+are the features that the player composites from the baked arrays; its targets are the colours of the full
+model and of photographs. Codes are rounded where they are composited, and gradients pass as if they were not
+(straight-through estimator).
 """
 
 from __future__ import annotations
@@ -37,98 +37,101 @@ from vfr_bake.presets import BakeChoice
 from vfr_bake.training.muon import Muon
 
 N_CALIBRATION = 20_000
-"""Rays that the calibration of the head's activations takes: they decide the ranges."""
+"""Rays from which the ranges of the head's activations are calibrated."""
 BATCH, HEAD_BATCH = 4096, 1024
-"""Rays of a step, and of a step in which the head alone is trained. Codes are rounded anew in each step, to
-which a head adapts better with more rays; one that is trained alone gains more by twice the steps with half
-the rays."""
+"""Rays of a step of refinement, and of a step in which the head alone is trained. Refinement rounds the codes
+anew in each step, and the head adapts to that better with more rays. A head that is trained alone gains more
+by twice the steps with half the rays."""
 UNIT = 4.0
-"""Mean sizes of a channel's composites that make a unit of it; so large a unit makes the first weights of the
-size that the learning rate fits."""
+"""Unit of a channel of the head's input, in mean sizes of its composites. With so large a unit, the first
+weights have the size that suits the learning rate."""
 HEAD_RATE, NEW_HEAD_RATE = 5e-4, 6e-3
-"""Learning rates of a head that the full model had, and of a small head that is not trained yet; they fall to
+"""Initial learning rates of the model's own head, and of a small head that is not trained yet; they fall to
 zero along a cosine."""
 CODE_RATE, DENSITY_RATE = 0.375, 1.5
-"""Adagrad's learning rates of feature codes up to 127 and of density codes; they fall along the same
+"""Adagrad's initial learning rates of feature codes up to 127 and of density codes; they fall along the same
 cosine."""
 DAMPING = 8.0
-"""Adagrad's squared gradients of all vertices begin at so many times the mean that the first batch leaves at
-the vertices that it meets. A vertex that few rays meet would else move as far as the others, to suit those
-rays alone."""
+"""Initial value of Adagrad's squared gradients at all vertices, as a multiple of their mean over the vertices
+that the first batch meets. Without it, a vertex that few rays meet would move as far as the others, and
+overfit to those rays."""
 PASSES = 10
-"""How often a round of refinement looks at each training ray, unless that takes more steps than the preset
-has: a small scene, whose vertices few rays suffice to teach, takes few steps."""
+"""Passes of a round of refinement over the training rays, unless they take more steps than the preset has. So
+a small scene, whose vertices can be trained with few rays, takes few steps."""
 HEAD_STEPS, LAST_STEPS = 2000, 1000
-"""Steps in which a small head is trained alone before refinement, and in which a head is trained alone for
-the lookups and bits with which it is played. The latter are at most as many as refinement may have."""
+"""Steps in which a small head is trained alone before refinement, and steps in which a head is trained alone
+for the feature lookups and bits with which it is played; the latter never exceed those of refinement."""
 HEAD_SHARE = 3
-"""Steps of a small head for each step that refinement may have, at most. They take a fifth of the time or
-less, and what the head has not learned refinement would have to."""
+"""Most steps of a small head for each step that refinement may take. They take a fifth of the time or less,
+and refinement would have to make up for what the head has not learned."""
 AT_K = 0.25
-"""Factor of the head's learning rate in the last round, where little is left to be learned."""
+"""Factor on the head's learning rate in the last round, where little is left to be learned."""
 N_HEAD = 1_000_000
-"""Rays from which a head is trained alone, whose composites are found once."""
+"""Rays on which a head is trained alone; their composites are computed once."""
 SHARES = {"small head": 0.2, "refinement": 0.8, "head at k": 1.0, "refinement at k": 1.0}
-"""Share of the time that is left which a round may take."""
+"""Share of the remaining time that each round may take."""
 HEAD_SECONDS = 20.0
-"""Seconds that the head may take in the last round in any case: it learns most of what it can in them."""
+"""Seconds that training the head may take in the last round in any case: enough to learn most of what it
+can."""
 FEATURES_SECONDS = 60.0
-"""Seconds that have to be left for the features to be trained in the last round: fewer gain nothing."""
+"""Seconds that must remain for the features to be trained in the last round: less time gains nothing."""
 DIRECTION_SHARE = 0.1
-"""A small head leaves the direction out where that loses no more than this share of the loss that the preset
-aims at."""
+"""A small head ignores the direction if that loses at most this share of the preset's target loss."""
 ROUNDING_LEFT = 0.5
-"""Share of what a head loses by 8 bits that is left after it was tuned with them, as far as that helps."""
+"""Expected share of a head's loss by 8 bits that remains after it was trained with them."""
 BITS_SHARE = 0.5
-"""Share of the loss that the preset aims at which a head in 8 bits may lose by them after it was tuned."""
+"""Share of the preset's target loss that a head may lose by 8 bits after it was trained with them."""
 WORTH_A_ROUND = 0.1
-"""Loss in dB by fewer lookups and a head in 8 bits for which the head is trained with them."""
+"""Loss in dB by fewer lookups and a head in 8 bits above which the head is trained with them."""
 WORTH_FEATURES = 0.15
-"""The same for which the features are trained with them, too: where rays have a hundred samples with weight,
-as in the fog of a model that has hardly learned, the few that are looked up show something else."""
+"""Loss in dB by fewer lookups and a head in 8 bits above which the features are trained, too. It is exceeded
+if rays have a hundred samples with weight, as in the fog of a model that has hardly learned: then a few
+lookups show something else."""
 MOST_FAR_OFF = 1e-4
-"""Share of the pixels that may be far off because of fewer lookups. A lookup that lies between two surfaces
-makes a pixel stand out that costs next to nothing on average: lego's fast asset has 870 such pixels in a
-million with 4 lookups a ray and 40 with 8, which take 3% more time."""
+"""Largest share of the pixels that may be far off because of fewer lookups. A lookup between two surfaces
+makes a pixel stand out, although it hardly changes the mean error: lego's fast asset has 870 such pixels in a
+million with 4 lookups a ray, and 40 with 8 lookups, which take 3% more time."""
 N_WARM, N_TIMED = 10, 40
-"""Steps of a round that are not timed, because something may be compiled for the first time, and steps that
-are."""
+"""Steps at the beginning of a round that are not timed, because code may be compiled in them; and steps after
+them that are timed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What the asset will hold, before its codes are rounded."""
+    """The head and values that the asset will hold, before the codes are rounded."""
 
     head: HeadWeights
     features: np.ndarray
     """[n_features, n_channels] int16: latent features, as `vfr_bake.kernels.stored_features` has them."""
     density: np.ndarray
-    """[n_densities] float32 codes within 0..255 that need not be whole."""
+    """[n_densities] float32 codes in 0..255, which need not be whole."""
 
 
 def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
-    """The steps of refinement from `n_rays` training rays that meet something, unless they were asked for."""
+    """Return the steps of a round of refinement with `n_rays` training rays that meet something, unless the
+    number of steps was given."""
     most = choice.refine_steps
     return most if config.refine_steps is not None else min(int(PASSES * n_rays / BATCH) + 1, most)
 
 
 def head_steps(choice: BakeChoice) -> int:
-    """The steps in which the head is trained alone, before refinement and after it."""
+    """Return the steps in which the head is trained alone, before and after refinement together."""
     return (small_head_steps(choice) if choice.head_width else 0) + min(LAST_STEPS, choice.refine_steps)
 
 
 def small_head_steps(choice: BakeChoice) -> int:
-    """The steps in which a small head is trained alone before refinement."""
+    """Return the steps in which a small head is trained alone before refinement."""
     return min(HEAD_STEPS, HEAD_SHARE * choice.refine_steps)
 
 
 class Tuning:
-    """What the rounds of refinement share, and what they find out."""
+    """The state that the rounds of refinement share, and their findings."""
 
     kept: Stage
-    """What the asset loses as `run` leaves it: a round that gained nothing is measured, but not kept."""
+    """The measured loss of the asset as `run` returns it. A round that gained nothing is measured, but does
+    not change `kept`."""
     _in_float32: Stage
-    """What it would lose with a head in float32."""
+    """The measured loss of the asset with the head in float32, before the last round."""
 
     def __init__(
         self,
@@ -138,22 +141,26 @@ class Tuning:
         progress: Callable[[str], Progress],
         seconds: float,
     ) -> None:
-        """`seconds`: what all rounds may take, if the number of their steps was not asked for."""
+        """`seconds` is the time that all rounds together may take, if the number of steps was not given."""
         self.n_fetches = choice.n_fetches
-        """Feature lookups of a ray, 0 for all."""
+        """Feature lookups of a ray, 0 for every sample."""
         self.ranges: tuple[Range, ...] | None = None
-        """Ranges of the head's activations, if it multiplies in 8 bits."""
+        """Ranges of the head's activations if it multiplies in 8 bits, else None."""
         self.lookups: dict[str, float] = {}
-        """Loss in dB by the lookups that were tried, against every sample."""
+        """Loss in dB of each number of lookups that was tried, compared with a lookup at every sample."""
         self.left_out: dict[str, str] = {}
-        """What the scene does not need, and what that changed."""
+        """Descriptions, by topic, of what was left out and what that changed."""
         self._config, self._choice = config, choice
         self._held_out, self._progress = held_out, progress
         self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
 
     def run(self, stored: Stored, layout: Layout, teacher: TeacherRays, again: Callable[[], Parts]) -> Stored:
-        """Head and stored values adapted to each other: at every sample, then at the k lookups that are
-        played. Changes the features of `stored` in place; `again` finds what they were, should that lose."""
+        """Refine head and stored values together: with lookups at every sample first, then with the k lookups
+        that are played.
+
+        Changes the features of `stored` in place. `again` computes the original features, which are needed if
+        the refined ones lose more.
+        """
         choice = self._choice
         grid = layout.grid(stored.density, stored.features)
         if choice.refine_steps == 0:
@@ -172,7 +179,7 @@ class Tuning:
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
         with self._steps("refinement", refined_steps(self._config, choice, len(rays))) as steps:
             tuned = refine(stored, rays, steps, layout.density_range, head_rate, code_rate)
-        del rays, densities  # they hold on to rows of a grid, for two of which there may be no room
+        del rays, densities  # frees the rows of the old grid: there may be no memory for two
         grid = layout.grid(tuned.density, tuned.features)
         after = self._held_out.measure("refined", grid, runner(tuned.head), 0)
         if self._gained("refinement", before, after):
@@ -207,7 +214,8 @@ class Tuning:
         return self._in_enough_bits(stored, stored)
 
     def _in_enough_bits(self, stored: Stored, tuned: Stored) -> Stored:
-        """`tuned`; but `stored`, with its head in float32, where 8 bits lose too much all the same."""
+        """Return `tuned`; or `stored`, with its head in float32, if 8 bits lose too much even after
+        training."""
         lost = self._held_out.lost(self._in_float32.shown, self.kept.shown)
         if self.ranges is None or lost.most <= BITS_SHARE * self._choice.target_loss_db:
             return tuned
@@ -223,8 +231,8 @@ class Tuning:
         head_rate: float,
         code_rate: float,
     ) -> Stored:
-        """Head and features adapted to the lookups and bits that are played, if that gains anything. Changes
-        the features of `stored` in place."""
+        """Refine head and features with the lookups and bits that are played, and keep the result if it gains
+        anything. Changes the features of `stored` in place."""
         rays = collect_training_rays(teacher, grid, self.n_fetches)
         asked, left = refined_steps(self._config, self._choice, len(rays)), remainders(stored.features)
         with self._steps("refinement at k", asked) as steps:
@@ -240,7 +248,8 @@ class Tuning:
 
     @contextmanager
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:
-        """The steps of a round, which takes its share of the time that is left."""
+        """Give the steps of round `name`, up to `asked`, within its share of the remaining time. Afterwards,
+        note the steps that were left out."""
         seconds = SHARES[name] * self._seconds_left()
         if name == "head at k":
             seconds = max(seconds, HEAD_SECONDS)
@@ -254,14 +263,15 @@ class Tuning:
         return self._until - time.monotonic()
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
-        """Whether less is lost than before, on pixels that nothing is trained on."""
+        """Return whether less is lost than before, on pixels that nothing is trained on; if not, note that
+        round `name` was left out."""
         if self._held_out.is_better(before.shown, after.shown):
             return True
         self.left_out[name] = "all of it: it lost more on what it has not seen"
         return False
 
     def _new_head(self, own: HeadWeights, code_scale: np.ndarray) -> HeadWeights:
-        """A small head that is not trained yet; without directions where the colours do not need them."""
+        """Make a small, untrained head. It ignores directions if the colours hardly depend on them."""
         choice, n_bands = self._choice, min(self._choice.head_bands, own.sh_degree)
         lost = self._held_out.direction_loss()
         if lost.most < DIRECTION_SHARE * choice.target_loss_db:
@@ -272,8 +282,8 @@ class Tuning:
         return small_head(own, choice.head_width, choice.head_layers, n_bands, code_scale)
 
     def _choose_lookups_and_bits(self, stored: Stored, grid: SparseGrid, teacher: TeacherRays) -> Stage:
-        """Set `n_fetches`, and also `ranges`, unless a head in 8 bits would lose more than the preset allows
-        even after it was tuned. Returns what the asset loses then."""
+        """Set `n_fetches`, and also `ranges`, unless a head in 8 bits is expected to lose more than the
+        preset allows even after training. Returns the measured loss with these settings."""
         before = self._in_float32 = self._choose_lookups(grid, stored.head)
         if self._choice.head_bits == 32:
             return before
@@ -289,9 +299,9 @@ class Tuning:
         return after
 
     def _choose_lookups(self, grid: SparseGrid, head: HeadWeights) -> Stage:
-        """Set `n_fetches` to what was asked for, or the fewest that lose no more than the preset allows and
-        let no more pixels stand out than MOST_FAR_OFF; what each number loses is kept in `lookups`. Returns
-        what the asset loses with them."""
+        """Set `n_fetches` to the number that was given, or to the fewest lookups that lose no more than the
+        preset allows and let at most a share MOST_FAR_OFF of the pixels stand out. The loss of each number
+        that is tried is put into `lookups`. Returns the measured loss with the chosen number."""
         most = self._choice.n_fetches
         run = runner(head)
         if self._config.k == "auto":
@@ -310,8 +320,8 @@ class Tuning:
 
 
 class Steps:
-    """The steps of a round of refinement: as many as are asked for, or fewer where there is no time for them,
-    which the first ones tell.
+    """The steps of a round of refinement: as many as asked for, or fewer if the time of the first ones shows
+    that there is no time for all.
 
     >>> steps = Steps(40, lambda done, of: None)
     >>> [round(steps.falling(step), 3) for step in steps][::10]
@@ -331,23 +341,25 @@ class Steps:
             if step == N_WARM:
                 begin = time.monotonic()
             elif step == N_WARM + N_TIMED:
-                # A clock may stand still for as long as 16 ms.
+                # Not 0: the resolution of some clocks is only 16 ms.
                 step_seconds = max(time.monotonic() - begin, 1e-9) / N_TIMED
                 self.n = max(int(min(self.n, self._seconds / step_seconds)), step)
             if step % 50 == 0 or step == self.n:
                 self._progress(step, self.n)
 
     def falling(self, step: int) -> float:
-        """The factor of a learning rate at a step, along a cosine from 1 to 0."""
+        """Return the factor on a learning rate at `step`, along a cosine from 1 to 0."""
         return float(0.5 * (1 + np.cos(np.pi * step / self.n)))
 
 
 def train_head(
     stored: Stored, rays: TrainingRays, steps: Steps, rate: float, ranges: tuple[Range, ...] | None = None
 ) -> HeadWeights:
-    """The head after `steps` on the squared error of the colours over random backgrounds, with everything
-    else as it is stored: what the rays compose is found once. With `ranges` it is trained as it is played in
-    8 bits (`vfr_bake.baking.head`)."""
+    """Train the head alone, on the squared error of the colours over random backgrounds.
+
+    The stored values stay as they are, so the rays' composites are computed only once. With `ranges`, the
+    head is trained as it is played in 8 bits (`vfr_bake.baking.head`).
+    """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
     head = FoldedHead(stored.head, UNIT * rays.typical(stored.features), ranges)
@@ -369,12 +381,14 @@ def refine(
     code_rate: float = CODE_RATE,
     ranges: tuple[Range, ...] | None = None,
 ) -> Stored:
-    """Head, features and densities after `steps` on the squared error of the colours over random backgrounds.
+    """Train head, features and densities together, on the squared error of the colours over random
+    backgrounds.
 
-    Codes are rounded where they are composed, not where they are kept. The features of `stored` are changed
-    in place: there may be no room for them twice. With a `density_range`, that of `Layout`, the `rays` hold
-    every sample and the densities around it, and their weights follow the densities. Without one the
-    densities stay as they are. With `ranges` the head is trained as it is played in 8 bits.
+    Codes are rounded where they are composited, not where they are kept. The features of `stored` are changed
+    in place, because there may be no memory for a copy. With a `density_range`, which is that of `Layout`,
+    densities are trained, too: the `rays` must then hold every sample and the densities around it, and the
+    samples' weights follow the densities. Without it, the densities stay unchanged. With `ranges`, the head
+    is trained as it is played in 8 bits.
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
@@ -388,7 +402,7 @@ def refine(
     muon = Muon(head.parameters())
     for step in steps:
         falling = steps.falling(step)
-        moving = falling if step else 0.0  # stored values wait for the squared gradients of the first rays
+        moving = falling if step else 0.0  # in step 0, stored values only collect squared gradients
         some = random.integers(0, len(rays), BATCH)
         fetches = rays.fetches(some)
         if density_range is not None:
@@ -431,15 +445,15 @@ def refine(
 
 
 def _damp(squares: np.ndarray) -> None:
-    """Let the squared gradients [n] of all vertices begin at DAMPING times those that the first rays have
-    left."""
+    """Set Adagrad's squared gradients [n] of all vertices to DAMPING times the mean of those above 0, which
+    are at the vertices that the first rays have met."""
     met = squares[squares > 0]
     squares[:] = DAMPING * met.mean() if len(met) else 0
 
 
 def _loss(head: FoldedHead, composed: Tensor, opacity: Tensor, rays: TeacherRays) -> Tensor:
-    """Mean squared error of the colours of the `rays` over random backgrounds, where they compose
-    [n, n_channels] and have this opacity [n]."""
+    """Return the mean squared error of the colours of the `rays` over random backgrounds, from their
+    composites `composed` [n, n_channels] and their opacity [n]."""
     dirs, colours, full_opacity = map(torch.from_numpy, (rays.rays_d, rays.colours, rays.opacity))
     background = torch.rand(len(dirs), 3)
     shown = head(composed, dirs) * opacity[:, None] + background * (1 - opacity)[:, None]

@@ -1,6 +1,6 @@
-"""`report.json` and `report.html`: what the bake chose, left out and lost, for programs and for people.
+"""Write `report.json`, for programs, and `report.html`, for people: what the bake chose, left out and lost.
 
-A page is one file: plots are SVG inside it, pictures are PNG inside it, nothing is loaded from elsewhere.
+The page is a single file: it contains plots as SVG and pictures as PNG, and loads nothing from elsewhere.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import BRIGHTEST_ERROR, comparison
 
 N_PICTURES = 2
-"""Views shown side by side in the report."""
+"""Number of views in the report that show the full model and the asset side by side."""
 PICTURE_PIXELS = 160_000
 """Most pixels of such a view: the full model takes a second for 10,000 pixels of an unbounded scene."""
 BAR_WIDTH = 420
-"""Pixels of the longest bar of a plot."""
+"""Length in pixels of the longest bar of a plot."""
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #222
 } table { border-collapse: collapse; margin: 1em 0 }
@@ -40,16 +40,16 @@ img { max-width: 100%; image-rendering: pixelated }
 
 
 class Pictures(NamedTuple):
-    """One view as two pictures, [height, width, 3] in [0, 1]."""
+    """Two pictures of one view, [height, width, 3] in [0, 1]."""
 
     name: str
     wanted: np.ndarray
-    """The picture to be reached: the full model's, or a photograph."""
+    """The reference picture: the full model's, or a photograph."""
     played: np.ndarray
     """The asset's picture."""
 
     def html(self) -> str:
-        """A paragraph with both pictures and their difference."""
+        """Return a paragraph of HTML with both pictures and their difference."""
         data = base64.b64encode(png_bytes(comparison(self.wanted, self.played))).decode()
         name = escape(self.name)
         return f'<p>{name}<br><img alt="{name}" src="data:image/png;base64,{data}"></p>'
@@ -57,37 +57,38 @@ class Pictures(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BakeReport:
-    """All that a bake has to say about itself."""
+    """The content of a bake's report."""
 
     title: str
     asked: dict[str, Any]
     """Preset and settings as resolved, and the limits that were asked for."""
     stages: list[dict[str, Any]]
-    """`vfr_bake.baking.held_out.HeldOut.table`: what each step shows and loses, in order."""
+    """Figures of each step of the bake, in order, as `vfr_bake.baking.held_out.HeldOut.table` gives them."""
     measured_on: str
-    """What the losses are measured on, or estimated from, in a sentence."""
+    """Description of what the losses are measured on, or estimated from."""
     n_bytes: dict[str, int]
     """Bytes of each file."""
     seconds: dict[str, float]
-    """Time of each part."""
+    """Wall-clock seconds of each part of the bake."""
     left_out: dict[str, str]
-    """What is not in the asset, and what that changed."""
+    """Descriptions, by topic, of what was left out of the asset and what that changed."""
     lookups: dict[str, float]
-    """Loss in dB of each number of lookups a ray against all of them; empty where the number was given."""
+    """Loss in dB of each number of feature lookups a ray, compared with a lookup at every sample; empty if
+    the number was given."""
     missed: list[str]
-    """Limits that were not met, in words; empty if all were."""
+    """The targets that were missed, in words; empty if all were met."""
     pictures: list[Pictures] = field(default_factory=list)
-    """The full model's pictures and the played ones."""
+    """Pictures of the full model and of the asset."""
 
     def json(self) -> bytes:
-        """The content of report.json."""
+        """Return the content of report.json."""
         names = ("asked", "stages", "measured_on", "seconds", "left_out", "lookups", "missed")
         document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
         document |= {name: self.stages[-1][name] for name in ("loss_db", "loss_db_spread")}
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
     def html(self) -> bytes:
-        """The content of report.html."""
+        """Return the content of report.html."""
         last = self.stages[-1]
         megabytes = sum(self.n_bytes.values()) / 1e6
         lookups = f"<h2>Lookups a ray: loss against all</h2>{bars(self.lookups, 'dB', 3)}"
@@ -123,7 +124,7 @@ class BakeReport:
 
 
 def page(title: str, *parts: str) -> bytes:
-    """A page of HTML."""
+    """Return a page of HTML."""
     title = escape(title)
     text = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -133,17 +134,17 @@ def page(title: str, *parts: str) -> bytes:
 
 
 def table(rows: Iterable[str]) -> str:
-    """A table of HTML rows."""
+    """Return an HTML table of rows that are HTML already."""
     return f"<table>{''.join(rows)}</table>"
 
 
 def title_row(*titles: str) -> str:
-    """The first row of a table."""
+    """Return the HTML of a table's first row."""
     return f"<tr>{''.join(f'<th>{escape(title, quote=False)}</th>' for title in titles)}</tr>"
 
 
 def row(first: str, *numbers: str, bold: bool = False) -> str:
-    """A row of a table: a name and numbers.
+    """Return the HTML of a table's row: a name and numbers.
 
     >>> row("grid", "1.5")
     '<tr><td>grid</td><td class="number">1.5</td></tr>'
@@ -154,7 +155,7 @@ def row(first: str, *numbers: str, bold: bool = False) -> str:
 
 
 def bars(values: dict[str, float], unit: str, digits: int) -> str:
-    """A bar for each value >= 0, longest for the largest, as SVG.
+    """Return a bar plot as SVG, with a bar for each value; negative values have bars of length 0.
 
     >>> bars({"grid": 0.5, "k": 1.0}, "dB", 1).count("<rect")
     2
@@ -174,7 +175,7 @@ def bars(values: dict[str, float], unit: str, digits: int) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number with so many decimals; nothing where there is none."""
+    """Format a number with so many decimal `digits`; None becomes an empty string."""
     return "" if value is None else f"{value:.{digits}f}"
 
 
@@ -183,7 +184,7 @@ def _pairs(values: dict[str, str]) -> str:
 
 
 def side_by_side(model: Model, asset: Asset) -> Iterator[Pictures]:
-    """Some views between the cameras, by the full model and by the asset."""
+    """Render some views between the training cameras with the full model and with the asset."""
     with Renderer(asset) as renderer:
         for view in views_between(model, N_PICTURES, seed=3):
             share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))

@@ -1,1 +1,1 @@
-"""The trade between speed and accuracy of baked assets, measured: `vfr-bench`."""
+"""Measurement of the trade between speed and accuracy of baked assets: `vfr-bench`."""

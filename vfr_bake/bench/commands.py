@@ -1,4 +1,4 @@
-"""The commands that bake or play a setting again."""
+"""The commands that bake an asset like a measured one, and that play it with a measured setting."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ GIVEN = (
 
 
 def bake_command(folder: str, asset: Asset) -> str:
-    """The command that bakes an asset like this one, from the settings that the asset keeps; "" if it keeps
-    none, or something else."""
+    """Return the command that bakes an asset like this one, from the settings that the asset keeps; "" if it
+    keeps none, or if they are not understood."""
     settings = asset.manifest.provenance.get("bake")
     preset = settings.get("preset") if isinstance(settings, dict) else None
     if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
@@ -43,7 +43,7 @@ def bake_command(folder: str, asset: Asset) -> str:
 
 
 def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, int]) -> str:
-    """The command that plays an asset with k = `samples`.
+    """Return the command that plays an asset with k = `samples`.
 
     >>> play_command("my out", 5, "fast", (400, 300))
     "vfr-play 'my out' --samples 5 --quality fast --size 400x300 --orbit 60 --output frames/"

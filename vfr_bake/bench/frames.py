@@ -1,15 +1,16 @@
-"""The processes that render for the bench: one plays an asset, another renders the full model.
+"""Processes that render for the bench: one plays an asset, another renders the full model.
 
     python -m vfr_bake.bench.frames player ASSET CAMERAS THREADS MAX_MEMORY
     python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS
 
-A request has `view`, `size` [width, height], for an asset `samples` and `quality`, and `rgb`, a file for the
+A request has `view`, `size` [width, height], for an asset `samples` and `quality`, and `rgb`: a file for the
 picture [height, width, 4], its colours over the background and its opacity, or null. The answer has the
-milliseconds of the frame and, of them, of march with lookups and of the head (time in their tasks over the
-number of threads), the fetches of all rays that hit, and peak memory. A model's frame is not taken apart.
+milliseconds of the frame, and the parts that the march with lookups and the head take (time in their tasks
+over the number of threads), the feature lookups of all rays that hit, and the peak memory. A model's frame
+is not split into parts.
 
-The player's process imports the player alone, as `vfr-play` does; so what either needs is imported where it
-is opened.
+The player's process imports the player alone, as `vfr-play` does. So the imports that only one of the
+processes needs are inside the function that opens its asset or model.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from vfr_bake.bench.process import Answer, Clock, serve
 
 
 def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Answer:
-    """An asset ready to play; `threads` 0 is one for each core, `max_memory` 0 a share of the machine's."""
+    """Open an asset and return a function that plays it; `threads` 0 is one for each core, `max_memory` 0 a
+    share of the machine's memory."""
     from player.asset.asset import Asset
     from player.march.march import MIN_OPACITY
     from player.render import Renderer
@@ -58,7 +60,7 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
 
 
 def open_model(path: str, cameras: str, threads: str) -> Answer:
-    """A model ready to render; `threads` 0 is one for each core."""
+    """Open a model and return a function that renders it; `threads` 0 is one for each core."""
     import numba
     import torch
 
@@ -87,14 +89,14 @@ def open_model(path: str, cameras: str, threads: str) -> Answer:
 
 
 def _timed(render: Callable[[], Any]) -> tuple[Any, float]:
-    """What was rendered, and the milliseconds that it took."""
+    """Return what `render` returns, and the milliseconds that it took."""
     start = time.perf_counter()
     rendered = render()
     return rendered, 1000 * (time.perf_counter() - start)
 
 
 def _kept(request: dict[str, Any], rgb: np.ndarray, opacity: np.ndarray) -> dict[str, Any]:
-    """Write the picture if that is asked for; returns the peak memory."""
+    """Write the picture if the request asks for it; return the peak memory."""
     if request["rgb"] is not None:
         np.save(request["rgb"], np.concatenate([rgb, opacity[..., None]], axis=-1))
     return {"peak_mb": peak_rss_mb()}

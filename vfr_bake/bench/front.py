@@ -1,8 +1,8 @@
-"""The Pareto front: the settings that nothing else beats in quality, time and size at once.
+"""The Pareto front: the settings that no other setting beats in quality, time and size at once.
 
-Quality is in dB, time in ms a frame, size in MB. Times are known to within their uncertainty only, and a
-setting is not thrown out because of noise: A beats B if A is at least as good, at least as small and not
-slower beyond the uncertainty of both, and better, smaller or faster (beyond the uncertainty) in something.
+Quality is in dB, time in ms per frame, size in MB. Times are known only to within their uncertainty, and
+noise must not exclude a setting. So A beats B if A is at least as good, at least as small and not slower
+beyond the uncertainty of both, and if it is better, smaller or faster (beyond the uncertainty) in something.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 MAX_LOSS_DB, MAX_MS, MAX_MB = 0.1, 100.0, 20.0
-"""Limits on the loss in dB, on the milliseconds of a frame and on the megabytes, for each of which a setting
-is recommended."""
+"""Limits on the loss in dB, on the milliseconds of a frame and on the megabytes. For each of them
+a setting is recommended."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """What one setting gives and takes."""
+    """Quality, time and size of one setting."""
 
     name: str
     psnr: float
-    """dB against the photographs."""
+    """PSNR against the photographs, dB."""
     ms: float
     uncertainty: float
     """Half width of the interval around `ms` that noise alone explains, milliseconds."""
@@ -29,7 +29,7 @@ class Point:
 
 
 def beats(a: Point, b: Point) -> bool:
-    """Whether nobody has a reason left to choose b.
+    """Return whether `a` leaves no reason to choose `b`.
 
     >>> slow, fast = Point("slow", 30.0, 90.0, 2.0, 8.0), Point("fast", 30.0, 50.0, 2.0, 8.0)
     >>> beats(fast, slow), beats(slow, fast), beats(slow, slow)
@@ -41,14 +41,15 @@ def beats(a: Point, b: Point) -> bool:
 
 
 def pareto_front(points: Sequence[Point]) -> list[bool]:
-    """Which of the points are on the front."""
+    """Return for each of the points whether it is on the front."""
     return [not any(beats(other, point) for other in points) for point in points]
 
 
 def recommend(points: Sequence[Point], reference: float, against: str) -> str:
-    """One sentence: what to play for at most MAX_LOSS_DB, MAX_MS, MAX_MB.
+    """Return one sentence that recommends settings for at most MAX_LOSS_DB, MAX_MS and MAX_MB.
 
-    `points` are those of assets, `reference` the PSNR that losses are counted from, `against` its name.
+    `points` are those of assets, `reference` is the PSNR that losses are counted from,
+    and `against` is its name.
 
     >>> some = [Point("k 5", 30.0, 90.0, 1.0, 24.0), Point("k 2", 29.0, 50.0, 1.0, 18.0)]
     >>> recommend(some, 30.05, "the model")
@@ -60,7 +61,8 @@ k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).
         return f"{reference - point.psnr:.2f} dB, {point.ms:.0f} ms, {point.megabytes:.0f} MB"
 
     def best_for(wanted: str, limit: float, cost: Callable[[Point], float], fast: bool = False) -> str:
-        """What to play for at most `limit`: the fastest that keeps to it, or the best."""
+        """Return the words that recommend a setting whose cost is at most `limit`: the fastest one if `fast`,
+        else the one of the best quality."""
         fitting = [point for point in points if cost(point) <= limit]
         if not fitting:
             nearest = min(points, key=cost)

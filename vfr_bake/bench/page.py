@@ -1,4 +1,5 @@
-"""The trade as a page: one file, plots and pictures inside it, nothing loaded from elsewhere."""
+"""The measured trade as a single-file HTML page with plots and pictures inside, which
+loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -12,11 +13,11 @@ from vfr_bake.bench.worst import WorstPixel
 from vfr_bake.training.scores.metrics import BRIGHTEST_ERROR
 
 SCORES = {"psnr": 2, "loss_db": 2, "ssim": 4, "lpips": 4, "psnr_to_model": 2, "ssim_to_model": 4}
-"""Decimal places of each score that the table of all settings shows."""
+"""Scores that the table of all settings shows, with their decimal places."""
 
 
 def trade_page(trade: Trade) -> bytes:
-    """The trade as HTML."""
+    """Return the trade as an HTML page."""
     width, height = trade.sizes[0]
     wanted = "full model" if trade.conditions["model"] else "photograph"
     front = [setting for setting in trade.settings if setting.on_front]
@@ -52,7 +53,7 @@ def trade_page(trade: Trade) -> bytes:
 
 
 def table_lines(trade: Trade) -> list[str]:
-    """The front as lines of plain text, best first."""
+    """Return the settings on the front as lines of plain text, best first."""
     titles = ["setting", "PSNR", "loss", "SSIM", "ms", "p95", "MB"]
     front = [setting for setting in trade.settings if setting.on_front]
     front.sort(key=lambda setting: -setting.point.psnr)
@@ -74,7 +75,8 @@ def _front_cells(setting: Setting, times: Times) -> list[str]:
 
 
 def _marks(trade: Trade, x: str) -> dict[str, list[Mark]]:
-    """A mark for every setting, by asset; `x` is what is drawn across: "time", "size" or "k"."""
+    """Return a mark for every setting, grouped by asset; `x` names the quantity on the x
+    axis: "time", "size" or "k"."""
     played = [setting for setting in trade.settings if setting.asset is not None]
     shown = played if x == "k" else trade.settings
     most_ms = max(setting.point.ms for setting in shown)

@@ -1,4 +1,4 @@
-"""Plots as SVG: one file, no library, text that can be searched."""
+"""Plots as SVG text, which needs no library, fits into one file and can be searched."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ class Mark:
     size: float
     """Area as a share 0 to 1 of the largest mark's."""
     label: str
-    """Text that is shown where the mouse rests on the mark."""
+    """Text that is shown while the mouse rests on the mark."""
     filled: bool
-    """Whether it is on the front."""
+    """True for a setting on the front; only such marks are filled."""
 
 
 def plot(series: Mapping[str, Sequence[Mark]], x_title: str, y_title: str, joined: bool = False) -> str:
-    """Marks by series, each in a colour of its own, over a logarithmic x axis; `joined`: with lines.
+    """Return an SVG plot of marks over a logarithmic x axis, in one colour per series. With `joined`, lines
+    connect the marks of a series.
 
     >>> picture = plot({"out": [Mark(10, 30, 0.5, "k 5", True)]}, "ms", "dB")
     >>> picture.count("<circle"), "k 5" in picture
@@ -100,7 +101,7 @@ def _axes(x_low: float, x_high: float, y_low: float, y_high: float, x_title: str
 
 
 def x_ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times the powers of ten between 10^low and 10^high.
+    """Return 1, 2 and 5 times the powers of ten between 10^low and 10^high.
 
     >>> x_ticks(0.9, 2.1)
     [10.0, 20.0, 50.0, 100.0]

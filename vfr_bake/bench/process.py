@@ -1,6 +1,7 @@
-"""A process that renders on request: what is timed in it is disturbed by nothing else that the bench does.
+"""A process that renders on request, so that nothing else that the bench does disturbs its frame times.
 
-One line of JSON asks for a frame, one line answers. Pictures travel as .npy files, so that lines stay short.
+One line of JSON asks for a frame, and one line answers. Pictures travel as .npy files,
+so that lines stay short.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Answer = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class Process:
-    """`vfr_bake.bench.frames` as a program of its own, with its arguments; a context manager."""
+    """`vfr_bake.bench.frames` as a program of its own, with the given arguments; a context manager."""
 
     def __init__(self, *arguments: str) -> None:
         self._name = f"{arguments[0]}_frames"
@@ -39,13 +40,14 @@ class Process:
         self._process.communicate()
 
     def ask(self, **request: Any) -> dict[str, Any]:
-        """What the process answers. Raises VfrError: it failed, with its own message, or it ended."""
+        """Send a request and return the answer. Raises VfrError: the process failed, with its
+        own message, or it ended."""
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
         try:
             requests.write(json.dumps(request) + "\n")
             requests.flush()
-        except OSError:  # it ended; if it said why, that is still to be read
+        except OSError:  # the process ended; if it wrote an error before, that is read below
             pass
         line = answers.readline()
         if not line:
@@ -57,7 +59,7 @@ class Process:
 
 
 def serve(start: Callable[[], Answer], requests: TextIO, answers: TextIO) -> None:
-    """Answer each request until there are no more; what goes wrong is the answer, and the end.
+    """Answer each request until there are no more; a VfrError is written as the last answer.
 
     >>> import io
     >>> out = io.StringIO()
@@ -76,7 +78,7 @@ def serve(start: Callable[[], Answer], requests: TextIO, answers: TextIO) -> Non
 
 
 class Clock:
-    """Time spent in a function, over all threads."""
+    """Wrapper of a function that sums the time spent in it over all threads."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.seconds = 0.0

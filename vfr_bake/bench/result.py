@@ -1,4 +1,4 @@
-"""What the bench has found: a row for every setting, which of them are on the front, and what to choose."""
+"""The result of the bench: a row for every setting, whether it is on the front, and a recommendation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vfr_bake.bench.timing import Size, Times
 from vfr_bake.bench.worst import WorstPixel
 
 MAX_PSNR = 99.0
-"""PSNR in dB that equal pictures, whose PSNR is infinite, count as in a loss."""
+"""PSNR in dB that equal pictures, whose PSNR is infinite, count as."""
 
 
 @dataclass(frozen=True)
@@ -24,30 +24,30 @@ class Setting:
     asset: str | None
     """The folder; None for the full model."""
     n_fetches: int | None
-    """Feature fetches a ray, k; 0 for every sample. None for the full model."""
+    """Feature lookups per ray, k; 0 for one at every sample. None for the full model."""
     quality: Quality | None
-    """The player's. None for the full model."""
+    """Quality setting of the player. None for the full model."""
     what: dict[str, Any]
-    """What the asset is made of: preset, head, resolution, channels and number formats."""
+    """Properties of the asset: preset, head, resolution, channels and number formats."""
     scores: dict[str, float | None]
-    """psnr, ssim, lpips (8-bit pictures), psnr_float, ssim_float: means against the photographs;
-    psnr_to_model, ssim_to_model: against the full model's unrounded pictures, None without one; loss_db:
-    what is lost against it (without a model, against the best setting)."""
+    """Means over the views. psnr, ssim, lpips (8-bit pictures), psnr_float, ssim_float: against the
+    photographs. psnr_to_model, ssim_to_model: against the full model's unrounded pictures, None without one.
+    loss_db: the loss of psnr against the full model, or without one against the best setting."""
     times: dict[Size, Times]
     n_bytes: int
     """Bytes of the asset without its reports, or of the model file."""
     peak_mb: float | None
-    """Most memory of the process that played it at the photographs' size, all k."""
+    """Peak memory of the process that played it at the photographs' size, over all k, megabytes."""
     first_picture_ms: float | None
-    """From starting a process to its first picture of the photographs' size, Python included, what numba
-    compiles being in its cache."""
+    """Milliseconds from starting a process to its first picture of the photographs' size, Python's start
+    included, with numba's compiled code in its cache."""
     commands: tuple[str, ...]
-    """The command that bakes it, if the asset keeps its settings, and the command that plays it."""
+    """The command that bakes the asset, if it keeps its settings, and the command that plays it."""
     on_front: bool = False
 
     @property
     def point(self) -> Point:
-        """The setting on the front, with its time at the first of the sizes."""
+        """The setting as a point for the front, with its time at the first of the sizes."""
         first = next(iter(self.times.values()))
         quality = min(self.scores["psnr"] or 0.0, MAX_PSNR)
         return Point(self.name, quality, first.median, first.uncertainty, self.n_bytes / 1e6)
@@ -55,21 +55,21 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Trade:
-    """All rows, and what they say."""
+    """All rows, and the conclusions from them."""
 
     settings: list[Setting]
     recommendation: str
     sizes: list[Size]
-    """The first one is that of the first photograph, for which the front is drawn."""
+    """Sizes of the frames. The first is that of the first photograph, for which the front is found."""
     conditions: dict[str, Any]
-    """Views, rounds, threads, march."""
+    """Conditions of the measurement: views, rounds, threads, march."""
     pictures: list[Pictures] = field(default_factory=list)
     """The worst view of each asset, under the asset's name."""
     worst: dict[str, list[WorstPixel]] = field(default_factory=dict)
     """The worst pixels of each asset with its own k, by the asset's name."""
 
     def document(self) -> dict[str, Any]:
-        """The content of the JSON file."""
+        """Return the content of the JSON file."""
         return {
             "recommendation": self.recommendation,
             "conditions": self.conditions,
@@ -79,7 +79,8 @@ class Trade:
 
 
 def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setting], str]:
-    """All settings, the model's first, with losses and front; and the sentence that recommends some."""
+    """Return all settings, the model's first, with their losses and places on the front, and the
+    sentence that recommends some."""
     best = max(setting.point.psnr for setting in settings)
     reference = best if model is None else model.point.psnr
     every = settings if model is None else [model, *settings]
@@ -95,7 +96,7 @@ def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setti
 
 
 def _plain(setting: Setting) -> dict[str, Any]:
-    """A row as JSON; an infinite PSNR is null."""
+    """Return a row as JSON values; an infinite PSNR is null."""
     row = asdict(setting)
     row["scores"] = {key: None if value == float("inf") else value for key, value in row["scores"].items()}
     row["times"] = {f"{width}x{height}": asdict(times) for (width, height), times in setting.times.items()}

@@ -1,4 +1,4 @@
-"""Specks: single pixels that stand out of a picture where another picture of the same view is calm."""
+"""Specks: single pixels that stand out in one picture where another picture of the same view is calm."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import numpy as np
 from player.errors import ShapeError
 
 THRESHOLD = 0.1
-"""By how much a speck differs from the pixels around it, in one of three channels of 0 to 1."""
+"""Least difference of a speck from the pixels around it, in one of three channels of 0 to 1."""
 CALM = 0.5
-"""Share of that by which the other picture differs there at most."""
+"""Largest difference of the other picture there, as a share of the threshold."""
 
 
 def speck_mask(picture: np.ndarray, reference: np.ndarray, threshold: float = THRESHOLD) -> np.ndarray:
-    """[h, w] bool: pixels that differ from the median of the 3 x 3 pixels around them, themselves included,
-    by more than `threshold` in a channel in which `reference` differs by at most CALM of it.
+    """Return the specks, [h, w] bool: pixels that differ from the median of the 3 x 3 pixels around them,
+    themselves included, by more than `threshold` in a channel in which `reference` differs from its own
+    median by at most CALM times `threshold`.
 
-    What is one pixel wide in both pictures, a wire or a highlight, does not count; nor does an edge, which
-    the median follows. At the border the nearest pixels are repeated.
+    A detail that is one pixel wide in both pictures, such as a wire or a highlight, does not count. Neither
+    does an edge, which the median follows. At the border the nearest pixels are repeated.
 
     Args:
         picture: [h, w, 3] float, 0..1.
@@ -40,7 +41,7 @@ def speck_mask(picture: np.ndarray, reference: np.ndarray, threshold: float = TH
 
 
 def _from_around(picture: np.ndarray) -> np.ndarray:
-    """[h, w, 3] how far each pixel is from the median of the nine around it."""
+    """Return how far each pixel is from the median of the nine around it, [h, w, 3]."""
     height, width = picture.shape[:2]
     padded = np.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
     nine = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]

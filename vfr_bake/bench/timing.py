@@ -1,13 +1,13 @@
-"""Frame times, measured in rounds that ask every process in turn, so that a busy minute of the machine falls
-on all of them.
+"""Frame times, measured in rounds that ask every process in turn, so that a busy minute of the
+machine affects all of them.
 
-In a round each asset and size is visited once, in an order of its own; a visit renders one view with every k
-and quality, in an order of its own too, after a frame that is not counted. Times are those of whole frames.
+A round visits each asset and size once, in random order. A visit renders one view with every k and quality,
+also in random order, after one frame that is not counted. Times are those of whole frames.
 
-March and lookups are one loop, which has no seams to time. Of the same view the lookups alone differ with k:
-the slope b of the march's time against the fetches, fitted to the exact frames of each visit, the median of
-all visits, makes `lookups = b x fetches`, and the march is what remains. Medians, so that a pause decides
-nothing.
+March and lookups are one loop and cannot be timed apart. For one view, only the lookups differ with k. So a
+slope b is fitted to the march's time against the number of lookups, over the exact frames of each visit, and
+the median of all visits is taken. Then `lookups = b x fetches`, and the march is the rest. Medians are used
+so that a single pause has no effect.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ Size = tuple[int, int]
 
 
 class Dials(NamedTuple):
-    """What a frame is asked with."""
+    """Settings of the player with which a frame is rendered."""
 
     n_fetches: int
-    """k, feature fetches a ray; 0 for every sample."""
+    """k, feature lookups per ray; 0 for one at every sample."""
     quality: Quality = "exact"
 
     def request(self) -> dict[str, Any]:
-        """As a process takes them."""
+        """Return the settings as a request to a process has them."""
         return {"samples": self.n_fetches, "quality": self.quality}
 
 
 Ask = Callable[..., dict[str, Any]]
 SEED = 0
-"""Seed of the order within the rounds."""
+"""Seed of the random orders within the rounds."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,16 @@ class Times:
     p95: float
     quartiles: tuple[float, float]
     uncertainty: float
-    """Half width of the interval in which two medians do not differ: 1.57 interquartile ranges over the root
-    of the number (the notches of McGill, Tukey and Larsen, 1978), of what is left of the times when the
-    round's view and the machine's state in it, which all settings share, are divided out."""
+    """Half width of the interval within which two medians do not differ: 1.57 interquartile ranges over
+    the root of the number of frames (the notches of McGill, Tukey and Larsen, 1978). The times are
+    first divided by the mean of all settings in the same round, which removes the effect of the view
+    and of the machine's state."""
     frames: int
     march: float
-    """Median of the march in a frame, without the lookups."""
+    """Median time of the march in a frame, without the lookups."""
     lookups: float | None
-    """Median of the lookups in a frame; None where only one k was played, so that march and lookups cannot be
-    told apart: `march` holds both then."""
+    """Median time of the lookups in a frame. None if only one k was played, so that march and lookups cannot
+    be told apart; `march` then holds both."""
     head: float
     rest: float
 
@@ -70,7 +71,8 @@ def measure_times(
     n_rounds: int,
     progress: Callable[[int, int], object],
 ) -> dict[tuple[int, Dials, Size], Times]:
-    """Times of every (player, dials, size); each in `players` asks one process for a frame."""
+    """Return the times of every (player, dials, size); each of `players` is a function that asks
+    one process for a frame."""
     random = np.random.default_rng(SEED)
     visits: dict[tuple[int, Size], list[dict[Dials, dict[str, Any]]]] = {}
     done, total = 0, n_rounds * len(players) * len(sizes)
@@ -101,8 +103,8 @@ def _mean_ms(visits: Sequence[dict[Dials, dict[str, Any]]]) -> float:
 
 
 def notch(ms: np.ndarray, shared: Sequence[float]) -> float:
-    """The uncertainty of the median of `ms` [n], one frame a round, `shared` being the mean of all settings
-    in each round.
+    """Return the uncertainty of the median of `ms` [n], one frame per round, where `shared` [n] is the mean
+    time of all settings in each round.
 
     >>> notch(np.array([10.0, 40.0, 20.0]), [1.0, 4.0, 2.0])  # slow rounds, but always ten times the mean
     0.0
@@ -112,7 +114,8 @@ def notch(ms: np.ndarray, shared: Sequence[float]) -> float:
 
 
 def lookup_slope(rounds: Sequence[dict[Dials, dict[str, Any]]]) -> float | None:
-    """Milliseconds a fetch of exact frames; None where their number of fetches never differs.
+    """Return the milliseconds per feature lookup of exact frames; None if their number
+    of lookups never differs.
 
     >>> few, many = {"fetches": 10, "march_ms": 7.0}, {"fetches": 20, "march_ms": 9.0}
     >>> lookup_slope([{Dials(1): few, Dials(2): many}])
@@ -132,8 +135,8 @@ def lookup_slope(rounds: Sequence[dict[Dials, dict[str, Any]]]) -> float | None:
 
 
 def frame_times(answers: Sequence[dict[str, Any]], slope: float | None, shared: Sequence[float]) -> Times:
-    """The times of frames from what the process answered to each; `slope` is the milliseconds of a fetch, and
-    `shared` what `notch` divides out."""
+    """Return the times of frames from a process's answers to each; `slope` is the milliseconds per feature
+    lookup, and `shared` is what `notch` divides by."""
     ms, march, head, fetches = (
         np.array([answer[key] for answer in answers], np.float64)
         for key in ("ms", "march_ms", "head_ms", "fetches")

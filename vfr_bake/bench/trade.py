@@ -1,8 +1,9 @@
-"""What every setting of some assets gives and takes: quality against the photographs and the full model,
-time, bytes, memory.
+"""Measurement of every setting of some assets: quality against the photographs and the full
+model, time, bytes and memory.
 
-The full model renders first, in a process that ends before anything is timed. Then one process plays each
-asset: its pictures for quality, then frames in turns for time (`vfr_bake.bench.timing`).
+The full model renders first, in a process that ends before anything is timed. Then one process per asset
+plays it: first all pictures, for quality, then frames in turns with the other processes, for time
+(`vfr_bake.bench.timing`).
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
 from vfr_bake.training.scores.metrics import Distance, mean_scores, psnr, ssim
 
 N_FIRST_PICTURES = 3
-"""Number of times that an asset is opened for its first picture; the median counts."""
+"""Number of times that an asset is opened to time its first picture; the median counts."""
 MODEL_FRAMES = 3
-"""Frames of the full model of each size, but for the photographs' own size, which has one frame a view."""
+"""Frames of the full model at each size except the photographs' own, at which every view is rendered."""
 
 Progress = Callable[[str, int, int], object]
 
@@ -54,14 +55,14 @@ class Views:
     photographs: list[np.ndarray]
     """[h, w, 4] uint8 each."""
     masked: bool
-    """Whether pixels that are not opaque are masked."""
+    """True if pixels that are not opaque are masked."""
     exposure: bool
-    """Whether the model was trained with an exposure of each picture: that of a view is then fitted on its
-    left half, and the right half is scored, as `vfr-eval` does."""
+    """True if the model was trained with an exposure for each picture. The exposure of a view is then fitted
+    on its left half, and the right half is scored, as `vfr-eval` does."""
 
     def beside(self, pictures: list[np.ndarray]) -> list[RenderedView]:
-        """The pictures [h, w, 4], colours over the background and opacity, one a view, as they are compared
-        with the photographs."""
+        """Return the pictures [h, w, 4], one per view with colours over the background and opacity, in the
+        form in which they are compared with the photographs."""
         views = []
         for camera, picture, rgba in zip(self.cameras, pictures, self.photographs, strict=True):
             rendered = picture[..., :3], picture[..., 3].reshape(-1)
@@ -71,12 +72,13 @@ class Views:
 
 
 def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:
-    """Play the assets, with every k and quality, at every size; `progress` is called with what is done.
+    """Play the assets with every k and quality at every size, and return what was measured; `progress` is
+    called with (stage, done, of).
 
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
     """
-    assets = {  # whole ones: the figures of a part would be told as those of the asset
+    assets = {  # opened whole, because figures of a part would be reported as those of the asset
         str(folder): Asset.open(folder, verify=True, max_memory=config.max_memory) for folder in config.assets
     }
     views = _read_views(config, list(assets.values()), progress)
@@ -139,19 +141,19 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progres
 
 @dataclass(frozen=True, eq=False)
 class _Quality:
-    """One asset's pictures, compared."""
+    """Scores of one asset's pictures, and where they are worst."""
 
     scores: dict[Dials, dict[str, float | None]]
-    """The scores with each setting of the dials."""
+    """Scores with each setting of the dials."""
     peak_mb: float | None
     worst_view: Pictures
-    """The view that is farthest off with the asset's own k."""
+    """The view with the lowest PSNR, with the asset's own k."""
     worst: list[WorstPixel]
-    """The pixels that are farthest off with the asset's own k."""
+    """The pixels with the largest errors, with the asset's own k."""
 
 
 class _Run:
-    """What all measurements share."""
+    """Views, settings and files that all measurements share."""
 
     def __init__(
         self, folder: Path, views: Views, config: BenchConfig, lpips: Distance | None, progress: Progress
@@ -169,7 +171,7 @@ class _Run:
         return Process("player", name, str(self._cameras), self._threads, self._max_memory)
 
     def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
-        """The full model's row and its pictures, one a view."""
+        """Return the full model's row and its pictures, one per view."""
         n_views = len(self._views.cameras)
         own = [(camera.width, camera.height) for camera in self._views.cameras]
         frames = [(sizes[0], view) for view in range(n_views)]
@@ -201,9 +203,10 @@ class _Run:
         return setting, pictures
 
     def first_pictures(self, names: list[str], size: Size) -> list[float]:
-        """Milliseconds from starting a process to its first picture, by asset; their turns alternate."""
+        """Return for each asset the milliseconds from starting a process to its first
+        picture; the assets take turns."""
         request = {"view": 0, "size": size, "rgb": None, **Dials(1).request()}
-        with self.player(names[0]) as process:  # compiles, where that has not been done before
+        with self.player(names[0]) as process:  # compiles the code, if that has not been done before
             process.ask(**request)
         taken: list[list[float]] = [[] for _ in names]
         for turn in range(N_FIRST_PICTURES):
@@ -218,7 +221,8 @@ class _Run:
     def quality(
         self, name: str, asset: Asset, player: Process, dials: list[Dials], full: list[np.ndarray] | None
     ) -> _Quality:
-        """Every view with all dials, against the photographs and the model's pictures if there are some."""
+        """Score every view with all dials against the photographs, and against the model's pictures
+        `full` if there are any."""
         scores: dict[Dials, dict[str, float | None]] = {}
         first = self._views.photographs[0][..., :3] / np.float32(255)
         worst_view, worst, peak = Pictures(name, first, first), [], None
@@ -244,7 +248,7 @@ class _Run:
     def scores(
         self, beside: list[RenderedView], pictures: list[np.ndarray], full: list[np.ndarray] | None
     ) -> dict[str, float | None]:
-        """Means over the views."""
+        """Return the means of the scores over the views."""
         means = mean_scores([view.score(self._lpips) for view in beside])
         for name, score in (("psnr_to_model", psnr), ("ssim_to_model", ssim)):
             pairs = None if full is None else zip(_colours(pictures), _colours(full), strict=True)
@@ -257,7 +261,8 @@ def _colours(pictures: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
-    """Exact pictures with every k, and the other qualities with the k of the assets."""
+    """Return the dials to measure: exact pictures with every k, and the other
+    qualities with the assets' own k."""
     own = {asset.manifest.n_fetches for asset in assets}
     every = sorted(set(config.samples) | own, key=lambda k: k or 1e9)
     others: tuple[Quality, ...] = ("high", "fast")
@@ -265,7 +270,7 @@ def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
 
 
 def describe(asset: Asset) -> dict[str, Any]:
-    """What an asset is made of, as far as its manifest says."""
+    """Return what an asset is made of, as far as its manifest says."""
     manifest, baked = asset.manifest, asset.manifest.provenance.get("bake", {})
     width = baked.get("head_width")
     return {
@@ -280,7 +285,7 @@ def describe(asset: Asset) -> dict[str, Any]:
 
 
 def played_bytes(asset: Asset) -> int:
-    """Bytes of every file but the reports, which no player reads."""
+    """Return the bytes of all files except the reports, which no player reads."""
     files = asset.manifest.files.items()
     return sum(entry.bytes for name, entry in files if not name.startswith("report."))
 
@@ -308,8 +313,8 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) ->
 
 
 def _exposure_learned(provenance: dict[str, Any]) -> bool:
-    """Whether training found that the exposure changes from picture to picture; what an asset remembers is
-    free in its form."""
+    """Return whether training found that the exposure changes from picture to picture. The provenance of an
+    asset has no fixed form, so its types are checked."""
     trained = provenance.get("trained")
     effects = trained.get("effects") if isinstance(trained, dict) else None
     return isinstance(effects, dict) and effects.get("exposure") is True

@@ -1,4 +1,4 @@
-"""Where the loss sits: the pixels that are farthest off, and what their rays met."""
+"""The pixels with the largest errors, and the samples that their rays meet."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from player.cameras.camera import Camera
 from player.march.march import sample_rays
 
 N_WORST = 10
-"""Number of worst pixels that are listed."""
+"""Number of pixels that are listed."""
 APART = 8
-"""Distance in pixels that two of the worst in one view have at least, so that one wire does not take them
-all."""
+"""Least distance in pixels between two listed pixels of one view, along x or y, so that one
+wire does not take them all."""
 N_WEIGHTS = 6
 """Number of the heaviest samples of a ray that are listed."""
 
@@ -41,9 +41,10 @@ class WorstPixel:
 def worst_pixels(
     asset: Asset, cameras: Sequence[Camera], wanted: Sequence[np.ndarray], played: Sequence[np.ndarray]
 ) -> list[WorstPixel]:
-    """The N_WORST pixels of all views, worst first.
+    """Return the N_WORST pixels of all views, worst first.
 
-    `cameras` are in the world frame, the pictures [h, w, 3] in [0, 1] of their sizes.
+    `cameras` are in the world frame. The pictures `wanted` and `played`, [h, w, 3] in [0, 1],
+    have the cameras' sizes.
     """
     places = []
     for view, (a, b) in enumerate(zip(wanted, played, strict=True)):
@@ -60,7 +61,7 @@ def worst_pixels(
 
 
 def _peaks(error: np.ndarray) -> list[tuple[int, int]]:
-    """The worst pixels (x, y) of one view that are APART from each other."""
+    """Return the worst pixels (x, y) of one view that are APART from each other, at most N_WORST."""
     left = error.copy()
     peaks = []
     for _ in range(N_WORST):
@@ -73,7 +74,7 @@ def _peaks(error: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _ray(asset: Asset, camera: Camera, x: int, y: int) -> tuple[int, float, tuple[tuple[float, float], ...]]:
-    """Samples with weight, opacity, and the heaviest samples of one pixel's ray."""
+    """Return the number of samples with weight, the opacity, and the heaviest samples of one pixel's ray."""
     index = np.array([y * camera.width + x])
     rays_o, rays_d = camera.transformed(np.linalg.inv(asset.world_from_model)).rays_through(index)
     path, samples, _, tau, _ = sample_rays(asset.grid, rays_o, rays_d)

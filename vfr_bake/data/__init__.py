@@ -1,4 +1,4 @@
-"""What people have on disk, or the built-in scene -> posed views in the model's own frame."""
+"""Load a data set from the disk, or the built-in scene, as posed views in the model frame."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def load_scene(
     nerfstudio) or a COLMAP model (`sparse/0`), a ZIP of one, a video whose cameras have been estimated, or
     the word `demo` for the built-in scene (a folder of that name is `./demo`). `progress`: called with the
     number of pictures done and to do. `downscale`: pictures are reduced by this factor along each side.
-    `kind`: object or unbounded, or found from the pictures. `scale`: two pictures and the distance between
-    their cameras, which the world then has. `reader`: what reads the pictures, in place of `downscale`; None
-    holds all of them in memory.
+    `kind`: object or unbounded; "auto" finds it from the pictures. `scale`: two pictures and the distance
+    between their cameras; the world is scaled so that they are this far apart. `reader`: reads the pictures,
+    and decides their size in place of `downscale`; None holds all of them in memory.
 
-    Raises DataError or FormatError in one line that names the file and what was expected, OutputError where
-    the disk has no room for what the reader would keep there.
+    Raises DataError or FormatError in one line that names the file and what was expected, and OutputError if
+    the disk has no room for the pictures that the reader stores there.
     """
     reader = reader or PictureReader(WorkingSize(downscale=downscale))
     if str(data) == "demo":
@@ -67,7 +67,7 @@ def load_scene(
 
 
 def working_size(config: TrainConfig) -> WorkingSize:
-    """The size that pictures are trained on where the disk has room for them."""
+    """Return the size at which pictures are trained on if the disk has room for them."""
     default = config.max_side is None and config.downscale is None
     return WorkingSize(MAX_SIDE if default else config.max_side, config.downscale)
 
@@ -75,21 +75,22 @@ def working_size(config: TrainConfig) -> WorkingSize:
 def training_reader(
     config: TrainConfig, model: Path, kept: bool, say: Callable[[str], object] | None
 ) -> PictureReader:
-    """What reads pictures for the training of `model`; with `kept` it leaves them for the next
-    run."""
+    """Return the reader of the pictures for the training of `model`; with `kept` it leaves them on the disk
+    for the next run."""
     default = config.max_side is None and config.downscale is None
     return PictureReader(working_size(config), model, on_disk=True, kept=kept, may_shrink=default, say=say)
 
 
 def reader_as(settings: dict[str, Any]) -> PictureReader:
-    """What reads pictures as they were for a training with these `settings`, as a model or an asset has
-    them."""
+    """Return a reader that gives pictures the size that they had in a training with these `settings`, as they
+    are recorded in a model or an asset."""
     size = WorkingSize(settings.get("max_side"), settings.get("downscale"))
     return PictureReader(size, on_disk=True)
 
 
 def unpacked(data: str | Path, progress: Progress | None = None) -> Path:
-    """What `data` names; for a ZIP the folder that it is unpacked into, once (`files.archives.unpack`).
+    """Return the path that `data` names; for a ZIP, unpack it once and return its folder
+    (`files.archives.unpack`).
 
     >>> unpacked("garden").name
     'garden'
@@ -99,8 +100,8 @@ def unpacked(data: str | Path, progress: Progress | None = None) -> Path:
 
 
 def needs_cameras(data: str | Path) -> bool:
-    """Whether `data` is a video, or a folder of pictures without cameras: `poses.estimate_cameras` finds
-    them."""
+    """Return whether `data` is a video or a folder of pictures without cameras, so that
+    `poses.estimate_cameras` has to find them."""
     folder = Path(data)
     if str(data) == "demo":
         return False

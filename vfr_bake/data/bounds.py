@@ -16,13 +16,13 @@ MARGIN_CELLS = 1.5
 def scene_box(
     cameras: Sequence[Camera], alphas: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, float]:
-    """The centre [3] and the half side of the scene's cube, in the cameras' frame.
+    """Return the centre [3] and the half side of the scene's cube, in the cameras' frame.
 
-    `cameras`: at least one. `alphas`: [height, width] each, above 0 where the picture shows something of
-    the scene; None if pictures do not tell.
+    `cameras`: at least one. `alphas`: [height, width] each, above 0 where the picture shows something of the
+    scene; None if the pictures have no alpha.
 
-    Without silhouettes: centred where the optical axes meet, as large as the cameras see around it. With
-    them: the box of the visual hull, and a margin of 1.5 cells of its grid.
+    Without silhouettes, the cube is centred where the optical axes meet, and is as large as what the cameras
+    see there. With silhouettes, it is the box of the visual hull, with a margin of 1.5 cells of its grid.
 
     >>> from vfr_bake.data.demo import AABB, demo_views
     >>> train, _ = demo_views(size=32, n_train=12, n_test=0)
@@ -58,12 +58,13 @@ def _seen_box(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
 def _visual_hull(
     cameras: Sequence[Camera], alphas: Sequence[np.ndarray], centre: np.ndarray, half: float
 ) -> np.ndarray:
-    """The centres [n, 3] of the grid cells that no view sees past and at least one view sees."""
+    """Return the centres [n, 3] of the grid cells that at least one view sees, and that lie in the silhouette
+    of every view that sees them."""
     cell = 2 * half / N_CELLS
     axis = (np.arange(N_CELLS, dtype=np.float32) + 0.5) * np.float32(2 / N_CELLS) - 1
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * np.float32(half)
     seen = np.zeros(len(points), bool)
-    # From a cell's centre to its corners: a thin thing in the cell may be off by so much.
+    # Distance from a cell's centre to its corners: a thin thing in the cell may be so far from the centre.
     reach = cell * np.sqrt(3) / 2
     for camera, alpha in zip(cameras, alphas, strict=True):
         rotation = camera.c2w[:3, :3]

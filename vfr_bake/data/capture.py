@@ -16,51 +16,55 @@ HOLD_OUT_EVERY = 8
 
 
 class StoredImages(Sequence[np.ndarray]):
-    """Pictures that lie on a disk: each [height, width, 4] uint8 is read when it is asked for.
+    """Pictures on a disk. Each, [height, width, 4] uint8, is read when it is asked for.
 
-    They are also cut into *chunks*: each has its share of the pixels of every picture, spread over all of it,
-    in one place on the disk. Who draws pixels at random draws them from one chunk after the other.
+    Their pixels are also divided into *chunks*. A chunk holds a share of the pixels of every picture, spread
+    over the whole picture, and lies in one place on the disk. A caller that draws pixels at random draws them
+    from one chunk after the other.
     """
 
     n_chunks: int
 
     @abstractmethod
     def some(self, numbers: Sequence[int]) -> StoredImages:
-        """The pictures with these numbers."""
+        """Return the pictures with these numbers."""
 
     @abstractmethod
     def size(self, number: int) -> tuple[int, int]:
-        """Width and height of a picture, which is not read."""
+        """Return the width and height of a picture without reading it."""
 
     @abstractmethod
     def opaque(self, number: int) -> bool:
-        """Whether all of a picture is opaque; it is not read."""
+        """Return whether all of a picture is opaque, without reading it."""
 
     @abstractmethod
     def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
-        """[n, 4] uint8: those of the picture's `pixels` [n], numbers in row-major order, alone."""
+        """Read only the given `pixels` [n] of a picture, numbered in row-major order. Returns [n, 4]
+        uint8."""
 
     @abstractmethod
     def chunk(self, number: int) -> np.ndarray:
-        """[n, 3 or 4] uint8: the pixels of a chunk, picture after picture."""
+        """Read the pixels of a chunk, [n, 3 or 4] uint8, picture after picture."""
 
     @abstractmethod
     def chunk_places(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """[n_pictures] int64 each: of which place to which the pixels of each picture lie in a chunk. The
-        pixel at place p of a picture of n pixels is number `stride` p modulo n."""
+        """Return the first place of each picture's pixels in a chunk, and the place behind the last,
+        [n_pictures] int64 each. The pixel at place p of a picture of n pixels is number (`stride` p) modulo n
+        in row-major order."""
 
     @property
     @abstractmethod
     def strides(self) -> np.ndarray:
-        """[n_pictures] int64: see `chunk_places`."""
+        """The stride of each picture, [n_pictures] int64: see `chunk_places`."""
 
 
 @dataclass(frozen=True)
 class PosedImages:
-    """Pictures and where they were taken from; each may have its own size."""
+    """Pictures and the cameras that took them. Each picture may have its own size."""
 
     cameras: list[Camera]
-    """One a picture, of the picture's size; in the model frame in a `Scene`, in the world in a `Capture`."""
+    """One for each picture, of the picture's size; in the model frame in a `Scene`, in the world in a
+    `Capture`."""
     images: list[np.ndarray] | StoredImages
     """[height, width, 4] uint8 each, sRGB and straight (not premultiplied) alpha; in memory or on a disk."""
 
@@ -89,7 +93,7 @@ class PosedImages:
             )
 
     def some(self, numbers: Iterable[int]) -> PosedImages:
-        """The views with these numbers, in ascending order."""
+        """Return the views with these numbers, in ascending order."""
         chosen = sorted(numbers)
         cameras, images = [self.cameras[i] for i in chosen], self.images
         if isinstance(images, StoredImages):
@@ -97,8 +101,9 @@ class PosedImages:
         return PosedImages(cameras, [images[i] for i in chosen])
 
     def joined(self, numbers: Sequence[int]) -> np.ndarray:
-        """[n_pixels, 4] uint8: the pixels of the pictures in memory with these `numbers`, one picture behind
-        the other. The pictures are parts of it from then on, so that memory holds them once.
+        """Return the pixels, [n_pixels, 4] uint8, of the pictures with these `numbers`, one picture behind
+        the other; the pictures must be in memory. From then on they are parts of the returned array, so that
+        memory holds them once.
 
         >>> from vfr_bake.data.demo import demo_capture
         >>> train = demo_capture(size=16, n_train=4, n_test=1).train
@@ -117,13 +122,13 @@ class PosedImages:
         return pixels
 
     def opaque(self, number: int) -> bool:
-        """Whether every pixel of a picture is opaque."""
+        """Return whether every pixel of a picture is opaque."""
         if isinstance(self.images, StoredImages):
             return self.images.opaque(number)
         return bool((self.images[number][..., 3] == 255).all())
 
     def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
-        """[n, 4] uint8: the `pixels` [n] of a picture, numbers in row-major order."""
+        """Return the colours, [n, 4] uint8, of the `pixels` [n] of a picture, numbered in row-major order."""
         if isinstance(self.images, StoredImages):
             return self.images.pixels(number, pixels)
         return self.images[number].reshape(-1, 4)[pixels]
@@ -136,16 +141,17 @@ class Capture:
     name: str
     train: PosedImages
     test: PosedImages
-    """Views that training never sees; none when there are too few to spare one."""
+    """Views that training never sees; empty if there are too few to spare one."""
     points: np.ndarray | None = None
-    """[n_points, 3] points of the scene, world frame, where the data set knows some."""
+    """[n_points, 3]: points of the scene in the world frame, if the data set has some."""
     masked: bool = False
-    """Whether pixels that are not opaque are masked: they say nothing, and not that nothing is there."""
+    """Whether pixels that are not opaque are masked, so that nothing is known of what is there. Otherwise
+    they say that nothing is there."""
 
 
 def held_out(views: PosedImages) -> tuple[PosedImages, PosedImages]:
-    """The views to train on and those to test with: every eighth, the first one included, where there are at
-    least eight."""
+    """Return the views to train on and the views to test with. If there are at least eight views, every
+    eighth is a test view, the first one included."""
     n_views = len(views.cameras)
     held = set(range(0, n_views, HOLD_OUT_EVERY)) if n_views >= HOLD_OUT_EVERY else set()
     return views.some(set(range(n_views)) - held), views.some(held)

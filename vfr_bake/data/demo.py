@@ -1,12 +1,12 @@
-"""The built-in scene: analytic solids, ray traced in seconds, of known geometry and size.
+"""The built-in scene: analytic solids of known geometry and size, ray traced in seconds.
 
 A checkered plate carries a glossy ball, a textured cube, a slab with a hole through it, a golden ball, a ring
 and a thin wire arch. Every solid is a signed distance function that is exact outside the solid, so
-`signed_distance` is the truth that meshes are compared with. What the solids are is in `demo_solids`, how
-they are lit in `demo_shading`.
+`signed_distance` is the truth that meshes are compared with. The solids are defined in `demo_solids`, and
+their lighting in `demo_shading`.
 
-The world differs from the scene's own frame, where its box is about [-1, 1]³, by `CENTRE` and `SCALE`.
-Vectors in that frame are stored component first, [3, n].
+The world frame differs from the scene's own frame, where its box is about [-1, 1]³, by `CENTRE` and `SCALE`.
+Vectors in the scene's own frame are stored component first, [3, n].
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ _RAYS_AT_ONCE = 65536
 
 
 def signed_distance(points: np.ndarray) -> np.ndarray:
-    """Distance to the nearest surface, negative inside.
+    """Return the distance to the nearest surface, negative inside.
 
-    Exact outside; inside, where solids touch, a bound whose sign is right.
+    It is exact outside. Inside, where solids touch, it is a bound with the right sign.
 
     `points`: [n, 3] world units. Returns [n] float64, world units.
 
@@ -76,7 +76,7 @@ def signed_distance(points: np.ndarray) -> np.ndarray:
 
 
 def trace(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Ray trace one view; edges and texture borders are sampled 2 x 2 times a pixel.
+    """Ray trace one view; pixels at edges and texture borders are sampled 2 x 2 times.
 
     `camera`: world frame. Returns `rgba` [height, width, 4] float32 in [0, 1], sRGB and straight alpha (the
     covered part of the pixel), and `distance` [height, width] float32 along the ray through the pixel's
@@ -90,8 +90,7 @@ def trace(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     height, width = camera.height, camera.width
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rgba, distance = _sample(camera, columns.ravel(), rows.ravel())
-    # Premultiplied: the mean of samples is then the mean of what is seen, and hidden colours count for
-    # nothing.
+    # Colours are premultiplied until the end, so that in the mean of samples each counts by its coverage.
     rgba = rgba.reshape(height, width, 4)
     rough = np.flatnonzero(_rough(rgba))
     if len(rough):
@@ -106,8 +105,8 @@ def trace(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def demo_cameras(size: int, n_views: int, phase: float = 0.0, prefix: str = "./train/r_") -> list[Camera]:
     """Place cameras around the scene, world frame: most above it, a few a little below the plate.
 
-    They follow a Fibonacci spiral from above to below; another `phase`, in turns of its angle, gives other
-    views.
+    They follow a Fibonacci spiral from above to below. Another `phase`, as a fraction of the angle from one
+    camera to the next, gives other views.
 
     >>> [camera.name for camera in demo_cameras(8, 2, prefix="./test/r_")]
     ['./test/r_0', './test/r_1']
@@ -136,7 +135,7 @@ def demo_views(
     n_test: int = 16,
     progress: Progress | None = None,
 ) -> tuple[PosedImages, PosedImages]:
-    """Training and test pictures of `size` x `size` pixels, with their cameras in the world frame.
+    """Return training and test pictures of `size` x `size` pixels, with their cameras in the world frame.
 
     >>> train, test = demo_views(size=8, n_train=2, n_test=1)
     >>> len(train.images), train.images[0].shape, len(test.cameras)
@@ -159,7 +158,7 @@ def demo_capture(
     n_test: int = 16,
     progress: Progress | None = None,
 ) -> Capture:
-    """The built-in scene as a data set would give it, in its world.
+    """Return the built-in scene as a data set would give it, in the world frame.
 
     >>> demo_capture(size=16, n_train=6, n_test=1).name
     'demo'
@@ -168,7 +167,8 @@ def demo_capture(
 
 
 def demo_scene(size: int = 256, n_train: int = 64, n_test: int = 16) -> Scene:
-    """The built-in scene in the model frame: its box is found from the pictures like any other's.
+    """Return the built-in scene in the model frame. Its box is found from the pictures, like any other
+    scene's.
 
     >>> demo_scene(size=16, n_train=6, n_test=1).has_alpha
     True
@@ -177,7 +177,8 @@ def demo_scene(size: int = 256, n_train: int = 64, n_test: int = 16) -> Scene:
 
 
 def _sample(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied sRGB and coverage [n, 4], distances [n] in the world, of points of the picture."""
+    """Return premultiplied sRGB and coverage [n, 4], and distances [n] in world units, at points of the
+    picture."""
     rgba = np.zeros((len(columns), 4), np.float32)
     distance = np.full(len(columns), np.inf, np.float32)
     origin = ((camera.c2w[:3, 3] - CENTRE) / SCALE).astype(np.float32)[:, None]
@@ -204,7 +205,8 @@ def _first_hits(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, 
     """Find t [n] (infinite where nothing is hit) and the number of the solid [n] (-1 there) by sphere
     tracing, solid after solid.
 
-    `origin` [3, 1], `direction` [3, n], float32. A ray that grazes a solid until its steps run out passes it.
+    `origin` [3, 1], `direction` [3, n], float32. A ray that still grazes a solid when its steps run out
+    misses it.
     """
     n = direction.shape[1]
     t = np.full(n, np.inf, np.float32)
@@ -217,7 +219,8 @@ def _first_hits(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, 
         o, d = solid.local(origin), solid.turned(direction[:, index])
         here, end = near[index], far[index]
         if solid.angle:
-            # Its own box fits a flat side exactly: the march along it, endless otherwise, is over at once.
+            # The box in the solid's own frame fits a flat side exactly. A march along that side would take
+            # endless steps, and ends at once if the ray is clipped to this box.
             half = np.array(solid.own_half) + _SKIN
             near, far = enter(-half, half, o, inverse(d))
             near = np.maximum(near, here)
@@ -226,7 +229,8 @@ def _first_hits(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, 
         for _ in range(_MAX_ROUNDS):
             if not len(index):
                 break
-            # Sorting out rays costs as much as a step. Another step does a ray that has arrived no harm.
+            # Dropping rays that have ended costs as much as a step, so it is done after every third. Further
+            # steps do a ray that has arrived no harm.
             for _ in range(3):
                 h = solid.own_distance(o + here * d)
                 here = here + h
@@ -239,7 +243,7 @@ def _first_hits(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _rough(rgba: np.ndarray) -> np.ndarray:
-    """The pixels [height, width] that differ from a neighbour by more than a tenth."""
+    """Return a mask [height, width] of the pixels that differ from a neighbour by more than a tenth."""
     rough = np.zeros(rgba.shape[:2], bool)
     for a, b in (
         ((slice(None), slice(1, None)), (slice(None), slice(-1))),

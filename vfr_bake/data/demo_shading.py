@@ -1,7 +1,9 @@
-"""The built-in scene's light: two lamps with soft shadows, a studio's sky, and the colour of a point.
+"""The lighting of the built-in scene: two lamps with soft shadows, a studio around it, and the colour of a
+point.
 
 Letters: `p` [3, n] points, `n` [3, n] unit normals and `d` [3, n] unit viewing directions, in the scene's own
-frame. Highlights, reflections and the Fresnel term move with the view. Light is linear until the last lines.
+frame. Highlights, reflections and the Fresnel term depend on the viewing direction. Light is linear until the
+last lines of `shade`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ _RIM_COLOUR = np.array([[0.60], [0.76], [1.00]], np.float32) * 0.9
 
 
 def shade(p: np.ndarray, d: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Colours [3, n] in sRGB of the points `p` of the solids `which`, seen along `d`."""
+    """Return the colours [3, n] in sRGB of the points `p` on the solids numbered `which` [n], seen along
+    `d`."""
     n, albedo, material = np.empty_like(p), np.empty_like(p), np.empty((4, p.shape[1]), np.float32)
     for number, solid in enumerate(SOLIDS):
         index = np.flatnonzero(which == number)
@@ -54,18 +57,20 @@ def shade(p: np.ndarray, d: np.ndarray, which: np.ndarray) -> np.ndarray:
     linear = (
         albedo * diffuse * (1 - metal * np.float32(0.55)) + (reflected + highlight * np.float32(0.6)) * tint
     )
-    # A shoulder instead of a clip: highlights keep their hue (Narkowicz 2015, a fit of ACES).
+    # A tone curve with a shoulder, instead of clipping: highlights keep their hue (Narkowicz 2015, a fit of
+    # ACES).
     x = linear * np.float32(0.82)
     mapped = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
     return np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** np.float32(1 / 2.4) - 0.055)
 
 
 def _sunlight(p: np.ndarray, towards: np.ndarray, sharpness: float) -> np.ndarray:
-    """How much of a lamp `p` [3, n] see, 0 to 1, with soft edges: the ray's narrowest pass decides."""
+    """Return how much of a lamp the points `p` [3, n] see, 0 to 1. Shadows have soft edges: the narrowest
+    pass of the ray by a solid, relative to the distance from `p`, decides."""
     light = np.ones(p.shape[1], np.float32)
     direction = towards[:, None]
     reciprocal = inverse(direction)
-    for solid in SOLIDS[1:]:  # the plate lies under everything
+    for solid in SOLIDS[1:]:  # without the first, the plate, which lies under everything
         near, far = enter(*solid.box(0.06), p, reciprocal)
         index = np.flatnonzero((near < far) & (light > 0))
         here, end = np.maximum(near[index], np.float32(0.02)), far[index]
@@ -86,7 +91,7 @@ def _sunlight(p: np.ndarray, towards: np.ndarray, sharpness: float) -> np.ndarra
 
 
 def _openness(p: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """How much of the sky is seen, guessed from the free distance along the normal (Evans 2006)."""
+    """Return how much of the sky is seen, estimated from the free distance along the normal (Evans 2006)."""
     hidden = np.zeros(p.shape[1], np.float32)
     for step, weight in ((0.06, 5.0), (0.20, 1.4)):
         free = scene_distance(p + np.float32(step) * n)
@@ -95,7 +100,7 @@ def _openness(p: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def _normals(solid: Solid, p: np.ndarray) -> np.ndarray:
-    """Unit normals [3, n] by central differences on the corners of a tetrahedron."""
+    """Return unit normals [3, n], by differences between the corners of a tetrahedron around each point."""
     step = np.float32(1.5e-3)
     n = np.zeros_like(p)
     for corner in ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1)):
@@ -105,7 +110,8 @@ def _normals(solid: Solid, p: np.ndarray) -> np.ndarray:
 
 
 def _sky(d: np.ndarray) -> np.ndarray:
-    """The studio [3, n] seen along `d`: a warm floor, a pale wall and a cool, bright ceiling."""
+    """Return the light [3, n] of the studio seen along `d`: a warm floor, a pale wall and a cool, bright
+    ceiling."""
     up = d[2]
     ceiling = np.clip((up + np.float32(0.15)) * np.float32(1.2), 0, 1)
     ceiling = ceiling * ceiling * (3 - 2 * ceiling)

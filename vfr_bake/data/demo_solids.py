@@ -1,8 +1,9 @@
-"""The built-in scene's solids: their distance functions, their colours and where they stand.
+"""The solids of the built-in scene: their distance functions, their colours and their positions.
 
-Letters: `p` [3, n] points in the scene's own frame, where its box is about [-1, 1]³; the world differs from
-it by `CENTRE` and `SCALE`, on purpose neither 0 nor 1. Vectors are stored component first: numpy is faster
-so. The distance functions (Quilez, "Distance functions", 2008) are exact outside the solid.
+Letters: `p` [3, n] are points in the scene's own frame, where its box is about [-1, 1]³. The world frame
+differs from it by `CENTRE` and `SCALE`, which are on purpose neither 0 nor 1. Vectors are stored component
+first, because numpy is faster that way. The distance functions (Quilez, "Distance functions", 2008) are exact
+outside the solid.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ import numpy as np
 CENTRE = np.array([0.3, -0.2, 0.5])
 SCALE = 0.8
 WIRE_RADIUS = 0.02
-"""World units, as the radii of the ball and of the hole below are."""
+"""World units, like the radii of the ball and of the hole below."""
 
 BALL_CENTRE = CENTRE + SCALE * np.array([-0.42, -0.30, -0.28])
 BALL_RADIUS = SCALE * 0.32
 HOLE_CENTRE = CENTRE + SCALE * np.array([0.14, 0.44, -0.20])
 HOLE_RADIUS = SCALE * 0.22
 HOLE_ANGLE = 0.35
-"""Radians about z; at 0 one would look through the hole along y."""
+"""Angle of the slab about z, in radians; at 0 one would look through the hole along y."""
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]
@@ -32,7 +33,8 @@ Colour = Callable[[np.ndarray], np.ndarray]
 
 
 def _rotated(p: np.ndarray, angle: float) -> np.ndarray:
-    """Turn `p` about z by minus `angle`: there a solid that is turned by `angle` stands straight."""
+    """Turn `p` about z by minus `angle`, into the frame in which a solid that is turned by `angle` stands
+    straight."""
     c, s = p.dtype.type(np.cos(angle)), p.dtype.type(np.sin(angle))
     turned = np.empty_like(p)
     turned[0] = c * p[0] + s * p[1]
@@ -50,7 +52,7 @@ def _length2(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def length3(p: np.ndarray) -> np.ndarray:
-    """Lengths [n] of `p` [3, n], in its dtype."""
+    """Return the lengths [n] of `p` [3, n], in its dtype."""
     return np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
 
 
@@ -62,7 +64,8 @@ def _box(p: np.ndarray, half: tuple[float, float, float], rounding: float) -> np
 
 
 def _pierced_slab(p: np.ndarray, half: tuple[float, float, float], hole: float) -> np.ndarray:
-    """A box with a round hole along y; exact, for the hole stays clear of the sides."""
+    """Return the distances [n] to a box with a round hole along y; exact, because the hole stays clear of the
+    sides."""
     zero = p.dtype.type(0)
     x, z = np.abs(p[0]) - p.dtype.type(half[0]), np.abs(p[2]) - p.dtype.type(half[2])
     square = np.sqrt(np.maximum(x, zero) ** 2 + np.maximum(z, zero) ** 2) + np.minimum(np.maximum(x, z), zero)
@@ -73,7 +76,7 @@ def _pierced_slab(p: np.ndarray, half: tuple[float, float, float], hole: float) 
 
 
 def _arch(p: np.ndarray, radius: float, tube: float) -> np.ndarray:
-    """The upper half of a ring in the plane y = 0, with round ends."""
+    """Return the distances [n] to the upper half of a ring in the plane y = 0, with round ends."""
     ring = _length2(_length2(p[0], p[2]) - p.dtype.type(radius), p[1])
     x = np.abs(p[0]) - p.dtype.type(radius)
     ends = np.sqrt(x * x + p[1] * p[1] + p[2] * p[2])
@@ -88,7 +91,7 @@ def _ring(p: np.ndarray, radius: float, tube: float) -> np.ndarray:
 
 
 def mix(a: tuple[float, float, float], b: tuple[float, float, float], weight: np.ndarray) -> np.ndarray:
-    """The colours [3, n] on the way from `a`, at weight [n] 0, to `b`, at 1."""
+    """Return colours [3, n] interpolated from `a`, where `weight` [n] is 0, to `b`, where it is 1."""
     one, two = (np.asarray(c, weight.dtype)[:, None] for c in (a, b))
     return one + (two - one) * weight
 
@@ -128,12 +131,14 @@ def _plain(r: float, g: float, b: float) -> Colour:
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape and its material; `own`: before it is turned about z by `angle` and moved to `centre`."""
+    """A shape and its material. Attributes whose names begin with `own` describe the solid before it is
+    turned about z by `angle` and moved to `centre`."""
 
     centre: tuple[float, float, float]
     angle: float
     own_half: tuple[float, float, float]
-    """Half sides of the box before the turn; the arch's centre is at its foot, and its box too large."""
+    """Half sides of the bounding box before the turn. The arch's box is larger than it, because the arch's
+    centre is at its foot."""
     own_distance: Distance
     own_colour: Colour
     gloss: float
@@ -141,24 +146,25 @@ class Solid:
     shine: float
     """Exponent of the highlight."""
     mirror: float
-    """Reflected part of the sky when looked at head on."""
+    """Share of the sky's light that is reflected when the surface is seen head on."""
     metal: bool = False
     """Whether reflections take the solid's colour."""
 
     def local(self, p: np.ndarray) -> np.ndarray:
-        """Points [3, n] in the solid's own frame."""
+        """Return points [3, n] of the scene's frame in the solid's own frame."""
         return self.turned(_moved(p, self.centre))
 
     def turned(self, d: np.ndarray) -> np.ndarray:
-        """Directions [3, n] in the solid's own frame."""
+        """Return directions [3, n] of the scene's frame in the solid's own frame."""
         return _rotated(d, self.angle) if self.angle else d
 
     def distance(self, p: np.ndarray) -> np.ndarray:
-        """Distances [n] of points [3, n] of the scene's frame."""
+        """Return the distances [n] from the solid to points [3, n] of the scene's frame."""
         return self.own_distance(self.local(p))
 
     def box(self, grow: float) -> tuple[np.ndarray, np.ndarray]:
-        """Its low and high corner [3], along the axes of the scene, `grow` larger on every side."""
+        """Return the low and the high corner [3] of the solid's bounding box, along the axes of the scene,
+        `grow` larger on every side."""
         c, s = abs(np.cos(self.angle)), abs(np.sin(self.angle))
         x, y, z = self.own_half
         half = np.array([x * c + y * s, x * s + y * c, z]) + grow
@@ -205,11 +211,11 @@ SOLIDS = _scene()
 LOW = np.array([-0.95, -0.95, -0.70])
 HIGH = np.array([0.95, 0.95, -0.6 + 0.86 + WIRE_RADIUS / SCALE])
 AABB = np.stack([CENTRE + SCALE * LOW, CENTRE + SCALE * HIGH])
-"""[2, 3] the tight box of the whole scene, world units."""
+"""[2, 3]: the tight box of the whole scene, in world units."""
 
 
 def scene_distance(p: np.ndarray) -> np.ndarray:
-    """Distance [n] to the nearest solid, the scene's units."""
+    """Return the distances [n] from points `p` [3, n] to the nearest solid, in the scene's units."""
     distance = SOLIDS[0].distance(p)
     for solid in SOLIDS[1:]:
         np.minimum(distance, solid.distance(p), out=distance)
@@ -222,9 +228,10 @@ def scene_distance(p: np.ndarray) -> np.ndarray:
 def enter(
     low: np.ndarray, high: np.ndarray, origin: np.ndarray, reciprocal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The t at which rays enter and leave the box from `low` [3] to `high` [3]; near > far if they miss it.
+    """Return the t at which rays enter and leave the box from `low` [3] to `high` [3]; near > far if they
+    miss it.
 
-    `origin` [3, 1] or [3, n]; `reciprocal`: the `inverse` of their directions.
+    `origin` [3, 1] or [3, n]; `reciprocal`: the `inverse` of the rays' directions.
     """
     near = np.zeros(1, np.float32)
     far = np.full(1, np.inf, np.float32)
@@ -237,6 +244,6 @@ def enter(
 
 
 def inverse(direction: np.ndarray) -> np.ndarray:
-    """1 / direction, finite: parallel to an axis is nearly parallel."""
+    """Return 1 / direction, made finite: a component that is nearly zero counts as a tiny one."""
     tiny = np.float32(1e-9)
     return 1 / np.where(np.abs(direction) < tiny, tiny, direction)

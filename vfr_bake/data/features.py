@@ -1,9 +1,9 @@
-"""What two pictures have in common: SIFT features, and which of them match.
+"""SIFT features of pictures, and the matching of features between two pictures.
 
 The features are OpenCV's, and the matching is one matrix product: on a CPU both are an order of magnitude
-faster than pycolmap's own, and pictures are decoded here as everywhere else in the project, whatever their
-format. A point (x, y) is in pixels of the picture, the centre of the first pixel at (0.5, 0.5), as COLMAP
-has it.
+faster than pycolmap's own. Also, pictures are then decoded as everywhere else in the project, whatever their
+format. A point (x, y) is in pixels of the picture, with the centre of the first pixel at (0.5, 0.5), as in
+COLMAP.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import numpy as np
 from vfr_bake.data.files.pictures import opencv, shrunk
 
 MAX_SIDE = 1600
-"""Pictures are reduced to this many pixels before features are looked for: beyond it, a photograph's finest
-grain is noise and sharpening, which no other picture repeats, and time grows with the pixels."""
+"""Pixels of the longer side to which pictures are reduced before features are looked for. Beyond it, a
+photograph's finest grain is noise and sharpening, which no other picture repeats, and time grows with the
+pixels."""
 MAX_FEATURES = 3072
-"""Matching takes time in proportion to the square of it."""
+"""Number of features of a picture, at most. The time for matching is proportional to the square of this
+number."""
 N_COARSE = 256
-"""The largest features, which tell whether two pictures share anything."""
+"""Number of a picture's largest features that are used to find out whether two pictures share anything."""
 N_PARTNERS = 16
 N_NEIGHBOURS = 3
 MAX_RATIO = 0.8
@@ -35,17 +37,17 @@ class Features:
     points: np.ndarray
     """[n, 2] float64, pixels, rounded to float32, as COLMAP keeps them."""
     sift: np.ndarray
-    """[n, 128] uint8: SIFT descriptors, a quarter of what they take as `descriptors`."""
+    """[n, 128] uint8: SIFT descriptors, in a quarter of the memory of `descriptors`."""
 
     @property
     def descriptors(self) -> np.ndarray:
-        """[n, 128] float32 of unit length: RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
+        """RootSIFT descriptors, [n, 128] float32 of unit length (Arandjelovic and Zisserman, CVPR 2012)."""
         found = self.sift.astype(np.float32)
         return np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6))
 
 
 def find_features(rgba: np.ndarray) -> Features:
-    """The features of a picture, at most `MAX_FEATURES`, none where it is transparent.
+    """Return the features of a picture, at most `MAX_FEATURES`, none where the picture is transparent.
 
     `rgba`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
     """
@@ -61,13 +63,14 @@ def find_features(rgba: np.ndarray) -> Features:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
     order = np.argsort([-keypoint.size for keypoint in keypoints], kind="stable")[:MAX_FEATURES]
     points = np.array([keypoint.pt for keypoint in keypoints], np.float64)[order]
-    # OpenCV has the centre of the first pixel at (0, 0).
+    # OpenCV has the centre of the first pixel at (0, 0), this project at (0.5, 0.5).
     points = (points + 0.5) * [width / grey.shape[1], height / grey.shape[0]]
     return Features(points.astype(np.float32).astype(np.float64), descriptors[order].astype(np.uint8))
 
 
 def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The pairs of descriptors that are each other's nearest, and clearly nearer than the second nearest.
+    """Return the pairs of descriptors that are each other's nearest, and clearly nearer than the second
+    nearest.
 
     `a` [n, 128], `b` [m, 128] of unit length. Returns [n_matches, 2] uint32, indices into `a` and `b`.
 
@@ -80,7 +83,7 @@ def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     nearest = np.empty(len(a), np.intp)
     best, second = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
     best_of_b = np.full(len(b), -np.inf, np.float32)
-    # In blocks, for memory; not smaller ones, for BLAS wakes its threads for each.
+    # In blocks, to save memory. Not in smaller ones, because BLAS wakes its threads for each block.
     for start in range(0, len(a), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
         cosines = a[rows] @ b.T
@@ -97,12 +100,12 @@ def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
-    """The pairs (i, j), i < j, of pictures that are worth matching.
+    """Return the pairs (i, j), i < j, of pictures that are worth matching.
 
-    Each picture with the `N_PARTNERS` that share most of its largest features (preemptive matching: Wu,
-    Towards linear-time incremental structure from motion, 3DV 2013), which finds where a walk comes back to
-    its beginning as well as what pictures in no order have in common; and with its neighbours in the
-    sequence, which in a video overlap even where nothing large is seen.
+    Each picture is paired with the `N_PARTNERS` that share most of its largest features (preemptive matching:
+    Wu, Towards linear-time incremental structure from motion, 3DV 2013). This finds where a walk comes back
+    to its beginning, and what pictures in no order have in common. Each picture is also paired with its
+    neighbours in the sequence, which in a video overlap even where no large features are seen.
     """
     n = len(features)
     coarse = np.zeros((n, N_COARSE, 128), np.float32)
@@ -123,8 +126,8 @@ def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
 
 
 def _n_matches(a: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Count the matches [n_others] that `match` finds of `a` [n, 128] in each of `others` [n_others, m, 128];
-    rows of zeros match nothing."""
+    """Count the matches [n_others] that `match` would find between `a` [n, 128] and each of `others`
+    [n_others, m, 128]; rows of zeros match nothing."""
     cosines = (a @ others.reshape(-1, 128).T).reshape(len(a), *others.shape[:2])
     best_of_others = cosines.max(axis=0)
     nearest = cosines.argmax(axis=2)

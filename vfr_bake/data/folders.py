@@ -30,8 +30,9 @@ DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 def load_folder(
     folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
 ) -> Capture:
-    """The pictures and cameras in `folder`, in whichever form they are there. `reader`: what reads the
-    pictures; None for all as they are, in memory. Raises as `load_scene`."""
+    """Load the pictures and cameras in `folder`, in whichever form they are there. `reader`: reads the
+    pictures; None reads all of them, at their own size, into memory. Raises the same errors as
+    `load_scene`."""
     if not folder.exists():
         raise DataError(f"{folder}: no such folder: expected one with pictures and cameras, or the word demo")
     if not folder.is_dir():
@@ -49,8 +50,8 @@ def load_folder(
 def load_transforms_folder(
     folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
 ) -> Capture:
-    """The pictures of `folder`: `transforms_train.json` and `transforms_test.json`, or one
-    `transforms.json`.
+    """Load the pictures of `folder` with their cameras from `transforms_train.json` and
+    `transforms_test.json`, or from one `transforms.json`.
 
     Raises DataError (pictures) or FormatError (JSON, cameras), in one line that names the file.
     """
@@ -85,12 +86,13 @@ def _capture(
 
 
 def has_transforms(folder: Path) -> bool:
-    """Whether `folder` holds the cameras of its pictures in this form."""
+    """Return whether `folder` holds the cameras of its pictures as a transforms file."""
     return any((folder / name).exists() for name in ("transforms_train.json", "transforms.json"))
 
 
 def _described_views(path: Path) -> list[DescribedView]:
-    """The views of a transforms file: what can be wrong is found before the first picture is decoded."""
+    """Return the views of a transforms file. Errors in the file are found before the first picture is
+    decoded."""
     document = load_transforms(path)
     frames: list[dict[str, Any]] = document["frames"]
     paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
@@ -113,7 +115,8 @@ def _layout(picture: Path) -> Layout:
 
 
 def _given_size(document: dict[str, Any], path: Path, index: int) -> tuple[float, float] | None:
-    """Width and height that a frame, or all of them, are said to have; None where that is not said."""
+    """Return the width and height that the file states for a frame, or for all frames; None if it states
+    none."""
     frame = document["frames"][index]
     where = f"{path}: frame {index} ({frame['file_path']})"
     width, height = (transforms_number(document, frame, key, where) for key in ("w", "h"))
@@ -121,7 +124,8 @@ def _given_size(document: dict[str, Any], path: Path, index: int) -> tuple[float
 
 
 def _mask(path: Path, index: int, frame: dict[str, Any], picture: Path) -> Path | None:
-    """The mask of a frame: the one that it names (nerfstudio's `mask_path`), or the one in `masks/`."""
+    """Return the mask of a frame: the one that the frame names (nerfstudio's `mask_path`), or the one in
+    `masks/`; None if it has none."""
     root = path.parent
     named = frame.get("mask_path")
     if named is not None:
@@ -155,18 +159,19 @@ def _picture_path(transforms: Path, index: int, frame: dict[str, Any]) -> Path:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # a name that is too long; before Python 3.14 this raises
+    except OSError:  # the name is too long; before Python 3.14 this raises
         return False
 
 
 def load_colmap_folder(
     folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
 ) -> Capture:
-    """The pictures of `folder` that its COLMAP model has registered, in the order of their names.
+    """Load the pictures of `folder` that are registered in its COLMAP model, in the order of their names.
 
-    Pictures are looked for in `images/` and in the folder itself; every eighth is held out. They are taken as
-    stored, unless the model was estimated here, from upright ones, or its cameras fit no others. Raises
-    DataError (pictures, camera models) or FormatError (the model's files), in one line that names the file.
+    Pictures are looked for in `images/` and in the folder itself; every eighth is held out. The pixels are
+    taken as stored, unless this project estimated the model from upright pictures, or the cameras belong to
+    upright pictures (`is_taken_upright`). Raises DataError (pictures, camera models) or FormatError (the
+    model's files), in one line that names the file.
     """
     model = colmap_folder(folder)
     assert model is not None

@@ -1,9 +1,10 @@
-"""Features and matches of pictures whose cameras are not known yet, on disk until they are.
+"""Features and matches of pictures, kept on the disk until the cameras of the pictures are known.
 
-An estimation that was interrupted goes on where it was, and one of more pictures begins with what is known.
-Where the disk refuses, nothing more is kept, and the estimation goes on without.
+An estimation that was interrupted continues where it stopped, and one with additional pictures begins with
+the features and matches that are known. If the disk refuses to keep more, the estimation goes on without.
 
-Two files of records, one after the other, little-endian; a last record that is cut short does not count.
+There are two files of records, one record after the other, little-endian. A last record that is cut short
+does not count.
 
 - `features.bin`: stamp of the picture (16 bytes), sharpness (float64), width, height and number of features n
   (uint32 each), thumbnail (32 x 32 bytes, grey), n points (2 float32), n descriptors (128 bytes).
@@ -27,19 +28,19 @@ import numpy as np
 from vfr_bake.data.features import MAX_FEATURES, Features
 
 VERSION = b"2"
-"""Changes whenever the same picture would give other features or matches."""
+"""Version of the records. It changes whenever the same picture would give other features or matches."""
 SIDE = 32
 """Pixels along a side of a thumbnail."""
 STAMP = 16
 MOST_SECONDS = 30 * 24 * 3600
-"""What nobody came back to for so long is deleted."""
+"""Seconds after which records are deleted if no features were added to them."""
 _LOOK = struct.Struct(f"<{STAMP}sdIII")
 _MATCHES = struct.Struct(f"<{STAMP}s{STAMP}sI")
 _BYTES_A_FEATURE, _BYTES_A_MATCH = 8 + 128, 8
 
 
 class Found(NamedTuple):
-    """What is found in one picture, turned upright."""
+    """The features and measurements of one picture, turned upright."""
 
     width: int
     height: int
@@ -50,8 +51,8 @@ class Found(NamedTuple):
 
 
 def stamp(*files: Path | None) -> bytes:
-    """16 bytes that change with the path, the size or the time of change of any of the `files`; None for one
-    that is not there."""
+    """Return 16 bytes that change with the path, the size or the modification time of any of the `files`.
+    None stands for a file that a picture does not have."""
     told = hashlib.blake2b(VERSION, digest_size=STAMP)
     for path in files:
         if path is None:
@@ -66,8 +67,8 @@ class KeptMatches:
     threads."""
 
     def __init__(self, folder: Path, say: Callable[[str], object] | None = None) -> None:
-        """`folder`: made where it is missing; what cannot be read in it is cut off. `say`: called once, with
-        a sentence, where the disk refuses to keep more."""
+        """Open the records in `folder`, which is made if it is missing; what cannot be read at the end of a
+        file is cut off. `say`: called once, with a sentence, if the disk refuses to keep more."""
         self._folder = folder
         self._say = say or (lambda text: None)
         self._lock = threading.Lock()
@@ -106,9 +107,9 @@ class KeptMatches:
 
     @classmethod
     def of(cls, photos: Path, root: Path, say: Callable[[str], object] | None = None) -> KeptMatches:
-        """What is kept of the pictures in the folder `photos`, in a folder in `root`; others there that
-        nothing was added to for a month are deleted."""
-        with suppress(OSError):  # of another user, or gone by now
+        """Open the records of the pictures in the folder `photos`, in a subfolder of `root`. Subfolders to
+        which no features were added for a month are deleted."""
+        with suppress(OSError):  # it belongs to another user, or is gone by now
             for path in root.glob("*/features.bin"):
                 if time.time() - path.stat().st_mtime > MOST_SECONDS:
                     shutil.rmtree(path.parent, ignore_errors=True)
@@ -124,7 +125,7 @@ class KeptMatches:
         return self._folder / "matches.bin"
 
     def look(self, of: bytes) -> Found | None:
-        """What was found in the picture with the stamp `of`; None if nothing is kept."""
+        """Return what was found in the picture with the stamp `of`; None if nothing is kept."""
         at = self._looks.get(of)
         if at is None:
             return None
@@ -144,7 +145,8 @@ class KeptMatches:
         self._append(self._looks_path, self._looks, of, record)
 
     def matches(self, a: bytes, b: bytes, n_a: int, n_b: int) -> np.ndarray | None:
-        """The matches [n, 2] uint32 of pictures that have `n_a` and `n_b` features; None if none are kept."""
+        """Return the matches [n, 2] uint32 of the pictures with the stamps `a` and `b`, which have `n_a` and
+        `n_b` features; None if none are kept."""
         at = self._matches.get(a + b)
         if at is None:
             return None
@@ -155,7 +157,7 @@ class KeptMatches:
         return found if (found < (n_a, n_b)).all() else None
 
     def keep_matches(self, a: bytes, b: bytes, matches: np.ndarray) -> None:
-        """Keep the `matches` [n, 2] of two pictures."""
+        """Keep the `matches` [n, 2] of the pictures with the stamps `a` and `b`."""
         record = _MATCHES.pack(a, b, len(matches)) + matches.astype("<u4").tobytes()
         self._append(self._matches_path, self._matches, a + b, record)
 

@@ -1,8 +1,8 @@
-"""Matches between pictures -> cameras and points, by COLMAP's incremental mapper (Schönberger and Frahm,
-Structure-from-motion revisited, CVPR 2016).
+"""Estimate cameras and points from matches between pictures, by COLMAP's incremental mapper (Schönberger and
+Frahm, Structure-from-motion revisited, CVPR 2016).
 
-COLMAP gets features and matches from here and never opens a picture: its own decoder knows few formats and
-takes the process down on some it does not know.
+COLMAP gets features and matches from here and never opens a picture: its own decoder knows few formats, and
+crashes the process on some that it does not know.
 """
 
 from __future__ import annotations
@@ -29,23 +29,26 @@ SECONDS_BETWEEN_LOOKS = 0.1
 
 @dataclass(frozen=True)
 class Sensor:
-    """What pictures of one camera have in common; equal sensors share their intrinsics."""
+    """The properties that pictures of one camera have in common. Pictures with equal sensors share
+    intrinsics."""
 
     width: int
     height: int
     device: tuple[str, ...]
-    """Maker, model and focal length as EXIF has them; empty where it has not."""
+    """Maker, model and focal length from EXIF. Each is empty if EXIF lacks it; the tuple is empty if EXIF is
+    damaged."""
     focal: float | None
-    """Focal length in pixels, from EXIF."""
+    """Focal length in pixels, from EXIF; None if EXIF does not tell."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """How the two pictures that a model begins with are drawn."""
+    """Settings for drawing the two pictures that a model begins with."""
 
     first_angle: float
-    """Degrees between the rays to most of the points that they share, at least. COLMAP's own 16 give better
-    distances; neighbouring pictures have 4, and share more points, by which a third one finds its place."""
+    """Smallest angle, in degrees, between the two rays to a point, for most of the points that the pictures
+    share. COLMAP's own 16 give better distances; neighbouring pictures have 4, and share more points, by
+    which a third picture can be placed."""
     seed: int
 
 
@@ -55,7 +58,7 @@ FURTHER_ATTEMPTS = (Attempt(4.0, 0), Attempt(16.0, 1), Attempt(4.0, 1))
 
 @dataclass(frozen=True)
 class Pair:
-    """Two pictures that have something in common."""
+    """Two pictures with matches, enough of which agree with one geometry."""
 
     i: int
     j: int
@@ -63,11 +66,11 @@ class Pair:
     matches: np.ndarray
     """[n, 2] uint32, indices of features of i and of j."""
     geometry: Any
-    """The `pycolmap.TwoViewGeometry` that most matches agree with, and which do."""
+    """The `pycolmap.TwoViewGeometry` that most matches agree with; it lists those that do."""
 
 
 def pycolmap_module() -> Any:
-    """pycolmap, silenced. Raises MissingExtraError."""
+    """Return pycolmap, silenced. Raises MissingExtraError."""
     try:
         import pycolmap
     except ImportError as error:
@@ -86,8 +89,8 @@ def write_database(
     features: Sequence[Features],
     pairs: Sequence[Pair],
 ) -> None:
-    """Put the pictures, their cameras and features, and what the pairs have in common into a new COLMAP
-    database. Pictures of the same `Sensor` share a camera."""
+    """Write the pictures, their cameras and features, and the matches and geometries of the pairs into a new
+    COLMAP database. Pictures of the same `Sensor` share a camera."""
     pycolmap = pycolmap_module()
     rigs: dict[Sensor, tuple[int, int]] = {}
     numbers = []
@@ -114,11 +117,11 @@ def write_database(
 
 
 def colmap_camera(sensor: Sensor) -> Any:
-    """The camera that the estimation begins with: square pixels and two terms of radial distortion.
+    """Return the camera that the estimation begins with: square pixels and two terms of radial distortion.
 
-    OPENCV's second focal length and tangential terms are no better on a full set of pictures, and on a dozen
-    from a short arc the two focal lengths drift apart by 5 %. Without EXIF the focal length begins at
-    COLMAP's own guess, 1.2 of the longer side.
+    The model OPENCV, with a second focal length and tangential terms, is no better on a full set of pictures;
+    on a dozen from a short arc its two focal lengths drift apart by 5 %. Without EXIF the focal length begins
+    at COLMAP's own guess, 1.2 times the longer side.
     """
     pycolmap = pycolmap_module()
     focal = sensor.focal or 1.2 * max(sensor.width, sensor.height)
@@ -128,7 +131,8 @@ def colmap_camera(sensor: Sensor) -> Any:
 
 
 def two_view_options() -> Any:
-    """What the geometry of a pair is estimated with: the same in every run."""
+    """Return the options for estimating the geometry of a pair, with a fixed seed, so that every run gives
+    the same."""
     options = pycolmap_module().TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     options.min_num_inliers = MIN_MATCHES
@@ -143,10 +147,10 @@ def match_pictures(
     known: Callable[[int, int], np.ndarray | None] = lambda i, j: None,
     keep: Callable[[int, int, np.ndarray], object] = lambda i, j, matches: None,
 ) -> list[Pair]:
-    """Match the `pairs` (i, j) of pictures; those of which enough agrees with one geometry.
+    """Match the `pairs` (i, j) of pictures, and return those of which enough matches agree with one geometry.
 
     `known`: returns the matches [n, 2] of a pair that has been matched before, or None; `keep`: called with
-    those of every other pair.
+    the numbers and the matches of every other pair.
     """
     pycolmap = pycolmap_module()
     cameras = {sensor: colmap_camera(sensor) for sensor in set(sensors)}
@@ -176,10 +180,11 @@ def map_pictures(
     progress: Progress,
     attempt: Attempt = FIRST_ATTEMPT,
 ) -> list[Any]:
-    """The `pycolmap.Reconstruction`s that the database's matches allow, that of the most pictures first.
+    """Build the `pycolmap.Reconstruction`s that the database's matches allow; returns the one of the most
+    pictures first.
 
-    `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption
-    reaches it through its token, between one picture and the next.
+    `work`: a folder for COLMAP's own output. COLMAP runs in a thread of its own, so that an interruption can
+    stop it by its token, between one picture and the next.
     """
     pycolmap = pycolmap_module()
     options = pycolmap.IncrementalPipelineOptions()
@@ -192,7 +197,7 @@ def map_pictures(
     n_placed = 0
 
     def place(n_new: int) -> None:
-        # A second attempt begins again from nothing; the count never goes back.
+        # COLMAP may begin another model from nothing; the count never goes back.
         nonlocal n_placed
         n_placed = min(n_placed + n_new, n_pictures)
 
@@ -223,10 +228,11 @@ def map_pictures(
 
 
 def refine_principal_points(model: Any) -> None:
-    """Let the principal points go, once, at the end, where every camera has taken enough pictures.
+    """Refine the principal points, once, at the end, if every camera has taken enough pictures.
 
-    A phone's is off by a hundredth of the picture, which turns every pose by half a degree and leaves a pixel
-    of error at the border; from few pictures it cannot be told from a turn.
+    A phone's principal point is off by a hundredth of the picture, which turns every pose by half a degree
+    and leaves a pixel of error at the border. From few pictures this cannot be told from a turn of the
+    camera.
     """
     n_taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     if min(n_taken.values()) < MIN_FOR_PRINCIPAL_POINT:
@@ -235,8 +241,8 @@ def refine_principal_points(model: Any) -> None:
 
 
 def adjust(model: Any, principal_points: bool = False) -> None:
-    """Adjust the cameras and points of a `pycolmap.Reconstruction` together, also its `principal_points` if
-    that is asked for."""
+    """Adjust the cameras and points of a `pycolmap.Reconstruction` together (bundle adjustment), with
+    `principal_points` also the principal points."""
     pycolmap = pycolmap_module()
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = principal_points

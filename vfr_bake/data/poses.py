@@ -1,4 +1,5 @@
-"""Photographs or a video without cameras -> a COLMAP model beside them, `sparse/0`, estimated once."""
+"""Estimate the cameras of photographs or of a video, once, and keep them beside these as a COLMAP model,
+`sparse/0`."""
 
 from __future__ import annotations
 
@@ -45,15 +46,17 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 MIN_PICTURES = 3
 MIN_SHARE = 0.6
-"""Share of the pictures that must find a place. Where two in five find none, the subject is seen from one
-side only, or in two models of which one is lost: a field trained on the rest has holes."""
+"""Share of the pictures that must be placed, that is, get a camera. If two in five are not placed, the
+subject is seen from one side only, or is in two models of which one is lost: a field trained on the rest has
+holes."""
 MIN_REGISTERED = 8
-"""If there are fewer pictures, all must be registered: a handful can agree on a wrong model."""
+"""Number of pictures that must be placed at least. Of fewer pictures all must be, because a handful can agree
+on a wrong model."""
 HANDFUL = 24
-"""Whether so few pictures find their places depends on which two of them come first, and these are drawn by
-chance: more attempts are made."""
+"""Up to this number of pictures, more attempts are made: whether so few are placed depends on which two of
+them come first, and these are drawn by chance."""
 MIN_FEATURES = 50
-"""Fewer than these, and a picture is blank, out of focus, or all blur."""
+"""A picture with fewer features is blank, out of focus, or all blur."""
 
 ADVICE = (
     "photograph with more overlap (a step of some 10 degrees from one picture to the next), move around the "
@@ -67,26 +70,28 @@ Progress = Callable[[str, int, int], object]
 
 @dataclass(frozen=True)
 class PoseReport:
-    """How well the cameras of a set of pictures are known."""
+    """A report on how well the cameras of a set of pictures are known."""
 
     folder: Path
     """The folder that holds `sparse/0` and the pictures: the given one, or a video's folder of frames."""
     n_pictures: int
     n_registered: int
-    """The pictures that have got a camera."""
+    """Number of pictures that have got a camera."""
     mean_error: float
-    """Pixels: mean over the points of how far their projections are from where the pictures show them."""
+    """Reprojection error in pixels: the distance of a point's projections from where the pictures show it, as
+    the mean over the points."""
     mean_track_length: float
-    """Pictures a point is seen in, on average."""
+    """Number of pictures that a point is seen in, on average."""
     unplaced: Mapping[str, str] = field(default_factory=dict)
-    """Why a picture found no place, by its name."""
+    """The reason why a picture was not placed, by the picture's name."""
     repeated: dict[str, str] = field(default_factory=dict)
-    """Pictures that were left out because another shows the same, and which."""
+    """Names of pictures that were left out, each with the name of the picture that shows the same."""
     apart: tuple[int, ...] = ()
-    """Numbers of pictures of the groups that have places of their own, which fit nothing of the rest."""
+    """Number of pictures in each further group, whose pictures were placed relative to each other but not to
+    the rest."""
 
     def summary(self) -> str:
-        """One sentence for whoever took the pictures.
+        """Return one sentence for the person who took the pictures.
 
         >>> PoseReport(Path("garden"), 50, 48, 0.61, 7.25).summary()
         'garden: cameras of 48 of 50 pictures, off by 0.61 pixels, a point is seen in 7.2 pictures'
@@ -115,7 +120,7 @@ class PoseReport:
 
 
 def is_video(path: Path) -> bool:
-    """Whether `path` is a file that goes by the name of a video.
+    """Return whether `path` is a file with the suffix of a video.
 
     >>> is_video(Path("surely/not/there.mp4"))
     False
@@ -124,7 +129,7 @@ def is_video(path: Path) -> bool:
 
 
 def has_pictures(folder: Path) -> bool:
-    """Whether `estimate_cameras` finds pictures in `folder`."""
+    """Return whether `estimate_cameras` finds pictures in `folder`."""
     return bool(find_pictures(folder)[1])
 
 
@@ -134,23 +139,26 @@ def estimate_cameras(
     """Estimate the camera of every picture, and keep the result as `sparse/0` beside the pictures.
 
     `photos`: a folder with pictures in `images/` or in itself, or in folders within these, or a video, whose
-    frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that is there is reported and
-    left as it is; a new one appears when it is complete. `progress`: called with a stage (`frames` for a
-    video, then `features`, `matches`, `cameras`; where those of a handful are too few `cameras, attempt 2`
-    and so on, where they are folded `walk`, `turns`, `cameras again`), how much of it is done and how much
-    there is. `say`: called with a sentence where what is known of the pictures cannot be kept until the end.
+    frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that exists is reported and
+    left as it is; a new one appears when it is complete. `progress`: called with the name of a stage, the
+    number of its items that are done, and the number of all. The stages are `frames` for a video, then
+    `features`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful of
+    pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called with
+    a sentence if the disk refuses to keep features and matches until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
     tells, share one camera (model RADIAL), which begins with EXIF's focal length. In the model the z axis is
-    up (`vfr_bake.data.world`); its unit is arbitrary: pictures alone do not tell it. A subject that looks the
-    same from two sides is folded into one, as if walked around half, where nothing but it is matched.
-    Pictures of one walk, named in its order, are unfolded (`vfr_bake.data.models.folds`); pictures in no
-    order are not, unless their surroundings prevent it. Parts that share pictures are joined
-    (`vfr_bake.data.models.joining`); of others the largest is taken.
+    up (`vfr_bake.data.world`); the unit is arbitrary, because pictures alone do not tell it. A subject that
+    looks the same from two sides is folded if nothing but the subject is matched: the two sides become one,
+    as if the camera had gone half way around. Pictures of one walk, named in its order, are unfolded
+    (`vfr_bake.data.models.folds`). Pictures in no order are not; only their surroundings can prevent the
+    fold. Models that share pictures are joined (`vfr_bake.data.models.joining`); of others the largest is
+    taken.
 
-    Raises DataError (nothing that can be used; what to photograph differently; a COLMAP model as text),
-    FormatError (a damaged `sparse/0`), OutputError (the folder is read-only), MissingExtraError.
+    Raises DataError (no pictures that can be used, with advice on what to photograph differently; a COLMAP
+    model as text), FormatError (a damaged `sparse/0`), OutputError (the folder is read-only),
+    MissingExtraError.
     """
     if is_video(photos):
         photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of))
@@ -167,7 +175,7 @@ def estimate_cameras(
             f"{photos}: pictures ({', '.join(SUFFIXES)}): expected at least {MIN_PICTURES}, "
             f"got {len(pictures)}{other_kinds(photos)}"
         )
-    pycolmap_module()  # said at once if it is missing, not after minutes
+    pycolmap_module()  # reports at once that it is missing, not after minutes
     try:
         check_target(model)
     except OutputError as error:
@@ -209,7 +217,7 @@ def estimate_cameras(
 
 
 def _refuse_text(photos: Path) -> None:
-    """Raises DataError for a COLMAP model that is there as text alone."""
+    """Raise DataError if the folder has a COLMAP model as text alone."""
     if colmap_folder(photos) is not None:
         return
     for model in (photos / name for name in FOLDERS):
@@ -221,14 +229,14 @@ def _refuse_text(photos: Path) -> None:
 
 
 def cache_root() -> Path:
-    """The user's folder of what is kept of sets of pictures whose cameras are not known yet."""
+    """Return the user's folder of features and matches of pictures whose cameras are not known yet."""
     return user_folder() / "matches"
 
 
 def why_unplaced(
     names: Sequence[str], features: Sequence[Features], pairs: Sequence[Pair], models: Sequence[Any]
 ) -> dict[str, str]:
-    """Why pictures are not in the first of the `models`, by their names."""
+    """Return the reasons why pictures are not in the first of the `models`, by the pictures' names."""
     placed = _names_in(models[0])
     partners: dict[str, set[str]] = {name: set() for name in names}
     for pair in pairs:
@@ -273,8 +281,9 @@ def _placed(
     pairs: Sequence[Pair],
     progress: Progress,
 ) -> list[Any]:
-    """The `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, with those
-    joined into it that fit; if that is folded, others that are not."""
+    """Return the `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, after
+    joining those into it that fit. If the largest is folded, models built from a walk are returned instead,
+    if they tear fewer neighbours apart."""
 
     def built(some: Sequence[Pair], stage: str, attempt: Attempt = FIRST_ATTEMPT) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
@@ -305,14 +314,15 @@ def _placed(
         return models
     walk = built(near_pairs(pairs), "walk")
     if not enough(walk) or n_torn(walk) >= n_torn(models):
-        return models  # no walk
+        return models  # the pictures are not of one walk
     agreeing = agreeing_pairs(walk[0], names, features, pairs, lambda *n: progress("turns", *n))
     closed = built(agreeing, "cameras again")
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
 
 def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
-    """A clause on pictures that fall into several groups which have nothing in common; empty for one."""
+    """Return a clause on the groups that the pictures fall into if the groups have nothing in common; empty
+    for one group."""
     groups = {number: {number} for number in range(len(names))}
     for pair in pairs:
         if groups[pair.i] is not groups[pair.j]:
@@ -330,8 +340,8 @@ def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
 
 
 def _repeated(photos: Path, looks: Sequence[Look]) -> dict[int, int]:
-    """The pictures that are left out, and which are kept instead; raises DataError where too few would be
-    left, or too few show anything."""
+    """Return the numbers of the pictures that are left out, each with the number of the picture that is kept
+    instead. Raises DataError if too few pictures would be left, or too few show anything."""
     n_good = sum(len(look.features.points) >= MIN_FEATURES for look in looks)
     if n_good < _n_needed(len(looks)):
         raise DataError(
@@ -360,7 +370,8 @@ def _n_needed(n_pictures: int) -> int:
 
 
 def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
-    """What the files of a COLMAP model say of themselves (its scene/reconstruction_io.cc has the format)."""
+    """Read the report on a COLMAP model from the model's files (COLMAP's scene/reconstruction_io.cc has their
+    format)."""
     for name in MODEL_FILES:
         if not (model / name).is_file():
             raise FormatError(

@@ -1,7 +1,8 @@
-"""Posed pictures of one scene, in the frame that everything after the data set works in.
+"""Posed pictures of one scene, in the model frame, in which everything after the loading of the data set
+works.
 
-The model frame puts an object's cubic box at [-1, 1]³ and the cameras of an unbounded scene into the unit
-ball around what they look at, whatever the scene's unit; `world_from_model` undoes it.
+The model frame has an object's cubic box at [-1, 1]³, or the cameras of an unbounded scene in the unit ball
+around what they look at, whatever the scene's unit is. `world_from_model` maps it back to the world.
 """
 
 from __future__ import annotations
@@ -19,46 +20,49 @@ from vfr_bake.data.files.masks import check_masked
 from vfr_bake.data.world import MOST_POINTS
 
 BORDER = 2
-"""Pixels along a picture's edge that tell a plain background."""
+"""Width in pixels of the border of a picture that is examined for a plain background."""
 PLAIN_SHARE, PLAIN_LEVELS = 0.95, 8
-"""A background is plain if so large a share of the border pixels is within so many levels of one colour."""
+"""A background is plain if at least PLAIN_SHARE of the border pixels are within PLAIN_LEVELS of one
+colour."""
 N_LOOKED_AT = 200
-"""Silhouettes and borders are looked at in so many of the pictures, spread evenly."""
+"""Number of pictures, spread evenly, whose silhouettes and borders are examined."""
 CAMERA_QUANTILE = 0.9
-"""This share of an unbounded scene's cameras lies in the unit ball: one that strayed must not shrink the
+"""Share of an unbounded scene's cameras that lie in the unit ball: one that strayed must not shrink the
 rest."""
 NEAR_CAMERA = 0.05
-"""Matter begins at this distance from a camera, model units, where no points tell: nearer things than a
+"""Distance from a camera, in model units, at which matter begins if no points are known. Things nearer than a
 twentieth of the way to the subject are out of focus in a photograph."""
 NEAR_QUANTILE, NEAR_SHARE = 0.01, 0.5
-"""Where points tell: matter begins at half the depth that one point in a hundred is in front of."""
+"""If points are known, matter begins at NEAR_SHARE of the depth that one point in a hundred (NEAR_QUANTILE)
+is in front of, but at no more than 4 NEAR_CAMERA."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene to train on and to test with."""
+    """The views of a scene to train on and to test with."""
 
     name: str
     train: PosedImages
     test: PosedImages
-    """Views that training never sees; none when there are too few to spare one."""
+    """Views that training never sees; empty if there are too few to spare one."""
     has_alpha: bool
-    """Whether any training picture has a pixel that is not opaque and not masked either."""
+    """Whether any training picture has a pixel that is neither opaque nor masked."""
     world_from_model: np.ndarray
     """[4, 4] float64: uniform scale and translation."""
     unbounded: bool = False
-    """Whether the pictures show surroundings without end, or an object in a box."""
+    """True if the pictures show surroundings without end, False if they show an object in a box."""
     near: float = 0.0
-    """Unbounded: how near to a camera matter may begin, model units."""
+    """In an unbounded scene, the distance from a camera at which matter may begin, in model units."""
     masked: bool = False
-    """Whether pixels that are not opaque are masked: they are neither drawn nor scored."""
+    """Whether pixels that are not opaque are masked. Training does not draw them, and they are not scored."""
 
 
 def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
-    """A `Scene` out of pictures with cameras in the world: finds its kind and moves the cameras to the model
-    frame, which the training views alone decide.
+    """Build a `Scene` from pictures with cameras in the world: find its kind, and move the cameras to the
+    model frame, which the training views alone decide.
 
-    Raises DataError where depth is not to be had: fewer than two training views, or all from one place.
+    Raises DataError if depth cannot be found (fewer than two training views, or all from one place), or if
+    nearly everything is masked.
 
     >>> from vfr_bake.data.demo import demo_capture
     >>> scene = build_scene(demo_capture(size=16, n_train=4, n_test=1))
@@ -85,7 +89,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     def moved(views: PosedImages) -> PosedImages:
         return PosedImages([camera.transformed(model_from_world) for camera in views.cameras], views.images)
 
-    # Nothing is empty in front of surroundings without end: what is transparent there has been masked.
+    # In an unbounded scene every ray meets something, so that pixels can only be transparent because they
+    # have been masked.
     masked = capture.masked or (unbounded and has_alpha)
     has_alpha = has_alpha and not masked
     if masked:
@@ -108,7 +113,7 @@ def _check_cameras(name: str, cameras: list[Camera]) -> None:
 
 
 def _spread(views: PosedImages) -> PosedImages:
-    """At most N_LOOKED_AT of the views, spread evenly."""
+    """Return at most N_LOOKED_AT of the views, spread evenly."""
     n_views = len(views.cameras)
     return views.some(
         set(np.linspace(0, n_views - 1, min(n_views, N_LOOKED_AT)).round().astype(int).tolist())
@@ -116,7 +121,7 @@ def _spread(views: PosedImages) -> PosedImages:
 
 
 def _plain_border(views: PosedImages) -> bool:
-    """Whether the pictures' edges show nothing but one colour."""
+    """Return whether the pictures' borders show hardly anything but one colour."""
     edges = [
         views.pixels(number, _border(camera.width, camera.height))[:, :3]
         for number, camera in enumerate(views.cameras)
@@ -127,25 +132,26 @@ def _plain_border(views: PosedImages) -> bool:
 
 
 def _border(width: int, height: int) -> np.ndarray:
-    """[n] the numbers of a picture's pixels along its four edges; those of its corners come twice."""
+    """Return the numbers [n] of the pixels along a picture's four edges; those of its corners come twice."""
     numbers = np.arange(width * height).reshape(height, width)
     edges = (numbers[:BORDER], numbers[-BORDER:], numbers[:, :BORDER], numbers[:, -BORDER:])
     return np.concatenate([edge.reshape(-1) for edge in edges])
 
 
 def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:
-    """Centre [3] and radius of the ball around what the cameras look at that holds (nearly all of) them."""
+    """Return the centre [3] and the radius of a ball around what the cameras look at, which holds nearly all
+    cameras."""
     places = np.stack([camera.c2w[:3, 3] for camera in cameras])
     middle = places.mean(axis=0)
     spread = float(np.linalg.norm(places - middle, axis=1).max())
     centre = focus_point(cameras)
     if np.linalg.norm(centre - middle) > 20 * spread:
-        centre = middle  # nearly parallel views meet nowhere in particular
+        centre = middle  # nearly parallel views have no focus point that can be used
     return centre, float(np.quantile(np.linalg.norm(places - centre, axis=1), CAMERA_QUANTILE))
 
 
 def _near(cameras: list[Camera], points: np.ndarray | None, unit: float) -> float:
-    """How near to a camera matter may begin, in units of `unit`."""
+    """Return the distance from a camera at which matter may begin, in units of `unit`."""
     if points is None or len(points) == 0:
         return NEAR_CAMERA
     points = points[:: max(1, len(points) // MOST_POINTS)]

@@ -1,4 +1,4 @@
-"""Work on many pictures, or pairs of them, at a time."""
+"""Call a function for many pictures, or pairs of pictures, in several threads."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from player.threads import default_threads
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[int, int], object]
-"""Called with how many things are done and how many there are."""
+"""A function that is called with the number of items that are done and the number of all items."""
 
 
 def n_threads() -> int:
-    """As many as the cores that this process may use, up to eight: each holds a decoded picture and a block
-    of products."""
+    """Return the number of threads: as many as the cores that this process may use, but at most eight,
+    because each holds a decoded picture or a block of a matrix product."""
     return min(8, default_threads())
 
 
 def in_threads(
     function: Callable[[Item], Result], items: Sequence[Item], progress: Progress | None
 ) -> list[Result]:
-    """Call `function` for every item, and return what it returned in the order of the items.
+    """Call `function` for every item, and return the results in the order of the items.
 
-    What it raises ends the others, as does an interruption.
+    An exception in one call, or an interruption, cancels the calls that have not begun.
 
     >>> in_threads(str, [1, 2], None)
     ['1', '2']
@@ -40,10 +40,10 @@ def in_threads(
 
 
 def one_by_one(function: Callable[[Item], Result], items: Sequence[Item], n_threads: int) -> Iterator[Result]:
-    """What `function` returns for every item, in the order of the items; no more are worked on, or done and
-    not yet taken, than `n_threads` and one.
+    """Yield the results of `function` for every item, in the order of the items. At most `n_threads` + 1
+    items are in work, or finished and not yet taken, at a time.
 
-    What it raises ends the others, as does an interruption.
+    An exception in one call, or an interruption, cancels the calls that have not begun.
 
     >>> list(one_by_one(str, [1, 2], 1))
     ['1', '2']

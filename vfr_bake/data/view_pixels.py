@@ -16,8 +16,8 @@ from vfr_bake.data.capture import PosedImages
 N_TRAINING_PIXELS = 4_000_000
 """Number of training pixels at most: 32 MB of a model file."""
 NEAR = 1 / 32
-"""Share of a view's longer side. If a view has transparent pixels, those that are farther than this from
-everything else are not kept: there is nothing to learn from them."""
+"""Distance, as a share of a view's longer side. If a view has transparent pixels, those that are farther than
+this from everything else are not kept: there is nothing to learn from them."""
 SEED = 21
 """Seed of the choice of training pixels."""
 
@@ -29,23 +29,23 @@ class ViewPixels:
     """Pixels of some views, view after view."""
 
     counts: np.ndarray
-    """[n_views] int32: number of the pixels of each training view."""
+    """[n_views] int32: number of the pixels kept of each training view."""
     pixels: np.ndarray
     """[n_pixels] int32: row * width + column within their view, ascending in each view."""
     rgba: np.ndarray
     """[n_pixels, 4] uint8: their colours, sRGB and straight alpha."""
 
     def views(self) -> np.ndarray:
-        """[n_pixels] int64: the number of each pixel's view."""
+        """Return the number of each pixel's view, [n_pixels] int64."""
         return np.repeat(np.arange(len(self.counts)), self.counts)
 
     def of_views(self) -> list[np.ndarray]:
-        """`pixels` of each view."""
+        """Return `pixels` split by view."""
         return np.split(self.pixels, np.cumsum(self.counts)[:-1])
 
     def rays(self, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions of the pixels' rays, [n_pixels, 3] float32 each, in the frame of the
-        `cameras`, one for each training view."""
+        """Return the origins and unit directions of the pixels' rays, [n_pixels, 3] float32 each, in the
+        frame of the `cameras`, one for each training view."""
         rays = []
         for camera, pixels in zip(cameras, self.of_views(), strict=True):
             rows, columns = np.divmod(pixels, camera.width)
@@ -54,7 +54,8 @@ class ViewPixels:
         return rays_o, rays_d
 
     def chosen(self: SomePixels, kept: np.ndarray) -> SomePixels:
-        """The pixels with the numbers `kept`, ascending, or where `kept` [n_pixels] bool is true.
+        """Return the pixels with the numbers `kept`, ascending, or those where `kept` [n_pixels] bool is
+        true.
 
         >>> rgba = np.array([[9, 9, 9, 255], [9, 9, 9, 0]], np.uint8)
         >>> two = ViewPixels(np.array([0, 2], np.int32), np.array([3, 5], np.int32), rgba)
@@ -66,17 +67,17 @@ class ViewPixels:
         return replace(self, counts=counts, pixels=self.pixels[kept], rgba=self.rgba[kept])
 
     def opaque(self: SomePixels) -> SomePixels:
-        """The pixels that are opaque."""
+        """Return the pixels that are opaque."""
         return self.chosen(self.rgba[:, 3] == 255)
 
     def some(self: SomePixels, n: int) -> SomePixels:
-        """About `n` of the pixels, spread evenly, or all if there are fewer."""
+        """Return about `n` of the pixels, spread evenly, or all if there are fewer."""
         return self.chosen(np.arange(0, len(self.pixels), max(1, len(self.pixels) // n)))
 
 
 def choose_training_pixels(views: PosedImages, witnesses: ViewPixels, learned: np.ndarray) -> ViewPixels:
-    """Choose pixels of training `views`, as many of each of the views in `learned`, spread evenly over it;
-    leave out those that are `witnesses`.
+    """Choose pixels of training `views`: about as many of each of the views in `learned`, spread evenly over
+    it. Those that are `witnesses` are left out.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 3, 1)
@@ -100,14 +101,15 @@ def choose_training_pixels(views: PosedImages, witnesses: ViewPixels, learned: n
 
 
 def spread(n: int, of: int, random: np.random.Generator) -> np.ndarray:
-    """[n] int64, ascending: one of each of `n` equally long runs of the numbers below `of`, at random."""
+    """Draw one number at random from each of `n` equally long runs of the numbers below `of`. Returns [n]
+    int64, ascending."""
     edges = np.arange(n + 1) * of // max(n, 1)
     return random.integers(edges[:-1], edges[1:])
 
 
 def _near_something(alpha: np.ndarray) -> np.ndarray:
-    """[n] int64: the numbers of those pixels of a view with this `alpha` [height, width] that are not far
-    from all that is not transparent."""
+    """Return the numbers, [n] int64, of the pixels of a view that are near a pixel that is not transparent.
+    `alpha`: [height, width], of the view."""
     near, radius = alpha > 0, round(NEAR * max(alpha.shape))
     for axis in (0, 1):
         wider = [(0, 0), (0, 0)]

@@ -1,13 +1,14 @@
-"""Witnesses: pixels of the training views that training never draws, for a bake to be measured against.
+"""Witnesses: pixels of the training views that training never draws, on which the loss of a bake is measured.
 
-The test split is there to report on, so nothing may be chosen by it. What a bake loses is therefore measured
-on pixels of the training split that are kept apart before training begins, of two kinds:
+The test split is for reporting results, so nothing may be chosen by it. The loss of a bake is therefore
+measured on pixels of the training split that are set apart before training begins. There are two kinds:
 
-- *patches*, squares of pixels, as many of every view. They cover the whole scene. What is inside of a patch
-  the model knows from other views alone, as it knows a test view. Single pixels, with learned ones all around
-  them, it shows far better (docs/notes/2026-11-29-patches-of-witnesses.md).
-- pixels of a few *whole views*, of which training draws none. These views are to the model what test views
-  are, but there are only a few of them.
+- *patches*: squares of pixels, about the same number of pixels in every view. They cover the whole scene. The
+  model knows the inside of a patch from other views alone, as it knows a test view. It shows single pixels
+  far better, because it learned from the pixels all around them
+  (docs/notes/2026-11-29-patches-of-witnesses.md).
+- pixels of a few *whole views*, from which training draws no pixel. To the model these views are like test
+  views, but there are only a few of them.
 """
 
 from __future__ import annotations
@@ -21,35 +22,39 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.view_pixels import ViewPixels, spread
 
 N_WITNESSES = 60_000
-"""Number of witnesses at most; half of them are of whole views, where there are any."""
+"""Number of witnesses at most; half of them are in whole views, if there are any."""
 MOST_OF_A_VIEW = 0.02
-"""Largest share of a view's pixels that are kept as patches: a small scene needs its pixels itself."""
+"""Largest share of a view's pixels that are set apart as patches, because a small scene needs its pixels for
+training."""
 PATCH = 16
-"""Pixels along an edge of a patch, about: those of a view are as many as fit into its share of witnesses."""
+"""Approximate number of pixels along an edge of a patch. A view has about as many patches as fit into its
+share of the witnesses."""
 FEWEST_VIEWS, VIEWS_OF_A_WHOLE, MOST_WHOLE = 20, 25, 4
-"""Whole views are kept from as many training views on, about one in so many, and at most so many."""
+"""Whole views are set apart if there are at least FEWEST_VIEWS training views: about one in VIEWS_OF_A_WHOLE,
+and at most MOST_WHOLE."""
 SEED = 20
-"""Seed of the choice, which is the same whatever the seed of the training is."""
+"""Seed of the choice, which does not depend on the seed of the training."""
 
 
 @dataclass(frozen=True, eq=False)
 class Witnesses(ViewPixels):
-    """Pixels that training has not learned from, view after view."""
+    """Pixels that training does not learn from, view after view."""
 
     whole: np.ndarray
-    """[n_whole] int32, ascending: the views of which training draws no pixel at all."""
+    """[n_whole] int32, ascending: the numbers of the views from which training draws no pixel at all."""
 
     def learned(self) -> np.ndarray:
-        """[n_learned] int64, ascending: the views that training draws from."""
+        """Return the numbers of the views that training draws from, [n_learned] int64, ascending."""
         return np.setdiff1d(np.arange(len(self.counts)), self.whole)
 
 
 def choose_witnesses(views: PosedImages) -> Witnesses:
-    """Choose the witnesses of training `views`; the same pictures' sizes always give the same choice.
+    """Choose the witnesses of training `views`. The choice depends on the sizes of the pictures alone.
 
-    Every view has about the same number of pixels in patches, and at most MOST_OF_A_VIEW of it. Pictures that
-    are too small for that have none. Of whole views, pixels are drawn at random, one from each of as many
-    equally long runs as there are to be.
+    Every view that training draws from has about the same number of pixels in patches, and at most
+    MOST_OF_A_VIEW of its pixels. Pictures that are too small for that have none. The pixels of a whole view
+    are divided into as many equally long runs as it has witnesses, and one pixel is drawn at random from each
+    run.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 20, 1)
@@ -77,8 +82,9 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
 
 
 def patches(n: int, width: int, height: int, random: np.random.Generator) -> np.ndarray:
-    """[n_pixels] int64, ascending: the numbers, row * width + column, of at most `n` pixels of a picture, in
-    squares at random places, one in each of as many equal parts of its longer side.
+    """Return the numbers (row * width + column) of at most `n` pixels of a picture, [n_pixels] int64,
+    ascending. They form squares: the longer side is divided into as many equal parts as there are squares,
+    and each part has one at a random place.
 
     >>> patches(18, 10, 4, np.random.default_rng(0)).tolist()
     [5, 6, 7, 8, 15, 16, 17, 18, 25, 26, 27, 28, 35, 36, 37, 38]
@@ -94,7 +100,7 @@ def patches(n: int, width: int, height: int, random: np.random.Generator) -> np.
 
 
 def whole_views(n_views: int) -> np.ndarray:
-    """[n_whole] int32: the numbers of the whole views that are kept of `n_views`, spread evenly.
+    """Return the numbers of the whole views to set apart from `n_views`, [n_whole] int32, spread evenly.
 
     >>> [len(whole_views(n)) for n in (19, 20, 37, 38, 88, 1000)], whole_views(100).tolist()
     ([0, 1, 1, 2, 4, 4], [12, 37, 62, 87])
@@ -105,5 +111,5 @@ def whole_views(n_views: int) -> np.ndarray:
 
 
 def _shares(total: int, n: int) -> np.ndarray:
-    """[n] int64: whole numbers that differ by at most one and sum to `total`."""
+    """Return `n` whole numbers, [n] int64, that differ by at most one and sum to `total`."""
     return np.diff(np.arange(n + 1) * total // max(n, 1))

@@ -1,8 +1,8 @@
 """The world of a capture: which way is up, and how long a unit is.
 
-Pictures alone tell neither. People hold cameras level, so that the right hands of pictures that are turned
-upright lie in the horizontal plane; and where they photograph something on a table, a floor or the ground,
-that is the largest level plane of what they see, and has nothing below it.
+Pictures alone tell neither. But people hold cameras level, so that the x axes (the right-hand directions) of
+upright pictures lie in the horizontal plane. And where people photograph something on a table, a floor or the
+ground, that surface is the largest level plane in the scene, and nothing lies below it.
 """
 
 from __future__ import annotations
@@ -16,27 +16,29 @@ from player.errors import DataError
 from vfr_bake.data.capture import Capture, PosedImages
 
 SIDEWAYS = 0.1
-"""Sine of how far the right hand of a picture that is held level leaves the horizontal plane; those of
-pictures that lie on their side leave it by far more, and hardly count."""
+"""Sine of the angle by which the x axis of a camera that is held level may leave the horizontal plane. The x
+axes of pictures that lie on their side leave it by far more, and get hardly any weight."""
 N_ROUNDS = 20
 MAX_TILT = 5.0
-"""Degrees between up as the cameras tell it and the normal of a ground that is taken to be level: hands are
-off by one or two, and what leans by more is a slope."""
+"""Largest angle, in degrees, between the up direction of the cameras and the normal of a plane that counts as
+level ground. The x axes of cameras are off by one or two degrees, and a plane that leans by more than this is
+a slope."""
 N_TRIALS = 1000
 MIN_SHARE, MAX_BELOW = 0.2, 0.05
-"""Shares of the points that lie in the ground, at least, and below it, at most."""
+"""Shares of the points: at least MIN_SHARE must lie in the ground plane, and less than MAX_BELOW below it."""
 THICKNESS = 0.01
-"""Half the thickness of the ground, as a share of the median distance of the points from their middle."""
+"""Half the thickness of the ground plane, as a share of the median distance of the points from their
+middle."""
 MOST_POINTS = 5000
-"""About so many points of a scene are enough to tell of all."""
+"""A sample of about this many points stands for all points of a scene."""
 
 
 def find_up(c2w: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Up [3] in the world of estimated cameras, of unit length.
+    """Return the up direction [3], of unit length, in the world of estimated cameras.
 
     `c2w`: [n_cameras, 4, 4], OpenGL axes, of upright pictures. `points`: [n_points, 3] of the scene. Up is at
-    right angles to the right hands of most cameras, and the normal of the ground where there is one that
-    agrees to `MAX_TILT`.
+    right angles to the x axes of most cameras. If there is a ground plane whose normal agrees with that to
+    within `MAX_TILT`, up is its normal.
 
     >>> c2w = np.eye(4)[None].repeat(3, axis=0)
     >>> find_up(c2w, np.zeros((0, 3))).tolist()
@@ -48,22 +50,24 @@ def find_up(c2w: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _up_of_cameras(c2w: np.ndarray) -> np.ndarray:
-    """Minimise the sum of w_i (r_i up)^2 over unit vectors, with right hands r_i, and weights w_i that leave
-    out what lies on its side (iteratively reweighted least squares, Geman and McClure's weights)."""
+    """Return the unit vector up that minimises the sum of w_i (r_i up)^2, where r_i are the cameras' x axes.
+    The weights w_i leave out cameras that lie on their side (iteratively reweighted least squares, Geman and
+    McClure's weights)."""
     rights, ups = c2w[:, :3, 0], c2w[:, :3, 1]
     up = _unit(np.median(ups, axis=0), ups[0])
     for _ in range(N_ROUNDS):
         weights = 1 / (1 + (rights @ up / SIDEWAYS) ** 2) ** 2
         mean = _unit(weights @ ups, up)
         spread = (rights * weights[:, None]).T @ rights / weights.sum()
-        # As much as right hands tell that turn by two degrees: alone they may not tell at all.
+        # A prior of weight 1e-3 pulls up towards the mean of the cameras' own up axes, because the x axes
+        # alone may not determine it. It is as strong as x axes that turn by two degrees.
         up = _unit(np.linalg.solve(spread + 1e-3 * np.eye(3), 1e-3 * mean), mean)
     return up
 
 
 def _ground(points: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """The upward normal [3] of the largest level plane with nothing below it, or None (RANSAC: Fischler and
-    Bolles, 1981)."""
+    """Return the upward normal [3] of the largest level plane with hardly anything below it, or None (RANSAC:
+    Fischler and Bolles, 1981)."""
     if len(points) < 100:
         return None
     random = np.random.default_rng(0)
@@ -87,7 +91,7 @@ def _ground(points: np.ndarray, up: np.ndarray) -> np.ndarray | None:
 
 
 def _level(normal: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """The normal [3], upward and of unit length, if its plane is level."""
+    """Return the normal [3], upward and of unit length, or None if its plane is not level."""
     length = np.linalg.norm(normal)
     cosine = float(normal @ up) / length if length > 0 else 0.0
     if abs(cosine) < np.cos(np.radians(MAX_TILT)):
@@ -101,7 +105,7 @@ def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
 
 
 def turn_to_z(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] that takes `up` [3], of unit length, to the z axis.
+    """Return the smallest rotation [3, 3] that takes `up` [3], of unit length, to the z axis.
 
     >>> (turn_to_z(np.array([0.0, 1.0, 0.0])) @ [0, 1, 0]).round(6).tolist()
     [0.0, 0.0, 1.0]
@@ -116,10 +120,10 @@ def turn_to_z(up: np.ndarray) -> np.ndarray:
 
 
 def scaled(capture: Capture, first: str, second: str, distance: float) -> Capture:
-    """The capture in a world whose unit is that of `distance`, which lies between two of its cameras.
+    """Return the capture in a world in which two of its cameras are `distance` units apart.
 
-    `first`, `second`: the pictures that they took, by the names of their files. `distance`: more than 0.
-    Raises DataError: no such picture, or two from one place.
+    `first`, `second`: file names of the pictures that these cameras took. `distance`: more than 0. Raises
+    DataError: there is no such picture, or both are from one place.
     """
     a, b = (_place(capture, name) for name in (first, second))
     apart = float(np.linalg.norm(a - b))
@@ -142,7 +146,8 @@ def scaled(capture: Capture, first: str, second: str, distance: float) -> Captur
 
 
 def _place(capture: Capture, name: str) -> np.ndarray:
-    """Where the camera [3] of the picture called `name` is, with or without its folder and its ending."""
+    """Return the position [3] of the camera of the picture called `name`, which may lack its folder and its
+    suffix."""
     cameras: list[Camera] = [*capture.train.cameras, *capture.test.cameras]
     for form in (_whole, _last, _stem):
         found = [camera for camera in cameras if form(camera.name) == form(name)]

@@ -13,7 +13,7 @@ from vfr_bake.kernels.density import LARGEST_LOGIT, FieldArrays, density_logits
 
 
 class VfrField(nn.Module):
-    """The trained thing. Positions are in the model frame, whose scene box is [-1, 1]^3."""
+    """The trained field. Positions are in the model frame, whose scene box is [-1, 1]^3."""
 
     def __init__(self, config: FieldConfig) -> None:
         super().__init__()
@@ -23,24 +23,25 @@ class VfrField(nn.Module):
         self.head = Head(config)
 
     def arrays(self) -> FieldArrays:
-        """Grid and density as the kernels take them; of a field on a CPU."""
+        """Return grid and density network as the kernels take them, for a field on a CPU."""
         return FieldArrays(*self.grid.layout.grid(self.grid.table), *self.density.arrays())
 
     @torch.no_grad()
     def log_densities(self, points: np.ndarray) -> np.ndarray:
-        """Pre-activation densities [n] at `points` [n, 3] of the unit cube (model coordinates x as (x + 1) /
-        2)."""
+        """Return the pre-activation densities [n] at `points` [n, 3] of the unit cube, where the model
+        coordinate x is at (x + 1) / 2."""
         out = np.empty(len(points), points.dtype)
         density_logits(points, self.arrays(), out)
         return np.minimum(out, LARGEST_LOGIT)
 
     def lookup(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(features [n, n_channels], densities [n]) at `points` [n, 3] of the unit cube, on any device."""
+        """Return (features [n, n_channels], densities [n]) at `points` [n, 3] of the
+        unit cube, on any device."""
         features = self.grid(points)
         return features, self.density(features)
 
     def copied_to_cpu(self) -> VfrField:
-        """This field, or a copy if it is elsewhere."""
+        """Return this field if it is on a CPU, else a copy there."""
         if self.grid.table.device.type == "cpu":
             return self
         copy = VfrField(self.config)
@@ -49,7 +50,7 @@ class VfrField(nn.Module):
 
     @torch.no_grad()
     def features(self, points: np.ndarray) -> np.ndarray:
-        """Features [n, n_channels] at `points` [n, 3] of the unit cube."""
+        """Return the features [n, n_channels] at `points` [n, 3] of the unit cube."""
         return self.grid(torch.from_numpy(points)).numpy()
 
     def network_parameters(self) -> list[Tensor]:

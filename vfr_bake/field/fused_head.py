@@ -1,11 +1,11 @@
 """The head's forward and backward pass on a CPU, for the few hundred rays of a step.
 
 A ray costs 0.74 million operations forward and twice as many backward, nearly all of them in matrix products.
-torch's products do these at the speed of the processor; what lies between them takes one pass here, and
-autograd sees one function in place of sixty.
+torch computes these products at the speed of the processor. All operations between two products take one pass
+here, and autograd sees one function in place of sixty.
 
-Letters: layer l has x_l = W_l a_(l-1) + b_l and a_l = gelu(x_l); of the second, linear layer, the part behind
-the bottleneck is multiplied by the basis Y(d).
+Letters: layer l has x_l = W_l a_(l-1) + b_l and a_l = gelu(x_l). The second layer is linear; the part of its
+output after the bottleneck is multiplied by the basis Y(d).
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from vfr_bake.kernels.head import activations
 from vfr_bake.kernels.head.bfloat16 import as_array
 
 SPATIAL = 2
-"""Layers before the directions come in; the second has no activation."""
+"""Number of layers before the directions are used; the second has no activation."""
 BLOCK = 32
-"""Rows in bfloat16 are filled up to a multiple of this: oneDNN writes code for each number of rows that it
-meets, which takes longer than the product."""
+"""Rows in bfloat16 are padded to a multiple of this, because oneDNN generates code for each new number of
+rows, which takes longer than the product."""
 
 
 def fused_head(
     features: Tensor, basis: Tensor, layers: Sequence[torch.nn.Module], products: torch.dtype
 ) -> Tensor:
-    """Colours [n, 3] of `features` [n, n_channels], float32 on a CPU, with GELU between the layers.
+    """Return the colours [n, 3] of `features` [n, n_channels], float32 on a CPU, with
+    GELU between the layers.
 
-    `basis` [n, n_sh] is multiplied by what the second of the `layers` (`torch.nn.Linear`) predicts behind the
-    bottleneck. Differentiable with respect to the features and the layers.
+    `basis` [n, n_sh] is multiplied by the outputs of the second of the `layers` (`torch.nn.Linear`) that
+    follow the bottleneck. Differentiable with respect to the features and the layers.
 
-    `products`: float32, or bfloat16 for what the layers between the first and the last take and give, forward
-    and backward; sums are in float32.
+    `products`: float32, or bfloat16 for the inputs and outputs of the layers between the first and the last,
+    forward and backward; sums are in float32.
     """
     weights = [parameter for layer in layers for parameter in layer.parameters()]
     return _FusedHead.apply(features, basis, products, *weights)  # type: ignore[return-value]
@@ -73,7 +74,7 @@ class _FusedHead(torch.autograd.Function):
         rows = grads[0].any(dim=1).nonzero()[:, 0]
         n_rows, colours = len(rows), colours[rows]
         grad = grads[0][rows] * colours * (1 - colours)
-        if left_over := _left_over(n_rows, ctx.products):  # the last one again, with a gradient of 0
+        if left_over := _left_over(n_rows, ctx.products):  # pads with the last row, with a gradient of 0
             grad = torch.nn.functional.pad(grad, (0, 0, 0, left_over))
             rows = torch.cat([rows, rows[-1:].expand(left_over)])
         for number in reversed(range(n)):
@@ -98,5 +99,5 @@ class _FusedHead(torch.autograd.Function):
 
 
 def _left_over(n_rows: int, products: torch.dtype) -> int:
-    """How many rows of zeros fill `n_rows` up."""
+    """Return the number of rows that pad `n_rows` to a multiple of BLOCK in bfloat16; 0 in float32."""
     return -n_rows % BLOCK if products == torch.bfloat16 else 0

@@ -1,6 +1,6 @@
 """Multiresolution hash grid, F(x) of the paper: interpolated features at points of the unit cube.
 
-Letters: level l has N_l cells per axis, N_l = floor(base * growth^l); its (N_l + 1)^3 vertices have an entry
+Letters: level l has N_l cells per axis, N_l = floor(base * growth^l). Its (N_l + 1)^3 vertices have an entry
 each, or share 2^log2_table_size entries through the hash (x xor y * 2654435761 xor z * 805459861) mod size
 (Mueller et al. 2022, eq. 4).
 """
@@ -20,14 +20,14 @@ from vfr_bake.kernels.hash_grid import GridArrays, Levels
 from vfr_bake.torch_kernels.hash_grid import features_at
 
 Backend = Literal["numba", "torch"]
-"""The kernels that run: numba's, on a CPU, or torch's, on any device."""
+"""The kernels to run: numba's, on a CPU, or torch's, on any device."""
 
 
 def zeros(*shape: int) -> Tensor:
-    """A float32 tensor of zeros whose memory NumPy has allocated.
+    """Return a float32 tensor of zeros whose memory NumPy has allocated.
 
-    For large arrays NumPy asks Linux for pages of 2 MB, torch does not. A hash grid is read and written at
-    random, and with pages of 4 kB nearly every access would first have to look its page up.
+    For large arrays NumPy asks Linux for pages of 2 MB, which torch does not. A hash grid is read and written
+    at random, and with pages of 4 kB nearly every access would first need a lookup of its page.
 
     >>> zeros(2, 3).shape
     torch.Size([2, 3])
@@ -36,7 +36,7 @@ def zeros(*shape: int) -> Tensor:
 
 
 def level_resolutions(n_levels: int, base_resolution: int, max_resolution: int) -> list[int]:
-    """Cells per axis of every level, geometric from base to max.
+    """Return the cells per axis of every level, in geometric progression from base to max.
 
     >>> level_resolutions(3, 16, 64)
     [16, 32, 64]
@@ -48,7 +48,8 @@ def level_resolutions(n_levels: int, base_resolution: int, max_resolution: int) 
 
 
 class GridLayout:
-    """Which entries of a table belong to which level, and which of them are shared.
+    """Layout of a table: which entries belong to which level, and which levels share
+    entries through the hash.
 
     >>> GridLayout(n_levels=2, base_resolution=4, max_resolution=64, log2_table_size=10).n_entries
     1149
@@ -70,17 +71,17 @@ class GridLayout:
         return int(self.offsets[-1])
 
     def arrays(self, dtype: np.dtype | type) -> Levels:
-        """The levels as numba's kernels take them, for a table of type `dtype`."""
+        """Return the levels as numba's kernels take them, for a table of type `dtype`."""
         return Levels(np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask)
 
     def grid(self, table: Tensor) -> GridArrays:
-        """The table, which is on a CPU, with its levels, as numba's kernels take them."""
+        """Return the table, which is on a CPU, with its levels, as numba's kernels take them."""
         array = table.detach().numpy()
         return GridArrays(array, *self.arrays(array.dtype))
 
     def levels(self, table: Tensor) -> Levels:
-        """The levels as torch's kernels take them, beside `table` and in its type; made once for each
-        place."""
+        """Return the levels as torch's kernels take them, on the device and in the type of `table`; they are
+        made once for each device and type."""
         place = (table.device, table.dtype)
         if place not in self._levels:
             self._levels[place] = Levels(
@@ -106,17 +107,18 @@ class HashGrid(nn.Module):
             config.n_levels, config.base_resolution, config.max_resolution, config.log2_table_size
         )
         self.pending: list[tuple[Tensor, Tensor]] | None = None
-        """If a list, backward passes put (points, gradient of the features) here instead of scattering."""
+        """If a list, backward passes append (points, gradient of the features) to it instead
+        of scattering gradients."""
         self.backend: Backend = "numba"
-        """Which kernels `forward` runs where both could; elsewhere than on a CPU torch's alone can."""
+        """The kernels that `forward` runs on a CPU; on other devices torch's always run."""
         # Small and symmetric, as in instant-ngp: the first features say nothing about the scene.
         self.table = nn.Parameter(zeros(self.layout.n_entries, kernels.N_CHANNELS).uniform_(-1e-4, 1e-4))
 
     def forward(self, points: Tensor, features: Tensor | None = None) -> Tensor:
-        """Features [n_points, n_channels] at `points` [n_points, 3] of the unit cube.
+        """Return the features [n_points, n_channels] at `points` [n_points, 3] of the unit cube.
 
-        Where the march has computed `features` already they are taken as they are, and only their gradient
-        is our work. Not differentiable with respect to `points`.
+        If the march has already computed `features`, they are returned, and only their gradient is computed
+        here. Not differentiable with respect to `points`.
         """
         if self.backend == "torch" or points.device.type != "cpu":
             return features_at(points, self.table, self.layout.levels(self.table), features)
@@ -142,8 +144,8 @@ class _Encode(torch.autograd.Function):
         if ctx.grid.pending is not None:
             ctx.grid.pending.append((points, gradient))
             return None, None, None, None
-        # A leaf with a gradient buffer receives the gradient in place: clearing and adding 40 MB a step is
-        # saved.
+        # A table with a gradient buffer receives the gradient in place, which saves clearing and adding 40 MB
+        # per step.
         in_place = table.grad is not None
         grad_table = table.grad if in_place else torch.zeros_like(table)
         levels = ctx.grid.layout.arrays(gradient.numpy().dtype)

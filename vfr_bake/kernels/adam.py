@@ -1,5 +1,5 @@
-"""Adam on a hash table (Kingma & Ba 2015, algorithm 1), for entries that received a gradient in this
-step."""
+"""Adam for a hash table (Kingma & Ba 2015, algorithm 1): only entries that received a gradient are
+stepped."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, scatter_level
 
 AHEAD = 16
-"""Rows by which memory is prefetched ahead: a trip to memory takes about as long as so many steps."""
+"""Number of rows by which memory is prefetched ahead: a row takes as long to arrive as this many take to
+step."""
 
 
 class Pace(NamedTuple):
-    """The numbers of one step."""
+    """Learning rate and decay rates of one step."""
 
     rate: np.float32
-    """The learning rate, corrected for moments that begin at 0."""
+    """Learning rate, corrected for moments that begin at 0."""
     beta1: np.float32
     beta2: np.float32
     """Decay rates of the means of the gradient and of its square."""
@@ -30,8 +31,8 @@ class Pace(NamedTuple):
 
 @njit(inline="always")
 def _step_row(row, table, moments, grad_row, grad, pace):
-    """One step of `table[row]` by `grad[grad_row]`, which is cleared; `moments[row]` holds the means of the
-    gradient and behind them those of its square."""
+    """Step `table[row]` along `grad[grad_row]`, and clear that gradient. `moments[row]` holds the moving
+    means of the gradient, followed by those of its square."""
     rate, beta1, beta2, epsilon = pace
     one = table.dtype.type(1)
     n = table.shape[1]
@@ -47,8 +48,8 @@ def _step_row(row, table, moments, grad_row, grad, pace):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def adam_step(table, grad, moments, pace):
-    """Step the rows of `table` [n_entries, n_channels] that have a gradient, in place, and clear that; `grad`
-    is of the table's shape, `moments` [n_entries, 2 * n_channels].
+    """Step the rows of `table` [n_entries, n_channels] that have a gradient, in place, and clear the
+    gradient. `grad` has the table's shape, `moments` is [n_entries, 2 * n_channels].
 
     A step touches a few percent of the entries; the others keep their moments, as in instant-ngp.
     """
@@ -63,12 +64,12 @@ def adam_step(table, grad, moments, pace):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def scatter_and_step(points, grad_features, grid, grad, rows, moments, pace):
-    """Do what `hash_grid.scatter` and `adam_step` do, level by level: while a level's rows are stepped, its
-    gradient is still in the cache.
+    """Do what `hash_grid.scatter` and `adam_step` do, level by level, so that a level's gradient is still in
+    the cache when its rows are stepped.
 
-    `grad` [n_threads, largest level, 2], all zero before and after, is the gradient of one level, so that a
-    step moves 24 bytes a row through memory (entry and moments) and not 32. `rows` [n_threads, 8 n_points +
-    1] is scratch.
+    `grad` [n_threads, largest level, 2] holds the gradient of one level for each thread; it is zero before
+    and after. A step therefore moves 24 bytes a row through memory (entry and moments), not 32. `rows`
+    [n_threads, 8 n_points + 1] is scratch.
     """
     table, scales, offsets, hashed, mask = grid
     n_threads, n_levels = grad.shape[0], scales.shape[0]

@@ -1,8 +1,10 @@
 """Compositing of per-sample features along rays, forward and backward.
 
-Letters: samples `start : start + count` of a ray, each of a length `deltas[i]` along it, d_i = sigma_i *
-deltas[i], tau_i its running sum, T_i = exp(-tau_{i-1}), w_i = T_i (1 - exp(-d_i)), F = sum w_i F_i (equation
-3 of the paper), A = 1 - exp(-tau).
+Letters: a ray has the samples `start : start + count`. Sample i has the length `deltas[i]` along the ray and
+the optical depth d_i = sigma_i * deltas[i]; tau_i is the sum of the depths up to and including its own. Its
+transmittance is T_i = exp(-tau_{i-1}), and its weight w_i = T_i (1 - exp(-d_i)). The composite of the ray is
+F = sum w_i F_i (equation 3 of the paper), and its opacity A = 1 - exp(-tau), where tau is that of its last
+sample.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ def _composite_ray_backward(
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def composite(sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
-    """Write w_i to `weights`, the optical depth behind sample i to `taus` (both [n_samples]), F to `out`
+    """Composite all rays: write w_i to `weights` and tau_i to `taus` (both [n_samples]), F to `out`
     [n_rays, n_channels] and A to `opacity` [n_rays]."""
     for ray in prange(starts.shape[0]):
         _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity)
@@ -61,7 +63,7 @@ def composite(sigmas, features, deltas, starts, counts, weights, taus, out, opac
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def composite_part(sigmas, features, deltas, starts, counts, weights, taus, out, opacity):
-    """`composite` on the thread that calls it, while others do theirs."""
+    """Do what `composite` does, but on the calling thread alone, so that other threads can do other rays."""
     for ray in range(starts.shape[0]):
         _composite_ray(ray, sigmas, features, deltas, starts, counts, weights, taus, out, opacity)
 
@@ -71,7 +73,7 @@ def composite_backward(
     features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights, grad_sigmas,
     grad_features,
 ):  # fmt: skip
-    """Gradients of `composite`: with g = dL/dF, a = dL/dA and v_i = dL/dw_i + g.F_i,
+    """Write the gradients of `composite`. With g = dL/dF, a = dL/dA and v_i = dL/dw_i + g.F_i, they are
 
     dL/dF_i = w_i g,    dL/d d_i = T_{i+1} v_i - sum_{j>i} w_j v_j + a exp(-tau).
     """
@@ -87,7 +89,7 @@ def composite_part_backward(
     features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights, grad_sigmas,
     grad_features,
 ):  # fmt: skip
-    """`composite_backward` on the thread that calls it, while others do theirs."""
+    """Do what `composite_backward` does, but on the calling thread alone."""
     for ray in range(starts.shape[0]):
         _composite_ray_backward(
             ray, features, deltas, starts, counts, weights, taus, grad_out, grad_opacity, grad_weights,
@@ -97,8 +99,8 @@ def composite_part_backward(
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def silence(gradients, faint):
-    """Set those rows of `gradients` [n_samples, n_channels] to 0 whose length is less than `faint` times the
-    root of the mean square length; NaN stays."""
+    """Set to 0 the rows of `gradients` [n_samples, n_channels] that are shorter than `faint` times the root
+    mean square of all rows' lengths. If there is a NaN, nothing changes."""
     n, n_channels = gradients.shape
     kind = gradients.dtype.type
     squares = np.empty(n, gradients.dtype)
@@ -118,11 +120,11 @@ def silence(gradients, faint):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def distortion(weights, mids, widths, reach, starts, counts, losses, grad_weights):
-    """Distortion of each ray (mip-NeRF 360, eq. 15) and its gradient, where no intervals count as farther
-    apart than `reach`.
+    """Write the distortion of each ray (mip-NeRF 360, eq. 15) to `losses` and its gradient to `grad_weights`;
+    intervals that are farther apart than `reach` count as `reach` apart.
 
     losses[r] = sum_ij w_i w_j min(|m_i - m_j|, reach) + 1/3 sum_i w_i^2 b_i for interval middles m, ascending
-    along a ray, and widths b. On the thread that calls it.
+    along a ray, and widths b. It runs on the calling thread.
     """
     kind = weights.dtype.type
     for ray in range(starts.shape[0]):
@@ -130,7 +132,7 @@ def distortion(weights, mids, widths, reach, starts, counts, losses, grad_weight
         total = kind(0)
         for i in range(first, last):
             total += weights[i]
-        # The intervals within reach: `low` to i - 1 before an interval, i + 1 to `high` - 1 behind it.
+        # Intervals within reach of interval i: `low` to i - 1 before it, i + 1 to `high` - 1 behind it.
         low, high = first, first
         before, before_m, after, after_m = kind(0), kind(0), kind(0), kind(0)
         loss = kind(0)

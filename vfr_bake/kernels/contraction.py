@@ -1,7 +1,8 @@
-"""Scene contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10): all of space into the ball of radius 2.
+"""Scene contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10): it maps all of space into the ball of
+radius 2.
 
-c(x) = x inside the unit ball, (2 - 1 / |x|) x / |x| outside; u = (c + 2) / 4 puts it into the unit cube of
-the hash grids. Points are contracted where they are looked up; a contracted point is never turned back.
+c(x) = x inside the unit ball, (2 - 1 / |x|) x / |x| outside; u = (c + 2) / 4 is in the unit cube of the hash
+grids. Points are contracted when they are looked up; contracted points are never mapped back.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from vfr_bake.kernels.hash_grid import FLAGS
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def contracted_unit(x, y, z, one):
-    """The point of the unit cube for x, y, z of the model frame; `one` is 1 in their type. Any finite input
-    is served."""
+    """Return the point of the unit cube for any finite x, y, z of the model frame; `one` is 1 in their
+    type."""
     two = one + one
-    # Divided by the largest coordinate first: the square of 1e30 is beyond float32.
+    # Divide by the largest coordinate first: the square of 1e30 would overflow float32.
     largest = max(abs(x), max(abs(y), abs(z)))
     scale = one
     if largest * two > one:
@@ -32,7 +33,8 @@ def contracted_unit(x, y, z, one):
 
 @njit(inline="always")
 def contracted_at(rays_o, rays_d, ray, t):
-    """The point of the unit cube at distance `t` along a ray of `rays_o`, `rays_d` [n_rays, 3]."""
+    """Return the point of the unit cube at distance `t` along number `ray` of `rays_o`, `rays_d`
+    [n_rays, 3]."""
     return contracted_unit(
         rays_o[ray, 0] + t * rays_d[ray, 0],
         rays_o[ray, 1] + t * rays_d[ray, 1],

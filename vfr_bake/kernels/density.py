@@ -1,5 +1,9 @@
-"""A field as the kernels take it, and its density at a point (section 4 of the paper): sigma = exp(w2 .
-relu(w1 F + b1) + b2), with the logit, the number before the exponential, clamped."""
+"""Field in the form that kernels take, and its density at a point (section 4 of the paper):
+
+    sigma = exp(w2 . relu(w1 F + b1) + b2),
+
+where the logit, the number before the exponential, is clamped.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from vfr_bake.kernels import njit
 from vfr_bake.kernels.hash_grid import FLAGS, encode_point
 
 LARGEST_LOGIT = 15.0
-"""Logits are clamped here: exp(15) = 3e6 per model unit is opaque in one step at any step length in use."""
+"""Logits are clamped to this: exp(15) = 3e6 per model unit is opaque in one step of any length in use."""
 
 
 class Limits(NamedTuple):
@@ -24,11 +28,11 @@ class Limits(NamedTuple):
 
 
 LIMITS = Limits(np.float32(LARGEST_LOGIT), MAX_TAU)
-"""Both as the kernels take them, in float32."""
+"""The limits of all kernels, in float32."""
 
 
 class DensityArrays(NamedTuple):
-    """The weights of a density network."""
+    """Weights of a density network."""
 
     w1: np.ndarray
     """[n_channels, width]; empty for a linear map."""
@@ -40,7 +44,7 @@ class DensityArrays(NamedTuple):
 
 
 class FieldArrays(NamedTuple):
-    """What the kernels know of a field: the members of its `GridArrays` and of its `DensityArrays`."""
+    """Field in the form that kernels take: the members of its `GridArrays` and of its `DensityArrays`."""
 
     table: np.ndarray
     scales: np.ndarray
@@ -55,7 +59,7 @@ class FieldArrays(NamedTuple):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def density_logit(feature, field, hidden):
-    """The logit at a point with `feature` [n_channels]; `hidden` [width] is scratch."""
+    """Return the logit at a point with the `feature` [n_channels]; `hidden` [width] is scratch."""
     w1, b1, w2, b2 = field.w1, field.b1, field.w2, field.b2
     kind = feature.dtype.type
     total = b2
@@ -65,7 +69,7 @@ def density_logit(feature, field, hidden):
         return total
     for j in range(b1.shape[0]):
         hidden[j] = b1[j]
-    # Four channels at a time: each sum goes through memory, which takes longer than four products.
+    # Four channels at a time, because reading and writing each sum takes longer than four products.
     whole = feature.shape[0] // 4 * 4
     for c in range(0, whole, 4):
         f, g, h, k = feature[c], feature[c + 1], feature[c + 2], feature[c + 3]
@@ -81,7 +85,7 @@ def density_logit(feature, field, hidden):
 
 @njit(inline="always")
 def look_up(x, y, z, field, limits, feature, hidden):
-    """The density at a point of the unit cube, whose feature is written to `feature` [n_channels]."""
+    """Return the density at a point of the unit cube, and write its feature to `feature` [n_channels]."""
     encode_point(x, y, z, field, feature)
     return np.exp(min(density_logit(feature, field, hidden), limits.largest_logit))
 

@@ -10,7 +10,8 @@ from vfr_bake.kernels import njit
 
 @njit(cache=True)
 def _squares_to(a, b):
-    """The squared difference of two pixels [4] uint8, of premultiplied colours and of alpha, in levels."""
+    """Return the squared difference of two pixels [4] uint8, summed over premultiplied colours and alpha, in
+    levels of 0 to 255."""
     alpha_a, alpha_b = np.float32(a[3]), np.float32(b[3])
     scale = np.float32(1 / 255)
     total = (alpha_a - alpha_b) ** 2
@@ -21,8 +22,8 @@ def _squares_to(a, b):
 
 @njit(parallel=True, cache=True)
 def neighbour_squares(rgba, out):
-    """`out` [height, width] float32: the squared differences between each pixel of `rgba` [height, width, 4]
-    uint8 and its four neighbours, summed over them and over the channels."""
+    """Write to `out` [height, width] float32 the squared differences between each pixel of `rgba`
+    [height, width, 4] uint8 and its four neighbours, summed over the neighbours and the channels."""
     height, width = out.shape
     for y in prange(height):
         for x in range(width):
@@ -40,8 +41,9 @@ def neighbour_squares(rgba, out):
 
 @njit(parallel=True, cache=True)
 def window_powers(values, reach, power, out):
-    """`out` [height, width] float32: the mean of `values` [height, width] over the window of 2 reach + 1
-    pixels a side around each, to a `power`; what is outside repeats the edge."""
+    """Write to `out` [height, width] float32 the mean of `values` [height, width] over a square window around
+    each pixel, 2 reach + 1 pixels wide, raised to `power`. Outside the picture, the pixels of its edge are
+    repeated."""
     height, width = out.shape
     for y in prange(height):
         for x in range(width):

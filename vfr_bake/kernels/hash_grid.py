@@ -1,9 +1,9 @@
-"""Multiresolution hash grid: features at points, and their gradient scattered back (Mueller et al. 2022,
-section 3).
+"""Multiresolution hash grid: features at points, and the gradient scattered back to the table (Mueller et al.
+2022, section 3).
 
 Letters: a level has `scale` cells per axis over the unit cube, and its entries start at row `offset` of
-`table` [n_entries, n_channels]; where a level is `hashed`, vertices share entries through the spatial hash,
-elsewhere they have one each.
+`table` [n_entries, n_channels]. If a level is `hashed`, its vertices share entries through the spatial hash;
+otherwise each has its own.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ N_CHANNELS = 2
 """Feature channels per level, as in the paper; the loops below are written out for two."""
 
 FLAGS = {"contract", "reassoc", "nsz", "arcp"}
-"""Floating-point liberties for speed. NaN and infinity keep their meaning, so that a bad step is seen, not
-hidden."""
+"""Floating-point optimisations that are allowed. NaN and infinity keep their meaning, so that a bad step is
+noticed."""
 LARGE = 48
-"""Cells per axis of a level that is too large to stay in a core's cache: it has a megabyte."""
+"""Cells per axis from which on a level, of a megabyte, is too large to stay in a core's cache."""
 AHEAD = 4
-"""Points by which the rows that a gradient is added to are prefetched ahead."""
+"""Number of points by which the rows that a gradient is added to are prefetched ahead."""
 
 
 class Levels(NamedTuple):
-    """Which entries of a table belong to which level: arrays for numba, tensors for torch."""
+    """Levels of a table, and which of its rows belong to each: arrays for numba, tensors for torch."""
 
     scales: Any
     """[n_levels] cells per axis, in the table's type."""
     offsets: Any
-    """[n_levels + 1] int64 first row of each level, and the number of all rows."""
+    """[n_levels + 1] int64: first row of each level, and finally the number of all rows."""
     hashed: Any
     """[n_levels] bool: whether vertices share entries through the spatial hash."""
     mask: int
-    """Entries of a hashed level, less one; a power of two less one."""
+    """Number of entries of a hashed level, which is a power of two, minus one."""
 
 
 class GridArrays(NamedTuple):
-    """A hash grid as the kernels take it."""
+    """Hash grid in the form that kernels take."""
 
     table: np.ndarray
     """[n_entries, n_channels]."""
@@ -53,21 +53,21 @@ class GridArrays(NamedTuple):
     offsets: np.ndarray
     hashed: np.ndarray
     mask: int
-    """This and the three before it as in `Levels`: a parallel kernel takes no tuple within a tuple."""
+    """This member and the three before it are those of `Levels`: a parallel kernel takes no nested tuples."""
 
 
 @njit(inline="always")
 def cell_of(position, last):
-    """The cell, 0 to `last`, that a position along one axis lies in; both in cells."""
+    """Return the cell, from 0 to `last`, that contains a position along one axis, given in cells."""
     return min(max(np.int32(position), np.int32(0)), last)
 
 
 @njit(inline="always")
 def corner_rows(ix, iy, iz, last, offset, mask, hashed):
-    """Rows of the eight corners of cell (ix, iy, iz) of 0 to `last`, in the order 000 100 010 110 001 101 011
-    111 (x fastest).
+    """Return the rows of the eight corners of the cell (ix, iy, iz), each from 0 to `last`, in the order 000
+    100 010 110 001 101 011 111 (x fastest).
 
-    Unsigned: for a signed index Numba looks whether it counts from the end.
+    Rows are unsigned: for a signed index, Numba would test whether it is negative and counts from the end.
     """
     x, y, z, first = np.uint32(ix), np.uint32(iy), np.uint32(iz), np.uint64(offset)
     if hashed:
@@ -103,7 +103,7 @@ def corner_rows(ix, iy, iz, last, offset, mask, hashed):
 
 @njit(inline="always")
 def corners(x, y, z, scale, offset, mask, hashed):
-    """(rows, trilinear weights) of the eight corners around a point of the unit cube, order as in
+    """Return (rows, trilinear weights) of the eight corners around a point of the unit cube, in the order of
     `corner_rows`."""
     kind = type(scale)
     one = kind(1)
@@ -119,7 +119,8 @@ def corners(x, y, z, scale, offset, mask, hashed):
 
 @njit(inline="always")
 def prefetch_corners(x, y, z, scale, offset, mask, hashed, array):
-    """Prefetch the rows of `array` around a point, unless the level is small: then they are in the cache."""
+    """Prefetch the rows of `array` around a point, unless the level is so small that they are in the
+    cache."""
     if scale < LARGE:
         return
     last = np.int32(scale) - np.int32(1)
@@ -131,7 +132,7 @@ def prefetch_corners(x, y, z, scale, offset, mask, hashed, array):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def prefetch_point(x, y, z, grid):
-    """Prefetch the rows around a point of all levels."""
+    """Prefetch the rows around a point in all levels."""
     for level in range(grid.scales.shape[0]):
         prefetch_corners(
             x, y, z, grid.scales[level], grid.offsets[level], grid.mask, grid.hashed[level], grid.table
@@ -169,11 +170,11 @@ def encode(points, grid, out):
 
 @njit(inline="always")
 def scatter_level(points, grad_features, level, scale, offset, mask, hashed, grad_table, rows):
-    """Add one level's gradient to `grad_table` [n_entries, 2]; returns how many rows had none before, listed
-    in `rows`, which has room for 8 a point and one more.
+    """Add one level's gradient to `grad_table` [n_entries, 2]. List the rows that had no gradient before in
+    `rows`, which has room for 8 per point and one more, and return their number.
 
-    The list grows without a branch: what a row held is known only when it has come from memory, and guessing
-    it wrong would stop the fetching of those to come.
+    The list grows without a branch: what a row held is known only when it has arrived from memory, and a
+    mispredicted branch would hold up the fetching of later rows.
     """
     n, n_points = np.uint64(0), points.shape[0]
     for i in range(n_points):
@@ -197,12 +198,12 @@ def scatter_level(points, grad_features, level, scale, offset, mask, hashed, gra
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def scatter(points, grad_features, levels, n_threads, grad_table):
-    """Add to `grad_table` [n_entries, 2] the gradient of `encode`, given `grad_features` [n_points, 2 *
-    n_levels].
+    """Add the gradient of `encode` to `grad_table` [n_entries, 2], given `grad_features`
+    [n_points, 2 * n_levels].
 
-    One thread owns a level: no two threads write to one entry, and the sum has one order, so the result is
-    the same in every run. Fine levels cost more than coarse ones, so neighbouring levels go to different
-    threads.
+    Each level is owned by one thread: no two threads write to one entry, and sums are always in the same
+    order, so that the result is the same in every run. Fine levels cost more than coarse ones, so
+    neighbouring levels go to different threads.
     """
     scales, offsets, hashed, mask = levels
     n_levels = scales.shape[0]

@@ -1,8 +1,9 @@
-"""Rows of latent features in registers, CHANNELS at a time: interpolated, and moved along a gradient.
+"""Interpolation of rows of latent features, and their moves along a gradient, with CHANNELS channels at a
+time in registers.
 
-A loop over the channels of a row is not vectorised by the compiler, which cannot know that what is written
-lies elsewhere than what is read, and sixteen are fewer than it would unroll. Letters as in
-`vfr_bake.kernels.stored_features`. Compiled code alone imports this.
+The compiler does not vectorise a loop over the channels of a row: it cannot know that the memory which is
+written does not overlap the memory which is read, and 16 channels are fewer than it would unroll. Letters as
+in `vfr_bake.kernels.stored_features`. Only compiled code imports this module.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from numba.extending import intrinsic
 from player.compiled.lanes import INT, LANES, LONG, SHORT, Lanes, address, load, splat, store, vector
 
 CHANNELS = LANES
-"""Channels at a time; fewer are read together with what follows them in memory."""
+"""Number of channels processed at a time. If fewer are left, what follows them in memory is read as well."""
 PARTS_BITS = 8
 PARTS = 1 << PARTS_BITS
-"""Parts of a code that a latent feature counts."""
+"""Number of parts in a code: a latent feature is stored as a whole number of parts."""
 LARGEST_LATENT = 127 * PARTS
 GOLDEN = 0x9E3779B9
-"""The golden ratio's part of 2^32: its multiples, modulo that, are spread evenly."""
+"""2^32 divided by the golden ratio: its multiples modulo 2^32 are spread evenly."""
 
 
 def _table(context: Any, builder: Any, kind: Any, array: Any) -> tuple[Any, Any]:
-    """Where the numbers of a two-dimensional array begin, and how many columns it has."""
+    """Return the address of a two-dimensional array's first number, and its number of columns."""
     found = context.make_array(kind)(context, builder, array)
     return found.data, cgutils.unpack_tuple(builder, found.shape)[1]
 
@@ -57,11 +58,11 @@ def _interpolate_row(_: Any, latent: Any, rows: Any, shares: Any, fetch: Any, fi
 
 interpolate_row: Any = intrinsic(_interpolate_row)
 """interpolate_row(latent [n_vertices, n_channels] int16, rows [n, 8] int32, shares [n, 8] float32, fetch,
-first, out [n, n_stored] float32): the rounded codes around `fetch`, weighted by its shares, into
-`out[fetch]`, CHANNELS channels from `first` on.
+first, out [n, n_stored] float32): interpolate the rounded codes around `fetch` with its shares, and write
+CHANNELS channels, from `first` on, to `out[fetch]`.
 
-CHANNELS values are read and written whatever n_channels: both have to be there. What is written beyond
-n_channels is of no meaning.
+CHANNELS values are read and written whatever n_channels is, so that much memory must be there. Values that
+are written beyond n_channels have no meaning.
 """
 
 
@@ -96,8 +97,9 @@ def _move_row(
 
 move_row: Any = intrinsic(_move_row)
 """move_row(latent [n_vertices, n_channels] int16, row, first, length, gradient [n, n_stored] float32, ray,
-random uint32): move `latent[row]` by -`length` `gradient[ray]`, CHANNELS channels from `first` on. By the
-number `random` a move of 3.25 parts of a code is one of 4 in a quarter of all cases, and else one of 3.
+random uint32): move `latent[row]` by -`length` `gradient[ray]`, CHANNELS channels from `first` on. The number
+`random` decides how a move is rounded: 3.25 parts of a code become 4 in a quarter of all cases, and 3 in the
+others.
 
-Latents stay within +-LARGEST_LATENT. CHANNELS values are read whatever n_channels: they have to be there.
+Latents stay within +-LARGEST_LATENT. CHANNELS values are read whatever n_channels is: they must be there.
 """

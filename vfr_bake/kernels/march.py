@@ -1,5 +1,5 @@
-"""The march through the occupancy grid, with the field's density evaluated on the way so that it stops when
-opaque.
+"""March of rays through the occupancy grid. The field's density is evaluated on the way, so that a ray stops
+where it is opaque.
 
 Letters: the model frame's box is `aabb` = [-1, 1]^3, u = (x + 1) / 2 its unit cube. Samples of a ray lie at
 t_i = t_near + (i + jitter) * step; `distance` [n, n, n] is the Chebyshev distance in cells to the nearest
@@ -18,7 +18,7 @@ from vfr_bake.kernels.hash_grid import FLAGS, cell_of
 
 @njit(inline="always")
 def ray_box(rays_o, rays_d, ray):
-    """Entry and exit of a ray in [-1, 1]^3, entry at least 0; entry >= exit where it misses."""
+    """Return entry and exit of a ray in [-1, 1]^3, entry at least 0; entry >= exit if the ray misses."""
     kind = rays_o.dtype.type
     t_near, t_far = kind(0), kind(1e30)
     for axis in range(3):
@@ -35,7 +35,8 @@ def ray_box(rays_o, rays_d, ray):
 
 @njit(inline="always")
 def _empty_length(ux, uy, uz, rays_d, ray, distance, n):
-    """Path length that is certainly empty from a point of the unit cube; 0 in an occupied cell."""
+    """Return a path length that is certainly empty from a point of the unit cube on; 0 in an occupied
+    cell."""
     kind = rays_d.dtype.type
     cells, last = kind(n), np.int32(n - 1)
     ix, iy, iz = cell_of(ux * cells, last), cell_of(uy * cells, last), cell_of(uz * cells, last)
@@ -55,10 +56,11 @@ def _empty_length(ux, uy, uz, rays_d, ray, distance, n):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def next_sample(rays_o, rays_d, ray, t_near, t_far, i, jitter, step, distance):
-    """First lattice sample from number `i` on that lies in an occupied cell: (number, t, u); number -1 past
-    the exit.
+    """Return (number, t, ux, uy, uz) of the first lattice sample, from number `i` on, that lies in an
+    occupied cell. The number is -1 past the exit.
 
-    Skips land on or before the cell border that they aim at, so no occupied sample is ever jumped over.
+    Skips land on or before the cell border that they aim at, so that no sample in an occupied cell is
+    skipped.
     """
     kind = rays_o.dtype.type
     half = kind(0.5)
@@ -80,13 +82,14 @@ def next_sample(rays_o, rays_d, ray, t_near, t_far, i, jitter, step, distance):
 def march_samples(
     rays_o, rays_d, jitter, step, distance, field, limits, counts, starts, t_mid, points, features, sigmas
 ):  # fmt: skip
-    """Visible samples of as many rays as fit, in one pass: what is counted is what is written.
+    """Write the visible samples of as many rays as fit, in one pass that counts them as it writes them.
+    Return the number of samples of each chunk.
 
-    `t_mid` and `sigmas` [n_chunks, capacity], `points` [n_chunks, capacity, 3] and `features` [n_chunks,
-    capacity, n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray begins only
-    if the most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so nothing is ever
-    written past the end. `counts` [n_rays] is -1 for rays that were not served, `starts` [n_rays] is the
-    first sample within the chunk.
+    `t_mid` and `sigmas` [n_chunks, capacity], `points` [n_chunks, capacity, 3] and `features`
+    [n_chunks, capacity, n_channels] receive the samples; chunk c serves the rays c, c + n_chunks, ... A ray
+    is begun only if the most samples that it could have, ceil((t_far - t_near) / step) + 1, still fit, so
+    that nothing is ever written past the end. `counts` [n_rays] is -1 for rays that were not served. `starts`
+    [n_rays] is the first sample of each ray within its chunk.
     """
     kind = rays_o.dtype.type
     n_chunks, capacity = t_mid.shape
@@ -128,8 +131,8 @@ def march_samples(
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity, depth):
-    """Composited features without a stored sample: out [n_rays, n_channels], opacity [n_rays], depth
-    [n_rays] (mean t)."""
+    """Composite features along rays without storing samples: add them to `out` [n_rays, n_channels], which
+    must be 0 before, and write `opacity` [n_rays] and `depth` [n_rays] (mean t)."""
     kind = rays_o.dtype.type
     half = kind(0.5)
     block = 64
@@ -161,14 +164,14 @@ def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity,
 
 @njit(cache=True)
 def chebyshev_distance(occupied, distance):
-    """Chebyshev distance in cells to the nearest occupied cell, at most 254.
+    """Write to `distance` [n, n, n] uint8 the Chebyshev distance, in cells and at most 254, to the nearest
+    cell that is `occupied` [n, n, n] bool. Outside the grid nothing is occupied.
 
-    `occupied` [n, n, n] bool, `distance` [n, n, n] uint8 out. Outside the grid nothing is occupied. Two
-    sweeps over the 26 neighbours, half of them in each; in a row the rows already swept come first, which
-    vectorises, then the neighbour along z.
+    There are two sweeps, each over half of the 26 neighbours. For a row of cells, the neighbours in the rows
+    swept before come first, in a loop that vectorises, and then the neighbour along z.
     """
     n = occupied.shape[0]
-    # a frame of "far away" around the grid: no neighbour needs a test for the border
+    # a frame of the largest distance around the grid, so that no neighbour needs a test for the border
     d = np.full((n + 2, n + 2, n + 2), 254, np.uint8)
     one, far = np.uint8(1), np.uint8(253)  # 253 + 1 still fits
     for x in range(n):

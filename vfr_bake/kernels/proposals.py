@@ -1,10 +1,10 @@
 """Proposal sampling of unbounded scenes (Barron et al. 2022, sections 3 and 4), fused per ray.
 
-Letters: t is the distance along a ray in model units, s its spacing coordinate: s = t / 2 up to t = 1 and 1 -
-1 / (2 t) beyond, so that samples are dense near the cameras and sparse far away. `edges` [n_rays, n + 1] are
-the borders of a ray's n intervals in s, `weights` [n_rays, n] what the proposal's density gives them. A
-proposal's log-density is the sum over levels of one interpolated channel: a linear map of one-channel
-features, absorbed into the table.
+Letters: t is the distance along a ray in model units, and s its spacing coordinate: s = t / 2 up to t = 1,
+and 1 - 1 / (2 t) beyond, so that samples are dense near the cameras and sparse far away. `edges`
+[n_rays, n + 1] are the borders of a ray's n intervals in s, and `weights` [n_rays, n] the compositing weights
+of the intervals for the proposal's density. A proposal's log-density is the sum over levels of one
+interpolated channel: a linear map of one-channel features whose factors are absorbed into the table.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from vfr_bake.kernels.hash_grid import FLAGS, GridArrays, corners
 from vfr_bake.kernels.ray_lanes import look_up_lanes, propose_lanes
 
 PADDING = 1e-3
-"""Weight that every interval gets before it is drawn from, so that no place is out of reach."""
+"""Weight that is added to every interval before samples are drawn, so that every place can be drawn."""
 
 
 class Round(NamedTuple):
-    """What one round of proposals finds on n_rays rays in n intervals each."""
+    """Result of one round of proposals, on n_rays rays with n intervals each."""
 
     edges: np.ndarray
     """[n_rays, n + 1] borders of the intervals, in s."""
@@ -39,7 +39,7 @@ class Round(NamedTuple):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def spacing(t):
-    """s of a distance t >= 0, in [0, 1)."""
+    """Return s, in [0, 1), for a distance t >= 0."""
     one = t * 0 + 1
     two = one + one
     if t < one:
@@ -49,7 +49,7 @@ def spacing(t):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def distance(s):
-    """t of a spacing coordinate s in [0, 1): the inverse of `spacing`."""
+    """Return t for a spacing coordinate s in [0, 1): the inverse of `spacing`."""
     one = s * 0 + 1
     two = one + one
     if s * two < one:
@@ -59,12 +59,13 @@ def distance(s):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def resample(edges, weights, exponent, jitter, mass, middles, out):
-    """Borders `out` [m + 1] of m intervals drawn from a histogram: `edges` [n + 1], `weights` [n] >= 0.
+    """Draw m intervals from a histogram with the borders `edges` [n + 1] and the `weights` [n] >= 0, and
+    write their borders to `out` [m + 1].
 
-    The middles are the inverse of the distribution function at (j + jitter) / m; borders lie half way between
-    middles and are reflected at both ends (mip-NeRF 360, section 3). Weights are raised to `exponent` in [0,
-    1], which flattens them while they are not to be trusted yet. `mass` [n + 1] and `middles` [m + n], both
-    at least, are scratch.
+    The middles of the new intervals are the inverse of the distribution function at (j + jitter) / m. Borders
+    lie half way between middles, and are reflected at the first and the last middle (mip-NeRF 360, section
+    3). Weights are raised to `exponent` in [0, 1], which flattens them while they cannot be trusted yet.
+    `mass` and `middles` are scratch, of at least [n + 1] and [m + n].
     """
     kind = edges.dtype.type
     n, m = weights.shape[0], out.shape[0] - 1
@@ -76,8 +77,8 @@ def resample(edges, weights, exponent, jitter, mass, middles, out):
         mass[j + 1] = total
     low, high = edges[0], edges[n]
     part = total / kind(m)
-    # Each turn goes on to the next middle or to the next interval, without a branch that could be guessed
-    # wrong: a middle that is written in the wrong interval is written again.
+    # Each turn goes on to the next middle or to the next interval, without a branch that could be
+    # mispredicted: a middle that was computed for the wrong interval is overwritten in a later turn.
     i, j = 0, 0
     for _ in range(m + n - 1):
         wanted = (kind(i) + jitter) * part
@@ -98,8 +99,8 @@ def resample(edges, weights, exponent, jitter, mass, middles, out):
 
 @njit(fastmath=FLAGS, error_model="numpy")
 def _proposal_weights(rays_o, rays_d, ray, grid, limits, found):
-    """Fill in what the round `found` has of one ray, whose edges are there; nothing is looked up far behind
-    an opaque interval."""
+    """Fill in one ray's points, depths and weights in the round `found`, from its edges, which are there
+    already. Once the ray is opaque, only the other intervals of the same LANES are still looked up."""
     origin, direction, edges = rays_o[ray], rays_d[ray], found.edges[ray]
     points, depths, weights = found.points[ray], found.depths[ray], found.weights[ray]
     tau = np.float32(0)
@@ -113,11 +114,12 @@ def _proposal_weights(rays_o, rays_d, ray, grid, limits, found):
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def propose(rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, first, second, edges):
-    """Two rounds of importance sampling: `edges` [n_rays, n + 1] of the final intervals in s.
+    """Run two rounds of importance sampling, and write the borders of the final intervals in s to `edges`
+    [n_rays, n + 1].
 
-    `jitter` [n_rays, 3] in [0, 1) shifts the intervals of each round, 0.5 everywhere leaves them in the
-    middle; `borders` are the least and the largest s, `grid0` and `grid1` the proposals of the rounds
-    `first` and `second`, which are filled in.
+    `jitter` [n_rays, 3] in [0, 1) shifts the intervals of the two rounds and the final ones; 0.5 leaves them
+    in the middle. `borders` are the least and the largest s. `grid0` and `grid1` are the proposals of the
+    rounds `first` and `second`, which are filled in.
     """
     kind = edges.dtype.type
     near, far = borders
@@ -141,11 +143,11 @@ def propose(rays_o, rays_d, jitter, borders, exponent, grid0, grid1, limits, fir
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, points, features, sigmas):
-    """Look the field up in the final intervals, up to where a ray is opaque; their number n is a multiple of
-    LANES.
+    """Look the field up in the final intervals, up to where each ray is opaque. The number n of a ray's
+    intervals is a multiple of LANES.
 
     Ray r writes its `counts[r]` samples to the rows from r * n on of `t_mid`, `deltas`, `points`, `features`
-    and `sigmas`; what is written to the rows behind them has no meaning.
+    and `sigmas`. Rows behind these samples, up to (r + 1) * n, have no meaning.
     """
     n = edges.shape[1] - 1
     block = 16
@@ -178,12 +180,12 @@ def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, p
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def interlevel(edges, starts, counts, weights, found, losses, grad_logits):
-    """Interlevel loss (mip-NeRF 360, eq. 13) of each ray and its gradient for the log-densities of the
-    proposal whose round is `found`.
+    """Write the interlevel loss (mip-NeRF 360, eq. 13) of each ray to `losses`, and to `grad_logits` its
+    gradient with respect to the log-densities of the proposal whose round is `found`.
 
     The final weight of an interval must not exceed the sum of the proposal's weights that overlap it:
     sum_i max(0, w_i - bound_i)^2 / w_i. Final weights are `weights[starts[r] : starts[r] + counts[r]]` on the
-    intervals `edges[r]`, those behind counts[r] being 0.
+    intervals `edges[r]`; those of later intervals are 0.
     """
     kind = edges.dtype.type
     least = kind(1e-7)
@@ -225,7 +227,7 @@ def interlevel(edges, starts, counts, weights, found, losses, grad_logits):
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def scatter_logits(points, grad_logits, levels, n_threads, grad_table):
     """Add to `grad_table` [n_entries, 1] the gradient of a proposal's log-densities at `points` [n_rays, 3,
-    n], given `grad_logits` [n_rays, n]. One thread owns a level, as in the hash grid's own scatter."""
+    n], given `grad_logits` [n_rays, n]. Each level is owned by one thread, as in `hash_grid.scatter`."""
     scales, offsets, hashed, mask = levels
     n_levels = scales.shape[0]
     for thread in prange(n_threads):

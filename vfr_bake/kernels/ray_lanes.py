@@ -1,5 +1,6 @@
-"""LANES samples of one ray at a time, in registers: where they lie, what hash grids hold there, and what they
-weigh. In float32; letters as in `vfr_bake.kernels.proposals` and `vfr_bake.kernels.hash_grid`."""
+"""Operations on LANES samples of one ray at a time, in registers: their points, what hash grids hold there,
+and their weights. All in float32; letters as in `vfr_bake.kernels.proposals` and
+`vfr_bake.kernels.hash_grid`."""
 
 from __future__ import annotations
 
@@ -29,19 +30,19 @@ from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z
 Three = tuple[Lanes, Lanes, Lanes]
 
 SERIES = (1 / 5040, -1 / 720, 1 / 120, -1 / 24, 1 / 6, -1 / 2, 1.0)
-"""(1 - exp(-y)) / y for small y, highest power first: to 2e-8 below THIN."""
+"""Coefficients of the series of (1 - exp(-y)) / y, highest power first; accurate to 2e-8 for y below THIN."""
 THIN = 0.35
-"""Above this optical depth 1 - exp(-y) itself loses no digits that matter."""
+"""Optical depth y above which 1 - exp(-y) can be computed directly without losing digits that matter."""
 
 
 def distance(s: Lanes) -> Lanes:
-    """t of spacing coordinates s in [0, 1)."""
+    """Return t for spacing coordinates s in [0, 1)."""
     return choose(s < 0.5, s * 2.0, 1.0 / ((1.0 - s) * 2.0))
 
 
 def contracted(point: Three) -> Three:
-    """The points of the unit cube for points of the model frame, as
-    `vfr_bake.kernels.contraction.contracted_unit`."""
+    """Return the points of the unit cube for points of the model frame, as
+    `vfr_bake.kernels.contraction.contracted_unit` does."""
     x, y, z = point
     largest = x.call("fabs").most(y.call("fabs")).most(z.call("fabs")).most(0.5)
     a, b, c = (value / largest for value in point)
@@ -51,7 +52,7 @@ def contracted(point: Three) -> Three:
 
 
 def opacity(depth: Lanes) -> Lanes:
-    """1 - exp(-depth) of optical depths, to 5e-7 of itself."""
+    """Return 1 - exp(-depth) for optical depths, with a relative error of at most 5e-7."""
     thin = depth.like(SERIES[0])
     for coefficient in SERIES[1:]:
         thin = thin.call("fma", depth, coefficient)
@@ -59,11 +60,11 @@ def opacity(depth: Lanes) -> Lanes:
 
 
 def gathered(base: Any, index: Lanes, kind: Any) -> Lanes:
-    """Integers of a `kind` at `index` behind the address `base`.
+    """Return the integers of type `kind` at the places `index` counted from the address `base`.
 
-    By the processor's own instruction where LLVM knows it to be fast: a level of a table takes longer to come
-    than to be read, and with an instruction a number more are under way at a time. Field samples take 0.7 to
-    0.8 of the time that they take one by one.
+    This uses the processor's gather instruction where LLVM knows that it is fast. Rows of a table take longer
+    to arrive from memory than to be read, and with gather instructions more of them are under way at a time.
+    Field samples take 0.7 to 0.8 of the time that they take with loads one by one.
     """
     b, bits = index.b, kind.width
     nothing = ir.Constant(vector(LONG), ir.Undefined)
@@ -81,7 +82,7 @@ def gathered(base: Any, index: Lanes, kind: Any) -> Lanes:
 
 
 def sums_before(values: Lanes) -> tuple[Lanes, Any]:
-    """The sum of the lanes before each, and that of all as one number."""
+    """Return the sum of the lanes before each lane, and the sum of all lanes as one number."""
     b, zero = values.b, values.like(0.0)
 
     def later(lanes: Lanes, by: int) -> Lanes:
@@ -95,7 +96,7 @@ def sums_before(values: Lanes) -> tuple[Lanes, Any]:
 
 
 class _Level:
-    """One level of a hash grid, and the cells of it that points of the unit cube lie in."""
+    """Level of a hash grid, with the cells that LANES points of the unit cube lie in."""
 
     def __init__(self, b: Any, grid: Any, level: Any, point: Three) -> None:
         def entry(array: Any) -> Any:
@@ -110,10 +111,11 @@ class _Level:
         self._hashed = b.trunc(entry(grid.hashed), ir.IntType(1))
         self._mask = splat(b, b.trunc(grid.mask, INT))
         self.first = entry(grid.offsets)
-        """Row of the table that the level begins at."""
+        """Row of the table at which the level begins."""
 
     def corners(self) -> list[tuple[Lanes, Lanes]]:
-        """(Row from the level's first on, trilinear weight) of the eight corners, x fastest."""
+        """Return (row, trilinear weight) of the eight corners, x fastest; rows count from the level's
+        first."""
         x, y, z = self._cell
         b, side = x.b, self._side
         by_y, by_z = y * _signed(PRIME_Y), z * _signed(PRIME_Z)
@@ -135,12 +137,13 @@ class _Level:
 
 
 def _signed(prime: Any) -> int:
-    """The int32 with the bits of a uint32."""
+    """Return the int32 with the bits of a uint32."""
     return int(prime) - (1 << 32 if int(prime) >> 31 else 0)
 
 
 def _points_at(b: Any, origin: Any, direction: Any, edges: Any, first: Any) -> tuple[Lanes, Lanes, Three]:
-    """(t, lengths, points of the unit cube) of the LANES intervals from number `first` on."""
+    """Return (t, lengths, points of the unit cube) for the LANES intervals from number `first` on; t and the
+    points are those of their middles."""
     near, far = distance(load(b, edges, first)), distance(load(b, edges, b.add(first, LONG(1))))
     t = (near + far) * 0.5
 
@@ -192,11 +195,12 @@ def _propose_lanes(
 
 propose_lanes: Any = intrinsic(_propose_lanes)
 """propose_lanes(origin [3], direction [3], edges [n + 1], first, grid, limits, tau, points [3, n], depths
-[n], weights [n]), all of one ray and in float32: the optical depth behind the intervals `first` to `first` +
-LANES - 1, where it is `tau` before them.
+[n], weights [n]), all of one ray and in float32: process the intervals `first` to `first` + LANES - 1, before
+which the optical depth is `tau`, and return the optical depth behind them.
 
-The middles of these intervals, the optical depths that a proposal's `grid` gives them, and their weights are
-written to `points`, `depths` and `weights`; both are 0 behind an opaque interval. n is a multiple of LANES.
+The middles of these intervals are written to `points`, the optical depths that a proposal's `grid` gives them
+to `depths`, and their weights to `weights`; depths and weights are 0 behind an opaque interval. n is a
+multiple of LANES.
 """
 
 
@@ -237,8 +241,8 @@ def _look_up_lanes(
 
 look_up_lanes: Any = intrinsic(_look_up_lanes)
 """look_up_lanes(origin [3], direction [3], edges [n + 1], first, grid, places [5, LANES], features [LANES, 2
-n_levels]), all of one ray and in float32.
+n_levels]), all of one ray and in float32: look up the intervals `first` to `first` + LANES - 1.
 
-t, lengths and x, y, z in the unit cube of the intervals `first` to `first` + LANES - 1 are written to
-`places`, and what the hash grid `grid`, of two channels, holds in their middles to `features`.
+Their t, their lengths, and x, y, z of their middles in the unit cube are written to `places`; the features
+that the hash grid `grid`, of two channels, has at their middles are written to `features`.
 """

@@ -1,14 +1,16 @@
-"""Stored codes as the player composes them, and their descent along a gradient.
+"""Compositing of stored codes as the player does it, and gradient descent on the codes.
 
-Letters: ray i has the fetches starts[i] to starts[i + 1], in the order of the ray; fetch j has the weight
-weights[j] and takes row rows[j, c] by shares[j, c] for each of its eight corners c, so that the composite is
-x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. Where the fetches are all samples
-of a ray, weights follow from the density codes q_j, which are interpolated in the same way on a grid of their
-own: delta_j = exp(low + slope q_j) lengths[j], T_j =
-exp(-sum_{i<j} delta_i), weights[j] = T_j (1 - exp(-delta_j)), A = 1 - exp(-sum delta). A code is stored as
-the integer nearest to a `latent`; what is composed is the integers, and the gradient is applied to the
-latent as if there were no rounding (straight through). Latent densities are float32, latent features int16 in
-256ths of a code: there are so many of them that they decide how fine a grid fits into memory.
+Letters: ray i has the fetches starts[i] to starts[i + 1], in the order of the ray. Fetch j has the weight
+weights[j], and takes row rows[j, c] of the codes by shares[j, c] for each of its eight corners c. The
+composite is x = sum_j weights[j] f_j with f_j = sum_c shares[j, c] codes[rows[j, c]]. If the fetches are all
+samples of a ray, their weights follow from the density codes q_j, which are interpolated in the same way on a
+grid of their own: delta_j = exp(low + slope q_j) lengths[j], T_j = exp(-sum_{i<j} delta_i), weights[j] = T_j
+(1 - exp(-delta_j)), A = 1 - exp(-sum delta).
+
+A code is the integer nearest to a `latent`. The integers are composited, but the gradient is applied to the
+latents as if there were no rounding (straight-through estimator). Latent densities are float32. Latent
+features are int16 in 256ths of a code, because there are so many of them that they decide how fine a grid
+fits into memory.
 """
 
 from __future__ import annotations
@@ -32,18 +34,18 @@ from vfr_bake.kernels.latent_rows import (
 )
 
 BLOCK = 64
-"""Rays that a thread takes at a time."""
+"""Rays, or fetches, that a thread takes at a time."""
 OWN = 6
-"""2^OWN vertices behind each other belong to one part."""
+"""Each run of 2^OWN vertices belongs to one part (`descend`)."""
 AHEAD = 6
-"""Fetches by which memory is prefetched ahead: the rows of one lie all over the grid."""
+"""Number of fetches by which memory is prefetched ahead, because their rows lie all over the grid."""
 LINE = 64
-"""Bytes of a line of the cache."""
+"""Bytes in a line of the cache."""
 
 
 def table(n_rows: int, n_columns: int) -> np.ndarray:
-    """[n_rows, n_columns] int16 that has no values yet and begins with a line of the cache: rows of 16
-    numbers never lie in two. CHANNELS numbers and more are there behind it.
+    """Return [n_rows, n_columns] int16, not initialised, which begins at the start of a cache line, so that
+    rows of 16 numbers never cross two lines. At least CHANNELS numbers of memory follow it.
 
     >>> table(3, 16).shape, table(3, 16).ctypes.data % LINE
     ((3, 16), 0)
@@ -55,8 +57,8 @@ def table(n_rows: int, n_columns: int) -> np.ndarray:
 
 
 def _shown(value: Any) -> float:
-    """What is composed of a stored value: a latent feature, int16, rounded to a whole code, ties upwards; a
-    code or a float as it is.
+    """Return the number that is composited for a stored value: a latent feature, int16, rounded to a whole
+    code, ties upwards; a code or a float as it is.
 
     >>> [float(_shown(np.int16(parts))) for parts in (127, 128, -128, -129)], _shown(np.int8(7))
     ([0.0, 1.0, 0.0, -1.0], np.int8(7))
@@ -64,7 +66,7 @@ def _shown(value: Any) -> float:
     return np.floor(value / PARTS + 0.5) if value.dtype == np.int16 else value
 
 
-@overload(_shown, strict=False)  # it compares annotations, too
+@overload(_shown, strict=False)  # strict compares annotations, too
 def _overload_shown(value: types.Type) -> Callable[[Any], Any]:
     if value == types.int16:
         return lambda value: np.float32((value + (PARTS >> 1)) >> PARTS_BITS)
@@ -73,8 +75,8 @@ def _overload_shown(value: types.Type) -> Callable[[Any], Any]:
 
 @njit(cache=True)
 def _prefetch_rows(rows, j, table, n_columns):
-    """Prefetch all lines of what fetch j will read of `table`, flat; every other corner is the row after the
-    one before it."""
+    """Prefetch all cache lines that fetch j will read of `table`, flat. Corners are prefetched in pairs: the
+    second of a pair is usually the next row."""
     if j < rows.shape[0]:
         for corner in range(0, 8, 2):
             first = np.int64(rows[j, corner]) * n_columns
@@ -84,8 +86,8 @@ def _prefetch_rows(rows, j, table, n_columns):
 
 @njit(parallel=True, cache=True)
 def compose(starts, rows, shares, weights, latent, out):
-    """out [n, n_channels] of all rays, from `latent` [n_vertices, n_channels]: latent features, which are
-    rounded, or codes int8 or floats as they are."""
+    """Write the composites of all rays to `out` [n, n_channels], from `latent` [n_vertices, n_channels]:
+    latent features, which are rounded, or int8 codes or floats, as they are."""
     n_channels, flat = latent.shape[1], latent.reshape(-1)
     for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
@@ -103,7 +105,7 @@ def compose(starts, rows, shares, weights, latent, out):
 
 
 def padded(n_channels: int) -> int:
-    """`n_channels` and what fills the last register of them.
+    """Return `n_channels` rounded up to whole registers of CHANNELS numbers.
 
     >>> [padded(n) // CHANNELS for n in (1, CHANNELS, CHANNELS + 1)]
     [1, 1, 2]
@@ -113,8 +115,8 @@ def padded(n_channels: int) -> int:
 
 @njit(parallel=True, cache=True)
 def interpolate(rows, shares, weights, latent, out):
-    """f_j of all fetches into `out` [n_fetches, `padded(n_channels)`], from `latent` features as `table`
-    makes them; columns beyond n_channels are of no meaning, and fetches without weight are 0."""
+    """Write f_j of all fetches to `out` [n_fetches, `padded(n_channels)`], from `latent` features in an array
+    made by `table`. Columns beyond n_channels have no meaning; fetches with the weight 0 get 0."""
     for chunk in prange((out.shape[0] + BLOCK - 1) // BLOCK):
         for j in range(chunk * BLOCK, min((chunk + 1) * BLOCK, out.shape[0])):
             _prefetch_rows(rows, j + AHEAD, latent.reshape(-1), latent.shape[1])
@@ -127,7 +129,7 @@ def interpolate(rows, shares, weights, latent, out):
 
 @njit(parallel=True, cache=True)
 def composite(starts, weights, values, out):
-    """x of all rays into `out` [n, n_channels], from f_j in `values` [n_fetches, n_channels or more]."""
+    """Write x of all rays to `out` [n, n_channels], from f_j in `values` [n_fetches, n_channels or more]."""
     for i in prange(out.shape[0]):
         out[i] = np.float32(0)
         for j in range(starts[i], starts[i + 1]):
@@ -137,16 +139,16 @@ def composite(starts, weights, values, out):
 
 @njit(cache=True)
 def _owner(row, n_parts):
-    """The part to which a vertex belongs: that of the 2^OWN vertices behind each other, so that two threads
-    hardly ever write to one line of the cache. By a product of 32 bits, because every thread asks for every
-    vertex, and a remainder takes several times as long."""
+    """Return the part that a vertex belongs to. It is the same for a run of 2^OWN vertices, so that two
+    threads hardly ever write to one cache line. It is found by a 32-bit product, because every thread asks
+    for every vertex, and a remainder would take several times as long."""
     spread = np.uint32(np.uint32(row >> OWN) * np.uint32(GOLDEN))
     return (np.uint64(spread) * np.uint64(n_parts)) >> np.uint64(32)
 
 
 @njit(cache=True)
 def _prefetch_own(rows, j, part, n_parts, table, numbers):
-    """Prefetch what fetch j will read of `table` and `numbers` in rows that are of a part."""
+    """Prefetch what fetch j will read of `table` and `numbers`, in rows that belong to `part`."""
     if j < rows.shape[0]:
         flat, n_columns = table.reshape(-1), table.shape[1]
         for corner in range(8):
@@ -159,7 +161,7 @@ def _prefetch_own(rows, j, part, n_parts, table, numbers):
 
 @njit(cache=True)
 def _mixed(step, fetch):
-    """A number of 32 bits, as random as the rounding of a gradient needs, from two others."""
+    """Return a pseudo-random number of 32 bits from two others, random enough for the rounding of moves."""
     mixed = np.uint32(step * np.uint32(0x85EBCA6B)) ^ fetch
     mixed = np.uint32((mixed ^ (mixed >> np.uint32(16))) * np.uint32(0x7FEB352D))
     mixed = np.uint32((mixed ^ (mixed >> np.uint32(15))) * np.uint32(0x846CA68B))
@@ -168,16 +170,17 @@ def _mixed(step, fetch):
 
 @njit(parallel=True, cache=True)
 def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, steepness, step):
-    """Step number `step` of Adagrad on the latent features, in place, codes kept within -127..127.
+    """Take step number `step` of Adagrad on the latent features, in place; codes stay within -127..127.
 
-    A move of 3.25 parts of a code is one of 4 parts in a quarter of all cases, and else one of 3, so that
-    small moves are not lost: by a number that follows from the step, the fetch and the channel.
+    Moves are rounded at random, so that small ones are not lost: 3.25 parts of a code become 4 parts in a
+    quarter of all cases, and 3 in the others. The random number follows from the step, the fetch, its corner
+    and the channel.
 
-    `latent` is as `table` makes it; `gradient` [n, `padded(n_channels)`] is that of the composites, 0 beyond
-    n_channels; `steepness` [n_vertices] collects the mean square of what a vertex has seen, over its
-    channels, so that vertices that few rays meet move as fast as the others. Each of `n_parts` goes through
-    all fetches, in their order, and moves the vertices that are its own: the result does not depend on their
-    number.
+    `latent` is made by `table`; `gradient` [n, `padded(n_channels)`] is that of the composites, 0 beyond
+    n_channels. `steepness` [n_vertices] sums up the squared gradients of each vertex, as means over its
+    channels, so that vertices that few rays meet move as fast as the others. Each of `n_parts` parts goes
+    through all fetches, in their order, and moves only its own vertices, so that the result does not depend
+    on the number of parts.
     """
     n_channels = latent.shape[1]
     for part in prange(n_parts):
@@ -196,7 +199,7 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
                     if share == 0 or _owner(row, n_parts) != part:
                         continue
                     steepness[row] += share * share * square
-                    if steepness[row] == 0:  # the square of next to nothing is nothing
+                    if steepness[row] == 0:  # the square of a tiny number underflows to 0
                         continue
                     length = np.float32(PARTS) * rate * share / np.sqrt(steepness[row])
                     random = _mixed(np.uint32(step), np.uint32(8 * j + corner))
@@ -206,8 +209,8 @@ def descend(starts, rows, shares, weights, gradient, rate, n_parts, latent, stee
 
 @njit(parallel=True, cache=True)
 def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, opacity):
-    """Weights of the fetches of all rays, and the rays' opacity, from the latent density codes [n_vertices];
-    both in place. Behind the optical depth `opaque` nothing weighs."""
+    """Write the weights of all rays' fetches to `weights`, and the rays' opacity to `opacity`, from the
+    latent density codes [n_vertices]. Fetches behind the optical depth `opaque` have the weight 0."""
     for chunk in prange((opacity.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, opacity.shape[0])):
             tau = np.float32(0)
@@ -225,17 +228,18 @@ def weigh(starts, rows, shares, latent, low, slope, lengths, opaque, weights, op
             opacity[i] = -np.expm1(-tau)
 
 
-# sums over channels in any order: a quarter faster
+# With these flags, sums over channels may be in any order, which makes it a quarter faster.
 @njit(parallel=True, cache=True, fastmath={"reassoc", "nsz", "contract"})
 def slants(
     starts, density_rows, density_shares, weights, opacity, values, gradient, gradient_of_opacity, low, slope,
     lengths, latent, out,
 ):  # fmt: skip
-    """The gradient of each fetch's interpolated density code into `out` [n_fetches].
+    """Write the gradient with respect to each fetch's interpolated density code to `out` [n_fetches].
 
-    dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values` [n_fetches,
-    `padded(n_channels)`] are the f_j, as `interpolate` finds them; `gradient`, of as many columns, and
-    `gradient_of_opacity` [n] are those of x and A; `latent` are the density codes [n_densities].
+    dx / d delta_j = T_{j+1} f_j - sum_{i>j} weights[i] f_i, and dA / d delta_j = 1 - A. `values`
+    [n_fetches, `padded(n_channels)`] are the f_j that `interpolate` writes. `gradient`, with as many columns,
+    and `gradient_of_opacity` [n] are the gradients of x and A. `latent` [n_densities] are the latent density
+    codes.
     """
     for chunk in prange((gradient.shape[0] + BLOCK - 1) // BLOCK):
         for i in range(chunk * BLOCK, min((chunk + 1) * BLOCK, gradient.shape[0])):
@@ -266,8 +270,9 @@ def slants(
 
 @njit(parallel=True, cache=True)
 def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
-    """One step of Adagrad on the latent density codes [n_densities], in place, kept within 0..255, along the
-    gradients `slants` [n_fetches] of what is interpolated from `rows` by `shares`; in parts as `descend`."""
+    """Take one step of Adagrad on the latent density codes [n_densities], in place; codes stay within 0..255.
+    `slants` [n_fetches] are the gradients of the codes that are interpolated from `rows` by `shares`. The
+    vertices are split into parts as in `descend`."""
     for part in prange(n_parts):
         for j in range(slants.shape[0]):
             _prefetch_rows(rows, j + AHEAD, latent, 1)
@@ -280,7 +285,7 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
                 if slant == 0 or _owner(row, n_parts) != part:
                     continue
                 steepness[row] += slant * slant
-                if steepness[row] == 0:  # the square of next to nothing is nothing
+                if steepness[row] == 0:  # the square of a tiny number underflows to 0
                     continue
                 moved = latent[row] - rate * slant / np.sqrt(steepness[row])
                 latent[row] = min(max(moved, np.float32(0)), np.float32(255))
@@ -288,11 +293,10 @@ def descend_density(rows, shares, slants, rate, n_parts, latent, steepness):
 
 @njit(parallel=True, cache=True)
 def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, shares):
-    """The stored corners around `points` [n, 3] float32 of a grid (cells): `rows` [n, 8] and trilinear
-    `shares` [n, 8], 0 where a corner is not stored. As `player.march.fetches` states.
+    """Find the stored corners around `points` [n, 3] float32 of a grid, in cells, as `player.march.fetches`
+    states. Write `rows` [n, 8], and trilinear `shares` [n, 8], which are 0 where a corner is not stored.
 
-    With a `least` above 0, shares are of what is stored: divided by their sum, and all 0 where that is
-    below it.
+    If `least` is above 0, shares are divided by their sum, and all 0 where that sum is below `least`.
     """
     size = np.float32(resolution)
     one = np.float32(1)
@@ -327,8 +331,8 @@ def corner_rows(points, resolution, n_per_axis, bricks, of_bricks, least, rows, 
 
 @njit(parallel=True, cache=True)
 def take_runs(rays, starts, points, lengths, taken_starts, taken_points, taken_lengths):
-    """The runs starts[ray] to starts[ray + 1] of `points` [m, 3] and `lengths` [m] of each of the `rays` [n],
-    behind each other from taken_starts[i] on, into the last two arrays."""
+    """Copy the run starts[ray] to starts[ray + 1] of `points` [m, 3] and `lengths` [m], for the i-th of the
+    `rays` [n], to `taken_points` and `taken_lengths` from taken_starts[i] on."""
     for i in prange(len(rays)):
         first, to = starts[rays[i]], taken_starts[i]
         for j in range(starts[rays[i] + 1] - first):

@@ -1,12 +1,13 @@
-"""Which symbols a level of a pyramid stores, by what they cost and what they change in a picture.
+"""Choice of the symbols that a level of a pyramid stores, by their bits and by the error they make in
+pictures.
 
-Letters: vertex v of a level has the symbol s, which makes its value predicted[v] + step s; d is how far that
-is from the value that is wanted. A symbol is taken where
+Letters: vertex v of a level has the symbol s, so that its value is predicted[v] + step s; d is the difference
+of that value from the wanted one. The symbol is chosen for which
 
     weights[v] d^2 + bits[context, s]
 
-is least: a weight says how many bits it is worth that a square of 1 is less. The context is that of
-`player.asset.coder`, and follows from the symbols chosen before.
+is least: a weight is the number of bits worth spending to reduce d^2 by 1. The context is that of
+`player.asset.coder`; it follows from the symbols that were chosen before.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from player.asset.coder.tables import END, HALF, N_CONTEXTS
 from vfr_bake.kernels import njit
 
 TRIED = 2
-"""Symbols that are tried beside 0: the nearest, and the next towards 0."""
+"""Number of symbols that are tried beside 0: the nearest, and the next towards 0."""
 
 
 @njit(cache=True)
 def add_squares(starts, rows, shares, slopes, changed, out):
-    """Add to `out` [n_vertices] the squares by which a vertex changes each ray.
+    """Add to `out` [n_vertices] the squared changes of all rays for a change of each vertex by 1.
 
     Fetch j of ray i, starts[i] <= j < starts[i + 1], changes the ray by slopes[j] shares[j, c] for each unit
-    of the value at rows[j, c]; a ray often meets a vertex more than once, and what it does there adds up.
-    `changed` [n_vertices] is room for these sums: 0 before and after.
+    of the value at rows[j, c]. A ray often meets a vertex more than once; these changes are added up before
+    they are squared. `changed` [n_vertices] is scratch for the sums: 0 before and after.
     """
     for i in range(len(starts) - 1):
         for j in range(starts[i], starts[i + 1]):
@@ -42,11 +43,11 @@ def add_squares(starts, rows, shares, slopes, changed, out):
 
 @njit(cache=True)
 def add_to_coarser(masks, bricks, rows, values, out):
-    """Add to `out` [n_coarse] the values [n] of the finer level's vertices, each dealt to the vertices that
-    predict it by their shares in the prediction.
+    """Add the values [n] of a finer level's vertices to `out` [n_coarse]. Each is divided among the coarser
+    vertices that predict it, by their shares in the prediction.
 
-    `masks` [n_bricks, 8] uint64 are those of the vertices, `bricks` and `rows` their
-    `player.asset.prediction.prediction.Places`.
+    `masks` [n_bricks, 8] uint64 say which vertices the finer level has; `bricks` and `rows` are the members
+    of its `player.asset.prediction.prediction.Places`.
     """
     row = 0
     for brick in range(len(masks)):
@@ -69,8 +70,8 @@ def add_to_coarser(masks, bricks, rows, values, out):
 
 @njit(cache=True)
 def from_coarser(masks, bricks, rows, values, out):
-    """Into `out` [n] what the values [n_coarse] of the next coarser level say at the vertices of a level, as
-    floats; the rest is as for `add_to_coarser`."""
+    """Write to `out` [n] the values at a level's vertices that are predicted, as floats, from the values
+    [n_coarse] of the next coarser level; other arguments as for `add_to_coarser`."""
     row = 0
     for brick in range(len(masks)):
         first = np.int64(bricks[brick, 0]) * 729
@@ -95,23 +96,23 @@ def from_coarser(masks, bricks, rows, values, out):
 def choose(
     wanted, predicted, weights, neighbours, classes, bits, context_of_sum, mixed, limits, near, values, seen
 ):
-    """The values that one channel of a level stores.
+    """Choose the values that one channel of a level stores.
 
     Args:
-        wanted: [n] float32.
-        predicted: [n] int16: what the coarser level says.
+        wanted: [n] float32: the values before quantization.
+        predicted: [n] int16: the prediction from the coarser level.
         weights: [n] float32.
-        neighbours: [3, n] int32 rows of the neighbours, n for one that is not there.
+        neighbours: [3, n] int32: rows of the neighbours, n for one that does not exist.
         classes: [n] uint8.
-        bits: [n_classes * 81, 127] float32: what the symbols -63 to 63 cost in each context.
+        bits: [n_classes * 81, 127] float32: bits that the symbols -63 to 63 take in each context.
         context_of_sum, mixed: of `player.asset.coder.tables`.
         limits: step, lowest and highest value.
-        near: [n + 1] int16, room; the last is 0.
+        near: [n + 1] int16, scratch; the last number must be 0.
         values: [n] int16, written.
-        seen: [n_classes * 81, 127] int64, to which is added how often each symbol was chosen.
+        seen: [n_classes * 81, 127] int64: the number of times each symbol is chosen is added to it.
 
     Returns:
-        The sum of weights d^2, and that of the bits.
+        The sum of weights d^2, and the sum of the bits.
     """
     step, low, high = limits
     distortion, rate = 0.0, 0.0

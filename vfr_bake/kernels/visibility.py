@@ -1,4 +1,4 @@
-"""Which cells the samples of rays weigh in: cells of an object's box, or of contracted space."""
+"""Marking of the cells, of an object's box or of contracted space, in which samples of rays have weight."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vfr_bake.kernels.march import next_sample, ray_box
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def mark_visible_cells(rays_o, rays_d, step, distance, field, limits, weight_floors, visible):
-    """Set `visible` [r, r, r, n] (uint8) where a sample of some ray weighs at least each of `weight_floors`
-    [n].
+    """Set `visible` [r, r, r, n] (uint8) to 1 for the cells in which some ray has a sample whose weight is at
+    least `weight_floors[i]`, for each of the n floors.
 
-    Several threads may set one cell: all write the same 1, so the result does not depend on their order.
+    Several threads may set one cell. All write the same 1, so the result does not depend on their order.
     """
     kind = rays_o.dtype.type
     half = kind(0.5)
@@ -49,11 +49,12 @@ def mark_visible_cells(rays_o, rays_d, step, distance, field, limits, weight_flo
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def mark_weighty_cells(rays_o, rays_d, t_mid, deltas, weights, starts, counts, weight_floor, visible):
-    """Set `visible` [r, r, r] (uint8) where the intervals of some ray weigh at least `weight_floor` in all.
+    """Set `visible` [r, r, r] (uint8) to 1 for the cells in which the intervals of some ray have a total
+    weight of at least `weight_floor`.
 
-    Ray i has the intervals `starts[i]` to `starts[i] + counts[i]`; one that is longer than half a cell is cut
-    into equal parts of disparity, which is how long intervals lie. Several threads may set one cell: all
-    write the same 1.
+    Ray i has the intervals `starts[i]` to `starts[i] + counts[i]`. An interval that is longer than half a
+    cell is cut into parts of equal disparity, because long intervals are spaced by disparity. Several threads
+    may set one cell: all write the same 1.
     """
     r = visible.shape[0]
     cells, last = np.float32(r), np.int32(r - 1)
@@ -62,7 +63,7 @@ def mark_weighty_cells(rays_o, rays_d, t_mid, deltas, weights, starts, counts, w
         cell, inside = np.int64(-1), np.float32(0)
         for j in range(starts[ray], starts[ray] + counts[ray]):
             near, far = t_mid[j] - half * deltas[j], t_mid[j] + half * deltas[j]
-            # At least as many as it is half cells long: contracted space is never longer than disparity.
+            # At least one part for each half cell: a length in contracted space is at most that in disparity.
             s0, s1 = near / (one + near), far / (one + far)
             n = np.int64((s1 - s0) * np.float32(2 * r)) + 1
             for part in range(n):

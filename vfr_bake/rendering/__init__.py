@@ -1,1 +1,2 @@
-"""From rays to composited features: occupancy grid, samples, compositing, pictures."""
+"""Rendering: from rays to samples, composited features and pictures, guided by an
+occupancy grid or proposals."""

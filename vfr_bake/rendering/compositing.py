@@ -17,14 +17,14 @@ from vfr_bake.torch_kernels.compositing import Composite
 
 
 class RayFeatures(NamedTuple):
-    """What a field shows along rays, before the head gives it colour."""
+    """Composited features of rays, before the head gives them colour."""
 
     features: np.ndarray
-    """[n_rays, n_channels] composited."""
+    """[n_rays, n_channels], composited."""
     opacity: np.ndarray
     """[n_rays]."""
     depth: np.ndarray
-    """[n_rays] mean distance, model units; 0 where nothing is."""
+    """[n_rays] mean distance, model units; 0 where nothing is met."""
 
 
 @dataclass(frozen=True)
@@ -38,25 +38,26 @@ class RaySamples:
     points: Tensor
     """[n_samples, 3] in the unit cube of the field."""
     features: Tensor
-    """[n_samples, n_channels], as they were met."""
+    """[n_samples, n_channels] that the march looked up."""
     rays: Tensor
     """[n_served] indices of the rays that were served; rays past the sample budget are left out."""
     starts: Tensor
-    """[n_served] first sample of each."""
+    """[n_served] first sample of each of these rays."""
     counts: Tensor
-    """[n_served] number of samples of each, 0 where a ray meets nothing."""
+    """[n_served] number of samples of each of these rays, 0 where a ray meets nothing."""
     sigmas: Tensor | None = None
-    """[n_samples] densities, where they were looked up on the way."""
+    """[n_samples] densities, if the march has looked them up."""
     trail: Any = None
-    """What the guide of a training keeps of them, in tensors and plain values."""
+    """Values about the samples that the guide of a training needs later in the step, in
+    tensors and plain values."""
 
 
 def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor) -> Composite:
     """Composite packed samples.
 
-    `sigmas` [n_samples] >= 0, `features` [n_samples, n_channels], `deltas` [n_samples] lengths along the ray;
-    ray r owns the rows `starts[r] : starts[r] + counts[r]`. Optical depth is accumulated and exponentiated
-    once; a product of (1 - alpha) would lose thin samples.
+    `sigmas` [n_samples] are >= 0, `features` are [n_samples, n_channels], and `deltas` [n_samples] are
+    lengths along the ray. Ray r owns the rows `starts[r] : starts[r] + counts[r]`. Optical depth is summed
+    and exponentiated once, because a product of (1 - alpha) would lose thin samples.
 
     >>> one = torch.tensor([1.0])
     >>> F, A, w = composite(one, torch.ones(1, 2), one, torch.tensor([0]), torch.tensor([1]))
@@ -75,11 +76,12 @@ def composite_field(
     counts: Tensor,
     faint: float = 0.0,
 ) -> Composite:
-    """`composite` with the densities that `density` has at `features`, on a CPU, in float32.
+    """Composite as `composite` does, with the densities that `density` has at
+    `features`, on a CPU, in float32.
 
-    Where a march has computed `sigmas` [n_samples] already they are taken as they are. Differentiable with
-    respect to the features and the network; `TruncatedExp` says how a saturated density learns. Samples whose
-    gradient is less than `faint` times the root mean square of all get none.
+    If a march has already computed `sigmas` [n_samples], these are used. Differentiable with respect to the
+    features and the network; `TruncatedExp` says how a saturated density learns. The gradient with respect to
+    the features of a sample is set to 0 if its length is less than `faint` times the root mean square of all.
     """
     samples = features, sigmas, deltas, starts, counts
     return Composite(*_CompositeField.apply(*samples, faint, density, *density.parameters()))  # type: ignore[misc]
@@ -88,11 +90,13 @@ def composite_field(
 def distortion(
     weights: Tensor, mids: Tensor, widths: Tensor, reach: float, starts: Tensor, counts: Tensor
 ) -> Tensor:
-    """Distortion [n_rays] of the weights over intervals with ascending `mids` and `widths` [n_samples]:
-    sum_ij w_i w_j min(|m_i - m_j|, reach) + 1/3 sum_i w_i^2 b_i (mip-NeRF 360, eq. 15, which has no `reach`).
+    """Return the distortion [n_rays] of the weights over intervals with ascending `mids` and
+    `widths` [n_samples]: sum_ij w_i w_j min(|m_i - m_j|, reach) + 1/3 sum_i w_i^2 b_i (mip-NeRF 360,
+    eq. 15, which has no `reach`).
 
-    Beyond `reach` nothing draws weights together, so that two surfaces behind each other, as those of glass,
-    stay two. Differentiable with respect to `weights` alone. A single opaque interval of width b gives b / 3.
+    Beyond `reach` the loss does not pull weights together, so that two surfaces behind each other,
+    as those of glass, stay two. Differentiable with respect to `weights` alone. A single opaque
+    interval of width b gives b / 3.
 
     >>> one = torch.tensor([1.0])
     >>> round(float(distortion(one, one, one, 1.0, torch.tensor([0]), torch.tensor([1]))), 4)
@@ -118,7 +122,7 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, *grads):
         features, deltas, starts, counts, weights, taus = ctx.saved_tensors
         grad_out, grad_opacity, grad_weights = (_array(grad) for grad in grads)
-        # Rows that belong to no ray (there are none in a march) would keep this zero.
+        # Rows that belong to no ray keep these zeros; a march makes no such rows.
         grad_sigmas, grad_features = torch.zeros_like(weights), torch.zeros_like(features)
         kernels.composite_backward(
             _array(features), deltas.numpy(), starts.numpy(), counts.numpy(), weights.numpy(), taus.numpy(),
@@ -190,7 +194,7 @@ class _Distortion(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads):
         grad, starts, counts = ctx.saved_tensors
-        # Packed without gaps, though not in the rays' order.
+        # Samples are packed without gaps, but not in the order of the rays.
         order = torch.argsort(starts, stable=True)
         return grad * grads[0][order].repeat_interleave(counts[order]), *[None] * 5
 

@@ -1,8 +1,8 @@
-"""Proposal sampling of unbounded scenes: two small density fields find where on a ray matter lies.
+"""Proposal sampling of unbounded scenes: two small density fields find where on a ray there is matter.
 
-As in mip-NeRF 360 (Barron et al. 2022) and section 4 of the paper: two rounds of 64 samples, 32 final ones,
-distances spaced uniformly up to one model unit and by disparity beyond, positions contracted. Letters as in
-`vfr_bake.kernels.proposals`.
+As in mip-NeRF 360 (Barron et al. 2022) and section 4 of the paper: two rounds of 64 samples, then 32 final
+ones. Distances are spaced uniformly up to one model unit and by disparity beyond, and positions are
+contracted. Letters as in `vfr_bake.kernels.proposals`.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from vfr_bake.kernels.proposals import Round
 from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
 
 N_PROPOSED = 64
-"""Intervals of each of the two rounds."""
+"""Intervals in each of the two rounds."""
 N_FINAL = 32
-"""Intervals in which the field itself is looked up; in training, half of them once there is more than fog."""
+"""Intervals in which the field itself is looked up; training uses half of them
+once there is more than fog."""
 FAR = 1e3
-"""Rays end at this distance, model units; the farthest camera is at 1."""
+"""Distance at which rays end, model units; the farthest camera is at 1."""
 LAYOUTS = ((5, 128), (5, 256))
-"""Levels of each round's grid, and cells per axis of the finest over contracted space; the coarsest has
-BASE_RESOLUTION."""
+"""For each round's grid, its number of levels and the cells per axis of its finest level over contracted
+space. The coarsest level has BASE_RESOLUTION cells per axis."""
 FIRST_LAYOUTS = ((10, 128), (10, 512))
-"""Those of the model files that do not say."""
+"""Layouts of model files that do not state theirs."""
 BASE_RESOLUTION = 16
 LOG2_TABLE_SIZE = 17
 RAY_CHUNK = 4096
-"""Rays whose samples are held at once when pictures are rendered: 35 MB of features at most."""
+"""Rays whose samples are held at once when pictures are rendered, with 35 MB of features at most."""
 
 
 class ProposalGrid(nn.Module):
-    """Log-density as the sum over levels of one interpolated channel."""
+    """A log-density field: the sum over the levels of a hash grid of one interpolated channel."""
 
     def __init__(self, n_levels: int, max_resolution: int) -> None:
         super().__init__()
@@ -48,10 +49,10 @@ class ProposalGrid(nn.Module):
 
 
 class ProposalSampler(nn.Module):
-    """Says where to look a field up along the rays of an unbounded scene.
+    """Guide that chooses where a field is looked up along the rays of an unbounded scene.
 
-    `near`: how near to a camera matter may begin, model units. `layouts`: levels and finest resolution of
-    each round's grid.
+    `near` is the least distance of matter from a camera, model units. `layouts` has the number of levels and
+    the finest resolution of each round's grid.
     """
 
     def __init__(self, near: float, layouts: Sequence[tuple[int, int]] = LAYOUTS) -> None:
@@ -60,13 +61,14 @@ class ProposalSampler(nn.Module):
         self.grids = nn.ModuleList(ProposalGrid(*layout) for layout in self.layouts)
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
-        """The samples of all rays [n_rays, 3], in the middle of their intervals."""
+        """Return the samples of all rays [n_rays, 3], in the middle of their intervals."""
         middle = torch.full((len(rays_o), 3), 0.5)
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
 
     @torch.no_grad()
     def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
-        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], at every sample."""
+        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], with
+        a lookup at every sample."""
         features = np.empty((len(rays_o), field.config.n_channels), np.float32)
         opacity, depth = np.empty((2, len(rays_o)), np.float32)
         for start in range(0, len(rays_o), RAY_CHUNK):
@@ -88,13 +90,14 @@ class ProposalSampler(nn.Module):
         exponent: float = 1.0,
         n_final: int = N_FINAL,
     ) -> tuple[RaySamples, np.ndarray, list[Round]]:
-        """Samples, the borders [n_rays, n_final + 1] of their intervals in s, and what the rounds found.
+        """Return samples, the borders [n_rays, n_final + 1] of their intervals in s, and
+        the results of the rounds.
 
-        `exponent`: weights are raised to it before they are drawn from; less than 1 early in training.
-        `n_final`: a multiple of 16.
+        `exponent`: weights are raised to this power before they are drawn from; less than 1 early in
+        training. `n_final`: number of final intervals, a multiple of 16.
         """
         n_rays = len(rays_o)
-        # Those of a camera lie axis by axis; the kernels read a ray's three numbers beside each other.
+        # A camera's rays are stored axis by axis; the kernels expect the three numbers of a ray side by side.
         rays_o, rays_d = rays_o.contiguous(), rays_d.contiguous()
         rounds = [_empty_round(n_rays) for _ in self.grids]
         edges = np.empty((n_rays, n_final + 1), np.float32)
@@ -140,8 +143,8 @@ class ProposalSampler(nn.Module):
     def add_gradients(
         self, rounds: list[Round], edges: np.ndarray, samples: RaySamples, weights: Tensor, n_rays: int
     ) -> float:
-        """Add the interlevel loss's gradient to the tables' `.grad`; returns the loss, both a mean over
-        `n_rays`."""
+        """Add the interlevel loss's gradient to the tables' `.grad` and return the loss, both
+        as a mean over `n_rays`."""
         total = 0.0
         starts, counts = samples.starts.numpy(), samples.counts.numpy()
         for grid, found in zip(self.grids, rounds, strict=True):

@@ -17,18 +17,19 @@ from vfr_bake.rendering.proposals import ProposalSampler
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
 SMALL = 24
-"""Pixels along each side of the pictures whose mean colour is taken."""
+"""Pixels along each side of the small pictures from which the mean colour is computed."""
 RAY_CHUNK = 1024
 """Rays whose samples are held at once where colours are composited, with a head at each sample."""
 
 
 Sampler: TypeAlias = OccupancyGrid | ProposalSampler
-"""What says where to look a field up along rays: an object's occupancy grid, or a scene's proposals."""
+"""The guide that chooses where along rays a field is looked up: an object's occupancy
+grid, or a scene's proposals."""
 
 
 @torch.no_grad()
 def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    """Colours [n, 3] of composited `features` [n, n_channels] seen along unit `dirs` [n, 3]."""
+    """Return the colours [n, 3] of composited `features` [n, n_channels] seen along unit `dirs` [n, 3]."""
     out = np.empty((len(features), 3), np.float32)
     for start in range(0, len(features), HEAD_CHUNK):
         rows = slice(start, start + HEAD_CHUNK)
@@ -37,7 +38,8 @@ def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.
 
 
 def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: np.ndarray) -> np.ndarray:
-    """The full model's picture [height, width, 3] float32 in [0, 1] for a camera in the model frame."""
+    """Return the full model's picture [height, width, 3] float32 in [0, 1] for a
+    camera in the model frame."""
     colours, opacity = render_rays(field, sampler, *camera.rays())
     rgb = colours + (1 - opacity[:, None]) * background.astype(np.float32)
     return rgb.reshape(camera.height, camera.width, 3)
@@ -46,13 +48,14 @@ def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: 
 def render_rays(
     field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(Colours times opacity [n_rays, 3], opacity [n_rays]) of rays [n_rays, 3] in the model frame."""
+    """Return (colours times opacity [n_rays, 3], opacity [n_rays]) of rays [n_rays, 3] in the model frame."""
     render = _composited_colours if field.config.compositing == "colour" else _colours_of_features
     return render(field, sampler, rays_o, rays_d)
 
 
 def mean_colour(field: VfrField, sampler: Sampler, cameras: Sequence[Camera]) -> np.ndarray:
-    """[3] mean of the colours that `cameras`, model frame, see, from a small picture of each."""
+    """Return the mean [3] of the colours that `cameras`, model frame, see over black, from
+    a small picture of each."""
     small = [camera.resized(SMALL, SMALL) for camera in cameras]
     pictures = [render_image(field, sampler, camera, np.zeros(3)) for camera in small]
     return np.mean(pictures, axis=(0, 1, 2))
@@ -61,7 +64,8 @@ def mean_colour(field: VfrField, sampler: Sampler, cameras: Sequence[Camera]) ->
 def _colours_of_features(
     field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Equation 3: (colours times opacity [n_rays, 3], opacity [n_rays]), one head a ray."""
+    """Composite features, then colour them with one evaluation of the head per ray (equation 3): return
+    (colours times opacity [n_rays, 3], opacity [n_rays])."""
     features, opacity, _ = sampler.composited_features(field, rays_o, rays_d)
     colours = np.zeros((len(rays_o), 3), np.float32)
     hit = np.flatnonzero(opacity > 0)
@@ -73,7 +77,8 @@ def _colours_of_features(
 def _composited_colours(
     field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Equation 2: (colours times opacity [n_rays, 3], opacity [n_rays]), one head a sample."""
+    """Composite colours, with one evaluation of the head per sample (equation 2): return (colours times
+    opacity [n_rays, 3], opacity [n_rays])."""
     colours = np.empty((len(rays_o), 3), np.float32)
     opacity = np.empty(len(rays_o), np.float32)
     for start in range(0, len(rays_o), RAY_CHUNK):

@@ -1,4 +1,4 @@
-"""Samples of an object's box: lattice points in occupied cells, up to where the ray is opaque.
+"""Samples of rays in an object's box: lattice points in occupied cells, up to where the ray is opaque.
 
 Letters as in `vfr_bake.kernels.march`.
 """
@@ -21,16 +21,16 @@ from vfr_bake.torch_kernels.compositing import sums_before
 from vfr_bake.torch_kernels.march import lattice
 
 LATTICE_POINTS = 2**22
-"""Lattice points held at once on a GPU: about 80 bytes each."""
+"""Lattice points held at once on a GPU, at about 80 bytes each."""
 LOOKUP_POINTS = 2**18
-"""Points looked up at once on a GPU: without compilation 3.5 kB each, with 16 levels."""
+"""Points looked up at once on a GPU; without compilation they take 3.5 kB each, with 16 levels."""
 
 Lookup = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""From points [n, 3] of the unit cube to features [n, n_channels] and densities [n] there."""
+"""A function from points [n, 3] of the unit cube to features [n, n_channels] and densities [n] there."""
 
 
 def most_samples(step: float) -> int:
-    """As many samples as a ray can have in the box [-1, 1]^3, and some to spare for rounding."""
+    """Return the most samples that a ray can have in the box [-1, 1]^3, plus a few to allow for rounding."""
     return int(np.ceil(2 * 3**0.5 / step)) + 3
 
 
@@ -44,10 +44,10 @@ def march(
     budget: int,
     n_chunks: int = 2,
 ) -> tuple[RaySamples, np.ndarray]:
-    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities [n_samples]
-    that the march met there; `jitter` [n_rays] in [0, 1).
+    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities
+    [n_samples] that the march looked up there; `jitter` [n_rays] is in [0, 1).
 
-    The budget is grown to hold at least one whole ray per chunk.
+    The budget is raised if it cannot hold at least one whole ray per chunk.
     """
     capacity = max(budget // n_chunks, most_samples(step))
     n_channels = field.config.n_channels
@@ -83,11 +83,12 @@ def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:
 def march_on_device(
     lookup: Lookup, occupied: Tensor, step: float, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, budget: int
 ) -> tuple[RaySamples, Tensor]:
-    """Samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities [n_samples]
-    there; `jitter` [n_rays] in [0, 1).
+    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities
+    [n_samples] there; `jitter` [n_rays] is in [0, 1).
 
-    As `march`, but that a ray is served if its visible samples fit, known here,
-    and not the most that it could have had. The budget is grown to hold at least one whole ray.
+    In contrast to `march`, a ray is served if its visible samples fit, whose number is known here,
+    and not only if the most samples that it could have would fit. The budget is raised if it cannot
+    hold at least one whole ray.
     """
     longest = most_samples(step)
     capacity, block = max(budget, longest), max(1, LATTICE_POINTS // longest)
@@ -97,7 +98,7 @@ def march_on_device(
         found.append(_march_block(lookup, occupied, step, rays_o[rows], rays_d[rows], jitter[rows], longest))
         n_found += len(found[-1][1])
         if n_found > capacity:
-            break  # no ray of a later block would be served
+            break  # rays of later blocks would not fit
     counts, t_mid, points, features, sigmas = (torch.cat(parts) for parts in zip(*found, strict=True))
     ends = torch.cumsum(counts, dim=0)
     n_served = int((ends <= capacity).sum())
@@ -125,7 +126,7 @@ def _march_block(
     jitter: Tensor,
     longest: int,
 ) -> tuple[Tensor, ...]:
-    """(counts [n_rays], t, points, features, densities) of the visible samples of a block of rays."""
+    """Return (counts [n_rays], t, points, features, densities) of the visible samples of a block of rays."""
     t, u, candidate = fast(lattice, rays_o.device)(rays_o, rays_d, jitter, occupied, step, longest)
     places = candidate.reshape(-1).nonzero()[:, 0]
     points = u.reshape(-1, 3)[places]

@@ -1,8 +1,8 @@
 """The field's inner loops as vectorised torch, for a GPU; any device runs them.
 
-Each function has its numba kernel of `vfr_bake.kernels` as its twin, with the same letters, and the tests
-compare the two. Pure functions of tensors without a branch on their values, so that `torch.compile` makes few
-kernels of them.
+Each function is the counterpart of a numba kernel in `vfr_bake.kernels`, with the same letters, and the tests
+compare the two. The functions are pure, and never branch on the values of tensors, so that `torch.compile`
+turns each into few kernels.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ def fast(function: Callable[..., Any], device: torch.device) -> Callable[..., An
 
 
 def can_compile(device: torch.device) -> bool:
-    """Whether torch can generate code for `device`; Triton does not come with torch on Windows."""
+    """Return whether torch can generate code for `device`; Triton does not come with torch on Windows."""
     return device.type == "cuda" and find_spec("triton") is not None
 
 
 @cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    # torch advises 19-bit products, which lose digits that a density, an exponential, shows.
+    # torch advises products of 19 bits (TensorFloat32), but densities are exponentials and need more digits.
     warnings.filterwarnings("ignore", "TensorFloat32 tensor cores", UserWarning)
-    # The number of samples differs from step to step; without `dynamic` each would be compiled anew.
+    # The number of samples differs from step to step; without `dynamic`, code is compiled for each number.
     return torch.compile(function, dynamic=True)

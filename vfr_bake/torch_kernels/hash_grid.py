@@ -1,7 +1,7 @@
-"""Multiresolution hash grid in torch: features at points, and their gradient added up (Mueller et al. 2022,
-section 3).
+"""Multiresolution hash grid in torch: features at points, and the gradient added up in the table (Mueller et
+al. 2022, section 3).
 
-Letters as in `vfr_bake.kernels.hash_grid`; all levels of all points at once.
+Letters as in `vfr_bake.kernels.hash_grid`; all levels of all points are processed at once.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from torch import Tensor
 from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z, Levels
 from vfr_bake.torch_kernels import fast
 
-_PRIME_Y, _PRIME_Z = int(PRIME_Y), int(PRIME_Z)  # torch's compiler takes a number of numpy's for a tensor
+_PRIME_Y, _PRIME_Z = int(PRIME_Y), int(PRIME_Z)  # torch's compiler takes a numpy number for a tensor
 
 
 def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
-    """(rows, trilinear weights), both [n_points, n_levels, 8] with x fastest, of the corners around `points`
-    [n_points, 3] of the unit cube."""
+    """Return (rows, trilinear weights), both [n_points, n_levels, 8] with x fastest, of the corners around
+    `points` [n_points, 3] of the unit cube."""
     position = points[:, None, :] * levels.scales[:, None]
     n_cells = levels.scales.long()
     cell = torch.minimum(position.long().clamp(min=0), (n_cells - 1)[:, None])
@@ -28,7 +28,7 @@ def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
     y = vertices[:, :, 1, None, :, None]
     z = vertices[:, :, 2, :, None, None]
     side, hashed = (n_cells + 1)[:, None, None, None], levels.hashed[:, None, None, None]
-    # In 64 bits: the products do not overflow, and the mask takes the bits that 32 would have kept.
+    # In 64 bits: the products do not overflow, and the mask keeps low bits, which 32-bit products have too.
     shared = (x ^ (y * _PRIME_Y) ^ (z * _PRIME_Z)) & levels.mask
     rows = torch.where(hashed, shared, (z * side + y) * side + x) + levels.offsets[:-1, None, None, None]
     wx, wy, wz = weights[:, :, 0], weights[:, :, 1], weights[:, :, 2]
@@ -37,17 +37,18 @@ def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
 
 
 def encode(points: Tensor, table: Tensor, levels: Levels) -> Tensor:
-    """Features [n_points, n_levels * n_channels] at `points` [n_points, 3] of the unit cube; `table`
-    [n_entries, n_channels]."""
+    """Return the features [n_points, n_levels * n_channels] at `points` [n_points, 3] of the unit cube, from
+    `table` [n_entries, n_channels]."""
     rows, weights = corners(points, levels)
     return (weights[..., None] * table[rows]).sum(dim=2).flatten(1)
 
 
 def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) -> Tensor:
-    """The table's gradient [n_entries, n_channels], given that of `encode` [n_points, n_levels * n_channels].
+    """Return the table's gradient [n_entries, n_channels], given that of `encode`
+    [n_points, n_levels * n_channels].
 
-    By `index_add`, which adds atomically on a GPU; autograd's own would sort 33 million rows in every step.
-    One-dimensional, because on a CPU only that is fast.
+    It is added up by `index_add`, which adds atomically on a GPU; autograd's own gradient would sort 33
+    million rows in every step. The index is one-dimensional, because only that is fast on a CPU.
     """
     rows, weights = corners(points, levels)
     n_channels = gradient.shape[1] // rows.shape[1]
@@ -58,8 +59,8 @@ def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) ->
 
 
 def features_at(points: Tensor, table: Tensor, levels: Levels, features: Tensor | None = None) -> Tensor:
-    """Encode as `encode` does, differentiably with respect to `table` alone. `features`, if already known,
-    are returned as they are."""
+    """Encode as `encode` does, differentiably with respect to `table` alone. If the `features` are known
+    already, they are returned as they are, with the same gradient."""
     return _Features.apply(points, table, levels, features)  # type: ignore[return-value]
 
 

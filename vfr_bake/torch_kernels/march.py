@@ -1,7 +1,7 @@
-"""The march through the occupancy grid in torch: every lattice point of a block of rays at once.
+"""March of rays through the occupancy grid in torch: every lattice point of a block of rays at once.
 
 Letters as in `vfr_bake.kernels.march`: samples of a ray lie at t_i = t_near + (i + jitter) * step, u = (x +
-1) / 2. Nothing is skipped on the way: to test a cell costs a GPU less than to tell its threads apart.
+1) / 2. Empty space is not skipped: on a GPU, testing every cell costs less than threads that diverge.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from torch import Tensor
 
 
 def ray_box(rays_o: Tensor, rays_d: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit [n_rays] of rays [n_rays, 3] in [-1, 1]^3, entry at least 0; entry >= exit where one
-    misses.
+    """Return entry and exit [n_rays] of rays [n_rays, 3] in [-1, 1]^3, entry at least 0; entry >= exit where
+    a ray misses.
 
     >>> ray_box(torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
     (tensor([2.]), tensor([4.]))
@@ -20,7 +20,7 @@ def ray_box(rays_o: Tensor, rays_d: Tensor) -> tuple[Tensor, Tensor]:
     crosses = rays_d != 0
     divisor = torch.where(crosses, rays_d, torch.ones_like(rays_d))
     a, b = (-1 - rays_o) / divisor, (1 - rays_o) / divisor
-    outside = ~crosses & (rays_o.abs() > 1)  # parallel to a face that it lies outside of
+    outside = ~crosses & (rays_o.abs() > 1)  # parallel to a face, and outside of it
     low = torch.where(crosses, torch.minimum(a, b), torch.zeros_like(a))
     high = torch.where(crosses, torch.maximum(a, b), torch.full_like(a, 1e30))
     high = torch.where(outside, torch.full_like(a, -1), high)
@@ -30,8 +30,9 @@ def ray_box(rays_o: Tensor, rays_d: Tensor) -> tuple[Tensor, Tensor]:
 def lattice(
     rays_o: Tensor, rays_d: Tensor, jitter: Tensor, occupied: Tensor, step: float, n_points: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(t, u, whether it is inside the box and its cell is `occupied` [n, n, n]) of the first `n_points`
-    lattice points of rays [n_rays, 3]: [n_rays, n_points], [n_rays, n_points, 3] and [n_rays, n_points]."""
+    """Return t [n_rays, n_points], u [n_rays, n_points, 3], and a bool [n_rays, n_points] for the first
+    `n_points` lattice points of rays [n_rays, 3]. The bool is true for points inside the box whose cell is
+    `occupied` [n, n, n]."""
     t_near, t_far = ray_box(rays_o, rays_d)
     numbers = torch.arange(n_points, device=rays_o.device)
     t = t_near[:, None] + (numbers + jitter[:, None]) * step

@@ -15,7 +15,7 @@ from vfr_bake.torch_kernels.compositing import sums_before
 
 
 def distance(s: Tensor) -> Tensor:
-    """t of spacing coordinates s in [0, 1).
+    """Return t for spacing coordinates s in [0, 1).
 
     >>> distance(torch.tensor([0.25, 0.5, 0.75])).tolist()
     [0.5, 1.0, 2.0]
@@ -24,12 +24,12 @@ def distance(s: Tensor) -> Tensor:
 
 
 def contracted_unit(points: Tensor) -> Tensor:
-    """Points [..., 3] of the unit cube for `points` of the model frame (eq. 10), any finite ones.
+    """Return the points [..., 3] of the unit cube for any finite `points` of the model frame (eq. 10).
 
     >>> contracted_unit(torch.tensor([[1e30, 0.0, 0.0], [0.5, 0.0, -0.5]])).tolist()
     [[1.0, 0.5, 0.5], [0.625, 0.5, 0.375]]
     """
-    # Divided by the largest coordinate first: the square of 1e30 is beyond float32.
+    # Divide by the largest coordinate first: the square of 1e30 would overflow float32.
     largest = points.abs().amax(dim=-1, keepdim=True).clamp(min=0.5)
     norm = largest * torch.linalg.vector_norm(points / largest, dim=-1, keepdim=True)
     scale = torch.where(norm > 1, (2 - 1 / norm) / norm, torch.ones_like(norm))
@@ -37,8 +37,8 @@ def contracted_unit(points: Tensor) -> Tensor:
 
 
 def resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n: int) -> Tensor:
-    """Borders [n_rays, n + 1] of n intervals drawn from histograms: `edges` [n_rays, m + 1], `weights`
-    [n_rays, m] >= 0, `jitter` [n_rays] in [0, 1)."""
+    """Draw n intervals per ray from histograms with the borders `edges` [n_rays, m + 1] and the `weights`
+    [n_rays, m] >= 0, shifted by `jitter` [n_rays] in [0, 1); return their borders [n_rays, n + 1]."""
     mass = weights**exponent + PADDING
     up_to = torch.cumsum(mass, dim=1)
     numbers = torch.arange(n, device=edges.device)
@@ -57,8 +57,8 @@ def resample(edges: Tensor, weights: Tensor, exponent: float, jitter: Tensor, n:
 
 
 def midpoints(rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(t, lengths, points of the unit cube) in the middle of intervals with borders `edges` [n_rays, n + 1]:
-    [n_rays, n], [n_rays, n] and [n_rays, n, 3]."""
+    """Return t [n_rays, n], lengths [n_rays, n] and points of the unit cube [n_rays, n, 3] for the intervals
+    with the borders `edges` [n_rays, n + 1]; t and the points are those of their middles."""
     t = distance(edges)
     middle = (t[:, :-1] + t[:, 1:]) / 2
     points = rays_o[:, None] + middle[..., None] * rays_d[:, None]
@@ -66,10 +66,10 @@ def midpoints(rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> tuple[Tensor, Te
 
 
 def weights_of(logits: Tensor, lengths: Tensor) -> Tensor:
-    """Weights [n_rays, n] of intervals with log-densities `logits` and `lengths` [n_rays, n], 0 behind an
-    opaque one; differentiable with respect to the logits."""
-    # Clamped in value, with the gradient of the clamped value everywhere, so that a saturated density can
-    # come down: the bracket is 0.
+    """Return the weights [n_rays, n] of intervals with the log-densities `logits` and the `lengths`
+    [n_rays, n]; they are 0 behind an opaque interval. Differentiable with respect to the logits."""
+    # The value is clamped, and the gradient is that of the clamped density everywhere, so that a saturated
+    # density can come down. The value of the bracket is 0; it adds the gradient alone.
     sigmas = torch.exp(logits.detach().clamp(max=LARGEST_LOGIT))
     depths = (sigmas + sigmas * (logits - logits.detach())) * lengths
     before = sums_before(depths)
@@ -78,8 +78,8 @@ def weights_of(logits: Tensor, lengths: Tensor) -> Tensor:
 
 
 def interlevel(edges: Tensor, weights: Tensor, proposal_edges: Tensor, proposal_weights: Tensor) -> Tensor:
-    """Interlevel loss [n_rays] (mip-NeRF 360, eq. 13): sum_i max(0, w_i - bound_i)^2 / w_i for final
-    `weights` [n_rays, m] on `edges` [n_rays, m + 1], bound_i being the sum of the proposal's weights
+    """Return the interlevel loss [n_rays] (mip-NeRF 360, eq. 13): sum_i max(0, w_i - bound_i)^2 / w_i for the
+    final `weights` [n_rays, m] on `edges` [n_rays, m + 1], where bound_i is the sum of the proposal's weights
     [n_rays, n] that overlap interval i. Differentiable with respect to the proposal's weights."""
     n = proposal_weights.shape[1]
     low, high = edges[:, :-1].contiguous(), edges[:, 1:].contiguous()

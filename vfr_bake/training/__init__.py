@@ -1,1 +1,1 @@
-"""From posed pictures to a trained field."""
+"""Training: from posed pictures to a trained field."""

@@ -1,10 +1,10 @@
-"""Taking the samples of the next step while this one is learned from, each on half of the threads.
+"""Sampling of the next step while this step is learned from, each on half of the threads.
 
-What lies between a step's samples and its gradients is a few dozen matrix products of a few hundred rows:
-too short to be shared out among threads one by one, for a thread that waits sleeps, so as to leave the
-processor to others, and waking it takes as long as half a product. To draw and march the next batch is as
-long a piece of work that needs no result of this one, if the field may be the one before this step. Two
-threads then meet once a step.
+Between a step's samples and its gradients there are a few dozen matrix products of a few hundred rows each.
+These are too short to be split among threads: a waiting thread sleeps, to leave the processor to others, and
+waking it takes as long as half a product. Drawing and marching the next batch takes about as long as all of
+them, and needs no result of this step if it may use the field from before the step. So the two are done side
+by side, and the threads wait for each other only once a step.
 """
 
 from __future__ import annotations
@@ -30,31 +30,32 @@ class Sampled(NamedTuple):
     samples: RaySamples
 
     def state(self) -> dict[str, Any]:
-        """All of it, in tensors."""
+        """Return the batch and its samples as tensors and plain values."""
         return {"batch": vars(self.batch), "samples": vars(self.samples)}
 
     @classmethod
     def restored(cls, state: dict[str, Any]) -> Sampled:
-        """What gave that `state`."""
+        """Return the batch with its samples that `state` was made from."""
         return cls(Batch(**state["batch"]), RaySamples(**state["samples"]))
 
 
 class SecondThread:
-    """Does one piece of work at a time beside the thread that has it."""
+    """Second thread, which does one piece of work at a time beside the thread that owns it."""
 
     def __init__(self) -> None:
         n_threads = min(get_num_threads(), torch.get_num_threads())
         self.is_there = n_threads > 1
-        """Whether there is more than one thread to share out."""
+        """True if there is more than one thread to split between the two."""
         self._n_torch, n_numba = n_threads // 2, n_threads - n_threads // 2
         self._pool = ThreadPoolExecutor(1, "ahead", lambda: set_num_threads(n_numba))
         self._work: Future[Any] | None = None
 
     @contextmanager
     def meanwhile(self, work: Callable[[], T]) -> Iterator[Future[T]]:
-        """Within it `work` is done on one half of the threads, and torch has the other half.
+        """Do `work` on one half of the threads while this context lasts; torch has the other half.
 
-        Until `wait` no parallel kernel may be called: not all of numba's threads can stand that.
+        Until `wait` has returned, the caller must not run a parallel kernel: not every threading layer of
+        numba allows kernels to run in two threads at once.
         """
         n_threads = torch.get_num_threads()
         torch.set_num_threads(self._n_torch)
@@ -66,7 +67,7 @@ class SecondThread:
             torch.set_num_threads(n_threads)
 
     def wait(self) -> None:
-        """Until the work is done, if there is any."""
+        """Wait until the work is done, if there is any."""
         if self._work is not None:
             wait([self._work])
             self._work = None

@@ -1,9 +1,9 @@
-"""Checkpoints, from which `vfr-train --resume` goes on: all of a trainer's state, beside the model file until
-that is written.
+"""Checkpoints, from which `vfr-train --resume` continues: the whole state of a trainer, kept beside the model
+file until that is written.
 
 Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), pictures (names of the training
-views), cameras (of these, [n_views, 22]), state (`Trainer.state`). Tensors and plain values only; loads with
-`weights_only=True`.
+views), cameras ([n_views, 22], poses and intrinsics of these views), state (`Trainer.state`). It holds
+tensors and plain values only, and loads with `weights_only=True`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from vfr_bake.training.trainer import Trainer
 FORMAT = "vfr-checkpoint"
 VERSION = [1, 6]
 LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
-"""Settings that may differ between the run that was interrupted and the one that goes on."""
+"""Settings that may differ between the run that was interrupted and the one that continues it."""
 SAME = 1e-4
-"""Numbers of cameras that differ by no more are the same: processors round differently."""
+"""Largest difference between numbers of cameras that count as the same: processors round differently."""
 
 
 def checkpoint_path(model: Path) -> Path:
-    """Path of the checkpoint of the training of `model`.
+    """Return the path of the checkpoint for the training of `model`.
 
     >>> checkpoint_path(Path("a/model.pt")).name
     'model.pt.checkpoint'
@@ -34,7 +34,7 @@ def checkpoint_path(model: Path) -> Path:
 
 
 def save_checkpoint(path: Path, trainer: Trainer) -> None:
-    """Write beside `path` and rename into place, so that there is always a whole one."""
+    """Write a checkpoint beside `path`, then rename it to `path`, so that there is always a whole file."""
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -47,10 +47,10 @@ def save_checkpoint(path: Path, trainer: Trainer) -> None:
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> None:
-    """Put `trainer` where the checkpoint was.
+    """Restore the state of `trainer` from a checkpoint.
 
-    Raises FormatError (not a checkpoint, cut short) or ConfigError (of a run with other settings or other
-    pictures).
+    Raises FormatError (not a checkpoint, or cut short) or ConfigError (the checkpoint is of a run with other
+    settings or other pictures).
     """
     content = read_tensors(path, "a checkpoint written by vfr-train")
     if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
@@ -58,7 +58,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
             f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"
         )
     then, now = content["settings"], trainer.settings
-    # The device first: other settings follow from it.
+    # The device is compared first, because other settings follow from it.
     for name in ["device", *sorted(set(then) | set(now))]:
         if name not in LENGTH_SETTINGS and then.get(name) != now.get(name):
             raise ConfigError(
@@ -81,7 +81,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
 
 
 def _numbers(trainer: Trainer) -> torch.Tensor:
-    """Poses and intrinsics of the training views, [n_views, 22] float64, in the model frame."""
+    """Return the poses and intrinsics of the training views, [n_views, 22] float64, in the model frame."""
     rows = [
         [*camera.c2w.reshape(-1), camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
         for camera in trainer.cameras

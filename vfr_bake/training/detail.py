@@ -1,18 +1,21 @@
-"""Which pixels of an object teach most: those of its detail, which are drawn more often.
+"""Sampling of an object's pixels by detail: pixels with detail around them teach most, and are drawn more
+often.
 
-The gradient of a step is a sum over random pixels of the training pictures. It varies least where pixels are
-drawn in proportion to the size of their own gradients, hence of their errors (importance sampling;
-Katharopoulos and Fleuret, "Not all samples are created equal", 2018). Errors are where the pictures have
-edges and texture, and the plain middle of a surface is learned from a few rays. So the chance q of a pixel
-that is not transparent follows the contrast around it, which the pictures tell before training begins:
+The gradient of a step is a sum over random pixels of the training pictures. Its variance is least if pixels
+are drawn in proportion to the size of their own gradients, and so about to their errors (importance sampling;
+Katharopoulos and Fleuret, "Not all samples are created equal", 2018). Errors are large where the pictures
+have edges and texture; the plain middle of a surface is learned from a few rays. So the probability q of a
+pixel that is not transparent follows the contrast around it, which is known before training begins:
 
     q ~ MIX + (1 - MIX) g / mean(g),   g = (mean of the squared differences around the pixel) ^ POWER.
 
-A map of the errors themselves, in blocks of 8x8 pixels, is no better: detail is finer than blocks. The
-background is drawn as often as if all pixels were drawn alike: its rays cost little and say what is empty.
+A map of the errors themselves, in blocks of 8x8 pixels, is no better, because detail is finer than blocks.
+The background is drawn as often as if all pixels were equally likely: its rays cost little, and show which
+space is empty.
 
-Importance sampling would also divide each error by its pixel's chance, so that the loss stays the plain mean
-over all pixels. That is not done here: Adam undoes most of such factors, and what is left of them is noise.
+Importance sampling would also divide each error by its pixel's probability, so that the expected loss stays
+the plain mean over all pixels. That is not done here: Adam undoes most of such factors, and the rest is
+noise.
 """
 
 from __future__ import annotations
@@ -22,19 +25,19 @@ import numpy as np
 from vfr_bake.kernels.detail import neighbour_squares, window_powers
 
 MIX = 0.1
-"""Share of the draws that falls on all pixels alike that are not transparent."""
+"""Share of the draws that is spread evenly over all pixels that are not transparent."""
 POWER = 0.3
-"""Exponent of the contrast's square: about the power with which errors grow with it."""
+"""Exponent of the squared contrast: errors grow about as this power of it."""
 WINDOW = 3
 """Side of the square of pixels over which contrast is averaged."""
 MEAN_LOTS = 24
-"""Lots of a pixel on average: whole numbers from 1 to 255, coarse enough for a byte."""
+"""Mean number of lots of a pixel. Lots are whole numbers from 1 to 255, so that they fit into a byte."""
 
 
 def detail_lots(rgba: np.ndarray) -> np.ndarray:
-    """[height, width] uint8, 1 to 255 and about MEAN_LOTS on average, of the transparent and of the other
-    pixels: how often each pixel of `rgba` [height, width, 4] uint8, with straight alpha, is drawn relative to
-    others.
+    """Return the lots [height, width] uint8 of the pixels of `rgba` [height, width, 4] uint8, with straight
+    alpha: how often each pixel is drawn, relative to others. Lots are 1 to 255, and on average about
+    MEAN_LOTS both for transparent pixels and for the others.
 
     >>> rgba = np.full((64, 64, 4), 255, np.uint8)
     >>> rgba[:, 16:, :3], rgba[:, 32:, 3] = 90, 0

@@ -1,4 +1,5 @@
-"""The guides of `vfr_bake.training.guides` on a GPU: the same decisions, on tensors beside the field."""
+"""The guides of `vfr_bake.training.guides` for a GPU: the same decisions, on tensors of the field's
+device."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ from vfr_bake.training.optimiser import DeviceGridAdam
 
 
 class DeviceOccupancyGuide(BoxGuide):
-    """Marches an object's box on a GPU and keeps its occupancy grid."""
+    """Guide that marches through an object's box on a GPU, and keeps the occupancy grid up to date."""
 
     _grid: DeviceOccupancyGrid
 
@@ -50,7 +51,8 @@ class DeviceOccupancyGuide(BoxGuide):
 
 
 class DeviceProposalGuide(SpaceGuide):
-    """Trains the two proposal grids of an unbounded scene beside the field on a GPU, by autograd."""
+    """Guide that trains the two proposal grids of an unbounded scene beside the field on a GPU, by
+    autograd."""
 
     def __init__(self, settings: DeviceSettings, near: float, device: torch.device) -> None:
         super().__init__(settings, ProposalSampler(near).to(device), DeviceGridAdam, distortion)
@@ -97,7 +99,8 @@ class DeviceProposalGuide(SpaceGuide):
 
 
 def proposal_weights(grid: ProposalGrid, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> Tensor:
-    """Weights [n_rays, n] that a proposal gives to intervals with borders `edges` [n_rays, n + 1] in s."""
+    """Return the weights [n_rays, n] that a proposal gives to intervals with the borders `edges`
+    [n_rays, n + 1] in s."""
     _, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
     levels = grid.layout.levels(grid.table)
     logits = features_at(points.reshape(-1, 3), grid.table, levels).sum(dim=1)
@@ -106,8 +109,8 @@ def proposal_weights(grid: ProposalGrid, rays_o: Tensor, rays_d: Tensor, edges: 
 
 @torch.no_grad()
 def field_samples(field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: Tensor) -> RaySamples:
-    """The field in the middle of intervals with borders `edges` [n_rays, n + 1] in s, up to where a ray is
-    opaque."""
+    """Look the field up in the middle of the intervals with the borders `edges` [n_rays, n + 1] in s, up to
+    where each ray is opaque."""
     t_mid, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
     features, sigmas = field.lookup(points.reshape(-1, 3))
     kept = sums_before(sigmas.reshape(lengths.shape) * lengths) <= OPAQUE_DEPTH

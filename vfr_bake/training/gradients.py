@@ -1,4 +1,4 @@
-"""How much each ray and each sample teaches: gradients that are left out, or made smaller."""
+"""Gradients of rays and samples that are left out or made smaller."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import torch
 from torch import Tensor
 
 CERTAIN = 0.5
-"""Rays whose error is at least so many root mean squares are learned from, the others by chance."""
+"""Error, in root mean squares, from which on a ray is certainly learned from; smaller errors leave it to
+chance."""
 
 
 def chosen_rays(squares: Tensor, chances: Tensor) -> Tensor:
-    """Weights [n_rays] of rays with the squared errors `squares` [n_rays]: 0 for those left out, and for the
-    others the inverse of how probable it was that they are kept, so that a sum is the same in the mean.
+    """Return weights [n_rays] for rays with the squared errors `squares` [n_rays]: 0 for rays that are left
+    out, and for the others the inverse of their probability to be kept, so that the expected sum stays the
+    same.
 
-    Rays are kept in proportion to their error, with certainty from CERTAIN root mean squares on: of a step's
-    rays most have been learned already, and what they add to a gradient is little and costs the same.
-    `chances` [n_rays] in [0, 1) decide.
+    The probability is proportional to the error, and 1 from CERTAIN root mean squares on. Most rays of a step
+    have been learned already: they add little to the gradient, but cost as much as the others. `chances`
+    [n_rays], which are random numbers in [0, 1), decide.
 
     >>> import torch
     >>> squares, chances = torch.tensor([7.84, 0.08, 0.08, 0.0]), torch.tensor([0.9, 0.9, 0.3, 0.0])
@@ -29,10 +31,10 @@ def chosen_rays(squares: Tensor, chances: Tensor) -> Tensor:
 def scale_near_gradients(features: Tensor, t_mid: Tensor, distance: float) -> Tensor:
     """Return `features` [n_samples, n_channels] as they are, with gradients scaled by min(1, (t / d)^2).
 
-    Space just before a camera is sampled far more densely than what it looks at, and fog there explains a
-    single picture better than any surface does, above all where poses are off. Philip and Deschaintre,
-    "Floaters no more", 2023: the gradient at distance t is scaled by min(1, (t / d)^2), the share of its
-    density that a volume of space has at the distance d.
+    Space just before a camera is sampled far more densely than what the camera looks at, and fog there
+    explains a single picture better than any surface does, above all where poses are inaccurate. As in Philip
+    and Deschaintre, "Floaters no more", 2023, the gradient at distance t is therefore scaled by min(1, (t /
+    d)^2): the rays of a camera sample space at t more densely than at d by the inverse of this factor.
 
     `t_mid` [n_samples] and `distance` > 0 (d) are distances from the cameras in model units.
 

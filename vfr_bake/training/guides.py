@@ -1,8 +1,9 @@
-"""What finds the geometry while a field is trained: an occupancy grid for objects, proposals for
-scenes.
+"""Guides, which find the geometry while a field is trained: with an occupancy grid for objects, with
+proposals for scenes.
 
-All give the trainer the samples of rays, learn from what came of them, and are at last the sampler that the
-trained field is rendered with. Those of a GPU are in `vfr_bake.training.device_guides`.
+A guide gives the trainer the samples of rays and learns from their densities or weights. When training ends,
+it has become the sampler that the field is rendered with. Guides for a GPU are in
+`vfr_bake.training.device_guides`.
 """
 
 from __future__ import annotations
@@ -28,59 +29,63 @@ from vfr_bake.training.optimiser import GridAdam, TableAdam
 from vfr_bake.training.processes import Processes
 
 FOG_STEPS = 512
-"""First steps, in which empty space has to be found: the occupancy grid is updated often, and rays through
-proposals have all their samples."""
+"""Number of first steps, in which empty space is still to be found. During these the occupancy grid is
+updated more often, and rays through proposals have the full number of final samples."""
 STEPS_PER_UPDATE = (16, 64)
-"""Steps between two looks of the occupancy grid at the field: at first, and later."""
+"""Steps between two updates of the occupancy grid: during the first FOG_STEPS, and later."""
 ANNEAL_STEPS, ANNEAL_SLOPE = 1000, 10.0
-"""Proposals are believed step by step: weights ** (b x / (1 + (b - 1) x)) with x from 0 to 1 over so many
-steps and b the slope (mip-NeRF 360, section C)."""
+"""Annealing of the proposals, which are trusted more and more: weights ** (b x / (1 + (b - 1) x)), where x
+rises from 0 to 1 over ANNEAL_STEPS and b is ANNEAL_SLOPE (mip-NeRF 360, section C)."""
 STEPS_PER_PROPOSAL_UPDATE, STEADY_STEPS = 5, 200
-"""Proposals change ever more slowly, and learn in one step of so many at most (nerfacc's default): in each
-one for so many steps, then in every second for as many, and so on."""
+"""Proposals change more and more slowly, so they learn in fewer and fewer steps: in each of the first
+STEADY_STEPS, then in every second of the next STEADY_STEPS, and so on, down to one step in
+STEPS_PER_PROPOSAL_UPDATE (nerfacc's default)."""
 
 
 SIZES = 4
-"""Sizes that a batch has until it has grown by as much as it had at first."""
+"""Batches grow in increments of 1 / SIZES of their first size."""
 
 
 class Growth(NamedTuple):
-    """How batches grow on a CPU: in proportion to the number of steps, from one of them on and up to a size.
+    """Growth of the batches on a CPU: in proportion to the number of steps, from a given step on and up to a
+    largest size.
 
-    As many rays in more steps show less, and in a capture less yet of views that are not learned from
-    (docs/notes/2026-11-29-batches-that-grow.md).
+    The same number of rays in more, smaller steps gives worse pictures, above all of a capture's views that
+    are not learned from (docs/notes/2026-11-29-batches-that-grow.md).
     """
 
     after: int
-    """The step from which on batches grow."""
+    """Step from which on batches grow."""
     most: float
-    """How many times its first size a batch has at last."""
+    """Largest size of a batch, in multiples of its first size."""
 
     def size(self, step: int) -> float:
-        """How many times its first size the batch of a step has.
+        """Return the size of a step's batch, in multiples of its first size.
 
         >>> [Growth(after=2000, most=4.0).size(step) for step in (0, 2400, 2500, 3000, 9000)]
         [1.0, 1.0, 1.25, 1.5, 4.0]
         """
-        # Batches of one size for a while: memory that each frees suits the next one.
+        # The size stays the same for many steps, so that each batch can reuse the memory of the one before.
         return min(max(1.0, step // (self.after // SIZES) / SIZES), self.most)
 
 
 GROWTH = {False: Growth(6000, 2.0), True: Growth(2000, 4.0)}
-"""By whether the scene is unbounded; what limits the latter is memory, 150 kB a ray."""
+"""Growth, by whether the scene is unbounded; batches of unbounded scenes are limited by memory, 150 kB a
+ray."""
 
 
 class Guide(ABC):
-    """The sampler in training."""
+    """Sampler that is itself in training."""
 
     reach: float
-    """How far apart the distortion loss takes weights to be at most, in the unit of `_intervals`."""
+    """Distance, in the unit of `_intervals`, at which the distortion loss saturates: weights that are farther
+    apart count as this far apart."""
 
     def __init__(self, settings: DeviceSettings, distortion: Callable[..., Tensor]) -> None:
-        """`distortion`: as `vfr_bake.rendering.compositing.distortion`, for the device."""
+        """`distortion`: the implementation of `vfr_bake.rendering.compositing.distortion` for the device."""
         self._settings, self._distortion = settings, distortion
         self._size = 1.0
-        """How many times its first size the next batch has."""
+        """Size of the next batch, in multiples of its first size."""
 
     @property
     @abstractmethod
@@ -89,26 +94,26 @@ class Guide(ABC):
 
     @abstractmethod
     def n_rays(self, pilot: bool) -> int:
-        """Rays to draw for the next batch, over all processes."""
+        """Return the number of rays to draw for the next batch, over all processes."""
 
     @abstractmethod
     def prepare(self, step: int, field: VfrField) -> None:
-        """Before a step: look at what the field has become."""
+        """Get ready for `step`: look at what the field has become, and set what depends on the step."""
 
     @abstractmethod
     def sample(
         self, field: VfrField, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, pilot: bool, share: float
     ) -> RaySamples:
-        """Samples of rays [n_rays, 3] with `jitter` [n_rays, 3] in [0, 1), in this process' `share` of the
-        batch. What is needed later in their step is in their trail: those of the next step may be taken
-        meanwhile."""
+        """Sample rays [n_rays, 3], shifted by `jitter` [n_rays, 3] in [0, 1); `share` is this process' share
+        of the batch. What their step needs later is kept in the samples' trail, because the next step may be
+        sampled meanwhile."""
 
     def observe(self, n_rays: int, n_samples: int) -> None:
-        """Take note of how many rays and samples the batch had, over all processes."""
+        """Note how many rays and samples the batch had, over all processes."""
         return None
 
     def regulariser(self, samples: RaySamples, weights: Tensor) -> Tensor | None:
-        """Sum over the rays of the distortion loss of the weights [n_samples], None if its weight is 0."""
+        """Return the distortion loss of the weights [n_samples], summed over the rays; None if it is off."""
         if self._settings.distortion == 0:
             return None
         mids, widths = self._intervals(samples)
@@ -117,30 +122,30 @@ class Guide(ABC):
 
     @abstractmethod
     def _intervals(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Middles and widths [n_samples] of the intervals that samples stand for."""
+        """Return the middles and the widths [n_samples] of the samples' intervals."""
 
     def add_gradients(self, samples: RaySamples, weights: Tensor, n_rays: int) -> None:
-        """Add this process' gradient to the guide's own tables; losses are means over `n_rays`."""
+        """Add this process' gradient to that of the guide's own tables; losses are means over `n_rays`."""
         return None
 
     def tables(self, samples: RaySamples) -> Sequence[TableAdam]:
-        """The tables that learn in the step of the samples, with their gradients."""
+        """Return the optimisers of the tables that learn in the step of the samples."""
         return ()
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """All that later steps depend on, in tensors and plain values."""
+        """Return all that later steps depend on, as tensors and plain values."""
 
     @abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from what `state` returned."""
 
 
 class BoxGuide(Guide):
-    """Marches an object's box: what its guides have in common on all devices."""
+    """Base of the guides that march through an object's box, on any device."""
 
     reach = 0.01
-    """Sides of the box: what lies behind glass is not drawn to it."""
+    """In sides of the box; small, so that a surface behind glass is not drawn towards the glass."""
 
     def __init__(
         self,
@@ -158,7 +163,7 @@ class BoxGuide(Guide):
         return int(min(self._settings.max_rays, max(64, wanted)))
 
     def _budget(self, pilot: bool) -> int:
-        # A pilot step evaluates its network on every sample, so it gets half of them and costs about as much.
+        # A pilot step evaluates its network at every sample: with half the samples it takes about as long.
         budget = self._settings.batch_samples * self._size
         return int(budget / 2 if pilot else budget)
 
@@ -182,7 +187,7 @@ class BoxGuide(Guide):
 
 
 class OccupancyGuide(BoxGuide):
-    """Marches an object's box on a CPU and keeps its occupancy grid."""
+    """Guide that marches through an object's box on a CPU, and keeps the occupancy grid up to date."""
 
     _grid: OccupancyGrid
 
@@ -200,7 +205,7 @@ class OccupancyGuide(BoxGuide):
 
     def prepare(self, step: int, field: VfrField) -> None:
         if step % STEPS_PER_UPDATE[step >= FOG_STEPS] == 0:
-            # Every process has seen its own rays.
+            # Each process has raised densities along its own rays only.
             self._processes.take_largest(torch.from_numpy(self._grid.densities))
         super().prepare(step, field)
         self._size = GROWTH[False].size(step)
@@ -219,15 +224,16 @@ class OccupancyGuide(BoxGuide):
 
 
 class SpaceGuide(Guide):
-    """When the proposals of a scene learn and how far they are believed: what its guides have in common on
-    all devices.
+    """Base of the guides with proposals, on any device: it decides when the proposals learn, and how far they
+    are trusted.
 
-    The trail of its samples has "edges" [n_rays, n_final + 1], the borders of their intervals in s, the
-    "rounds" that led to them, and whether proposals learn from these ("learns").
+    The trail of its samples has "edges" [n_rays, n_final + 1], the borders of the samples' intervals in s;
+    "rounds", the rounds of proposals that led to them; and "learns", whether the proposals learn in this
+    step.
     """
 
     reach = 1.0
-    """The length of the ray, in s."""
+    """The whole length of a ray, so that the distortion loss never saturates."""
 
     def __init__(
         self,
@@ -253,11 +259,11 @@ class SpaceGuide(Guide):
         x = min(1.0, step / ANNEAL_STEPS)
         self._exponent = ANNEAL_SLOPE * x / (1 + (ANNEAL_SLOPE - 1) * x)
         self._learns = step % min(STEPS_PER_PROPOSAL_UPDATE, 1 + step // STEADY_STEPS) == 0
-        # Once there is more than fog, half of the samples teach as much, as they lie where matter is.
+        # Once there is more than fog, samples lie where matter is, and half as many teach as much.
         self._n_final = N_FINAL if step < FOG_STEPS else N_FINAL // 2
 
     def _intervals(self, samples: RaySamples) -> tuple[Tensor, Tensor]:
-        # In s, from 0 to 1 over the ray, as mip-NeRF 360 has it.
+        # In s, scaled so that the ray has length 1, as in mip-NeRF 360.
         edges = samples.trail["edges"]
         kept = torch.arange(edges.shape[1] - 1, device=edges.device) < samples.counts[:, None]
         low, high = edges[:, :-1][kept], edges[:, 1:][kept]
@@ -276,7 +282,7 @@ class SpaceGuide(Guide):
 
 
 class ProposalGuide(SpaceGuide):
-    """Trains the two proposal grids of an unbounded scene beside the field, on a CPU."""
+    """Guide that trains the two proposal grids of an unbounded scene beside the field, on a CPU."""
 
     def __init__(self, settings: DeviceSettings, near: float) -> None:
         super().__init__(settings, ProposalSampler(near), GridAdam, distortion)

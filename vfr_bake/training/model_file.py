@@ -1,15 +1,19 @@
 """The model file, `model.pt`: a trained field with all that baking needs. It holds tensors and plain values
 only, and loads with `weights_only=True`.
 
-Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of
-the training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD
-frame, as transforms.json text), sampler (below), state (the field's tensors), figures (what training
-measured), since version 2.1 witnesses (`vfr_bake.training.pixel_tensors`), which are missing in older
-files, since version 2.2 exposure (`vfr_bake.training.captures.picture_colours`), which is missing where all
-pictures have the same, and since version 2.5 training_pixels (`vfr_bake.training.pixel_tensors`). The
-sampler of an object is its occupancy grid: step (march step in model units), occupied (bits), resolution;
-that of an unbounded scene its proposals: near (model units), state (their tensors) and, since version 2.4,
-layouts (levels and finest resolution of each round's grid; 10 and 128, 10 and 512 in older files).
+Keys: format "vfr-model", version [major, minor], field (settings of the architecture), train (settings of the
+training, for the record), world_from_model [4, 4], has_alpha, cameras (training cameras in the WORLD frame,
+as transforms.json text), sampler (see below), state (the field's tensors), figures (measured by the
+training).
+
+Keys that older files do not have: witnesses since version 2.1 and training_pixels since version 2.5 (both:
+`vfr_bake.training.pixel_tensors`), and exposure since version 2.2, if it differs between pictures
+(`vfr_bake.training.captures.picture_colours`).
+
+The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits), resolution.
+The sampler of an unbounded scene is its proposals: near (model units), state (their tensors) and, since
+version 2.4, layouts (levels and finest resolution of each round's grid; 10 and 128, 10 and 512 in older
+files).
 """
 
 from __future__ import annotations
@@ -54,34 +58,35 @@ if TYPE_CHECKING:
 FORMAT = "vfr-model"
 VERSION = (2, 5)
 N_MEAN_VIEWS = 16
-"""Cameras, spread over all, whose pictures give the mean colour of a scene."""
+"""Number of cameras, about, spread evenly over all, whose pictures give the mean colour of a scene."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A trained field with its frame, its cameras and its occupancy grid."""
+    """Trained field with its sampler, its frame and its cameras."""
 
     field: VfrField
     sampler: Sampler
     world_from_model: np.ndarray
-    """[4, 4] float64 similarity; an object's box is [-1, 1]^3 of the model frame, a scene's cameras are in
-    its unit ball."""
+    """[4, 4] float64 similarity. In the model frame, an object's box is [-1, 1]^3, and the cameras of an
+    unbounded scene are in the unit ball."""
     cameras: list[Camera]
-    """Training cameras, WORLD frame."""
+    """Training cameras, in the WORLD frame."""
     has_alpha: bool
-    """Whether the photographs had a background cut away."""
+    """True if the background was cut out of the photographs."""
     train: dict[str, Any]
     """Settings of the training, for the record."""
     figures: dict[str, Any]
-    """What training measured, for the record."""
+    """Figures that training measured, for the record."""
     witnesses: Witnesses | None = None
-    """Pixels of the training views that training has not learned from; None in the models of before there
-    were any."""
+    """Pixels of the training views that training has not learned from; None in models of versions without
+    witnesses."""
     exposure: PictureColours | None = None
-    """How the training views show the field's colours; None where all show them as they are."""
+    """Gains and offsets with which the training views show the field's colours; None if all show them
+    unchanged."""
     training_pixels: ViewPixels | None = None
-    """Pixels of the training views that training has learned from, and a bake learns from, too; None in the
-    models of before there were any."""
+    """Pixels of the training views that training has learned from, and that a bake learns from too; None in
+    models of versions without them."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -92,8 +97,10 @@ class Model:
 
     @cached_property
     def background(self) -> np.ndarray:
-        """[3] default background, sRGB: white, as NeRF-synthetic is compared; of surroundings without end the
-        mean of what their cameras see, for what is missing there is a hole in a wall and no white."""
+        """[3] float32: default background, sRGB. It is white where pictures have alpha and for objects, as
+        usual for NeRF-synthetic. In other unbounded scenes it is the mean colour that the cameras see,
+        because the background shows there through holes in what is reconstructed, where white would stand
+        out."""
         if self.has_alpha or not self.field.config.unbounded:
             return np.ones(3, np.float32)
         cameras = self.model_cameras()
@@ -102,12 +109,12 @@ class Model:
         return (np.round(255 * seen) / 255).astype(np.float32)
 
     def model_cameras(self) -> list[Camera]:
-        """The cameras of the views that training has learned from, in the model frame."""
+        """Return the cameras of the views that training has learned from, in the model frame."""
         cameras = self._in_model_frame()
         return cameras if self.witnesses is None else [cameras[i] for i in self.witnesses.learned()]
 
     def witness_rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions of the witnesses' rays, [n_witnesses, 3] float32 each, model frame.
+        """Return origins and unit directions of the witnesses' rays, [n_witnesses, 3] float32, model frame.
 
         Raises ConfigError for a model without witnesses.
         """
@@ -118,14 +125,16 @@ class Model:
         return self.witnesses.rays(self._in_model_frame())
 
     def neutral_witnesses(self) -> Witnesses | None:
-        """The witnesses with the colours that the field should have, whatever their picture's exposure."""
+        """Return the witnesses with the colours that the field should show, without their pictures'
+        exposure."""
         if self.witnesses is None or self.exposure is None:
             return self.witnesses
         return self.exposure.neutral(self.witnesses)
 
     def training_pixel_rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Origins and unit directions of the training pixels' rays, [n, 3] float32 each, model frame, and the
-        colours that the field should have there, [n, 4] uint8; none of a model without training pixels."""
+        """Return the origins and unit directions of the training pixels' rays, [n, 3] float32 each, in the
+        model frame, and the colours [n, 4] uint8 that the field should show there; n is 0 for a model without
+        training pixels."""
         if self.training_pixels is None:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint8)
         pixels = self.training_pixels
@@ -138,7 +147,7 @@ class Model:
 
 
 def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Model:
-    """The model that `trainer` has by now, of the `scene` that it trains on."""
+    """Return the model that `trainer` has so far; `scene` is the one that it trains on."""
     model = Model(
         field=trainer.field,
         sampler=trainer.sampler,
@@ -156,8 +165,8 @@ def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Mo
 
 
 def _exposure(model: Model, witnesses: Witnesses, learned: Correction) -> PictureColours:
-    """How the training views show the field's colours: those that were `learned` from, and the whole
-    witnesses, which are fitted to what the model shows there."""
+    """Return the gains and offsets of all training views: those that were `learned`, and for the whole views
+    of the witnesses those that fit the model's colours to the pictures."""
     n_views = len(witnesses.counts)
     gains, offsets = np.ones((n_views, 3), np.float32), np.zeros((n_views, 3), np.float32)
     gains[witnesses.learned()] = learned.gains.cpu().numpy()
@@ -172,7 +181,7 @@ def _exposure(model: Model, witnesses: Witnesses, learned: Correction) -> Pictur
 
 
 def save_model(path: Path, model: Model) -> None:
-    """Write beside `path` and rename into place."""
+    """Write a model file beside `path`, then rename it to `path`."""
     content = {
         "format": FORMAT,
         "version": list(VERSION),
@@ -195,10 +204,11 @@ def save_model(path: Path, model: Model) -> None:
 
 
 def load_model(path: Path, max_memory: float | None = None) -> Model:
-    """Read a model file; it takes at most `max_memory` gigabytes, a share of what the machine has if None.
+    """Read a model file with at most `max_memory` gigabytes of memory; None for a share of what the machine
+    has.
 
-    Raises FormatError (not a model, cut short, wrong shapes), VersionError (too new) or ConfigError (more
-    memory than it may take).
+    Raises FormatError (not a model, cut short, or wrong shapes), VersionError (another major version) or
+    ConfigError (it would take more memory than allowed).
     """
     content = _read(path, max_memory)
     try:
@@ -217,7 +227,7 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
         raise FormatError(f"{path}: world_from_model: expected 4 x 4 finite numbers, got {brief(got)}")
     world_from_model = matrix.double().numpy()
     where = f"{path}: cameras"
-    text = content["cameras"].encode(errors="surrogatepass")  # a reader of UTF-8 refuses half a character
+    text = content["cameras"].encode(errors="surrogatepass")  # half a character then fails as bad UTF-8
     cameras = transforms_cameras(parse_transforms(text, where), where)
     witnesses = None
     if "witnesses" in content:
@@ -272,7 +282,7 @@ def _sampler_content(sampler: Sampler) -> dict[str, Any]:
 
 
 def _check_table(config: FieldConfig, state: dict[str, Any], where: str) -> None:
-    """Refuse settings that speak of a larger table than there is, before that is made."""
+    """Raise FormatError if the settings describe another table than the file has, before one is allocated."""
     layout = GridLayout(
         config.n_levels, config.base_resolution, config.max_resolution, config.log2_table_size
     )
@@ -314,7 +324,7 @@ def _restore_space(content: dict[str, Any], where: str) -> ProposalSampler:
 
 
 def _layouts(content: dict[str, Any], where: str) -> list[tuple[int, int]]:
-    """Levels and finest resolution of the grid of each round of proposals."""
+    """Return the number of levels and the finest resolution of each proposal round's grid."""
     if "layouts" not in content:
         return list(FIRST_LAYOUTS)
     check_kinds(content, {"layouts": torch.Tensor}, where)

@@ -1,11 +1,11 @@
-"""Muon, an optimiser of small dense networks: every matrix moves by its gradient made orthogonal, so that it
-learns in all directions of its space alike, those of small gradients too (Jordan et al. 2024,
+"""Muon, an optimiser for small dense networks: every matrix moves by its gradient made orthogonal, so that it
+learns equally fast in all directions of its space, including those of small gradients (Jordan et al. 2024,
 https://kellerjordan.github.io/posts/muon/).
 
-With the momentum M of a matrix's gradient G, the step is that of the nearest orthogonal matrix to
-G + MOMENTUM M, found by five Newton-Schulz iterations. It is scaled so that the entries move by about the
-rate in root mean square, as those that Adam moves do: both take one learning rate. Biases and narrow
-matrices, of which little would be left if they were orthogonal, are left to Adam.
+With the momentum M of a matrix's gradient G, the step is the orthogonal matrix nearest to G + MOMENTUM M,
+found by five Newton-Schulz iterations. It is scaled so that the root mean square of the entries' moves is
+about the learning rate, as with Adam, so that both use the same rate. Biases and narrow matrices are left to
+Adam, because little of their gradient would be left if it were made orthogonal.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from vfr_bake.training.optimiser import Adam
 
 MOMENTUM = 0.95
 DECAY = 0.3
-"""By so many times the rate a matrix shrinks in a step. Directions of no use would else stay as large as they
-became: a head that is not held learns less, and 8 bits of its activations are coarser."""
+"""Weight decay: in a step, a matrix shrinks by this share times the learning rate. Without it, directions of
+no use stay as large as they once became: the head learns less, and its activations lose more in 8 bits."""
 NARROWEST = 9
-"""Rows and columns that a matrix has at least, if it is made orthogonal."""
+"""Fewest rows and columns of a matrix whose gradient is made orthogonal."""
 COEFFICIENTS = 3.4445, -4.7750, 2.0315
-"""Jordan's: singular values from 0.001 to 1 come near 1, within 0.7 and 1.2, in N_ITERATIONS."""
+"""Jordan's coefficients: N_ITERATIONS bring singular values from 0.001 to 1 to between 0.7 and 1.2."""
 N_ITERATIONS = 5
 
 
 class Muon:
-    """Muon for the matrices of a network, Adam for the rest of it."""
+    """Muon for the matrices of a network, Adam for its other parameters."""
 
     def __init__(self, parameters: Iterable[Tensor]) -> None:
-        """`parameters` are matrices [n_in, n_out] and vectors, whose `grad` is read."""
+        """`parameters`: matrices [n_in, n_out] and vectors; their `grad` is read in each step."""
         every = list(parameters)
         matrices = [p for p in every if p.ndim == 2 and min(p.shape) >= NARROWEST]
         shapes = dict.fromkeys(p.shape for p in matrices)
@@ -43,7 +43,7 @@ class Muon:
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Move everything along the gradients, and drop them."""
+        """Take one step with all parameters, and clear the gradients."""
         self._adam.step(rate)
         self._adam.clear()
         for group, momentum in zip(self._groups, self._momenta, strict=True):
@@ -62,8 +62,8 @@ def _gradient(parameter: Tensor) -> Tensor:
 
 
 def orthogonal(matrices: Tensor) -> Tensor:
-    """[n, n_rows, n_columns]: about U V^T of the singular value decomposition U S V^T of each of `matrices`;
-    0 stays 0.
+    """Return [n, n_rows, n_columns]: about U V^T of the singular value decomposition U S V^T of each of
+    `matrices`; 0 stays 0.
 
     >>> found = orthogonal(torch.tensor([[[3.0, 0.0], [0.0, -0.01]]]))
     >>> bool((found.abs().diagonal(dim1=1, dim2=2) > 0.6).all()), float(found[0, 0, 1])

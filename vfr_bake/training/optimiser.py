@@ -16,23 +16,23 @@ from vfr_bake.field.hash_grid import HashGrid, zeros
 from vfr_bake.kernels.adam import Pace, adam_step, scatter_and_step
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
-"""Adam's decay rates and its smallest denominator (instant-ngp)."""
+"""Adam's decay rates, and what is added to its denominator; both as in instant-ngp."""
 GRID_BETAS = 0.9, 0.95
-"""The decay rates of hash grids, which learn more with a shorter memory of squared gradients; networks do not
-(docs/notes/2026-11-25-learning-rates.md)."""
+"""Adam's decay rates for hash grids. Unlike networks, they learn more with a shorter memory of squared
+gradients (docs/notes/2026-11-25-learning-rates.md)."""
 DENSITY_DECAY = 0.05
-"""By so many times the rate the density network's matrix of an unbounded scene shrinks in a step (decoupled
-weight decay, Loshchilov and Hutter, ICLR 2019). With nothing to hold it, it grows at the whole rate, and what
-a step of the grid does to a density grows with it, until after some 20,000 steps the geometry falls apart.
-Objects do not, and learn a little more without (docs/notes/2026-11-29-densities-that-steepen.md)."""
+"""Decoupled weight decay (Loshchilov and Hutter, ICLR 2019) of an unbounded scene's density network: in a
+step, its matrices shrink by this share times the learning rate. Without it they keep growing, and a step of
+the grid changes densities more and more, until after some 20,000 steps the geometry falls apart. Objects stay
+stable without it, and learn a little more (docs/notes/2026-11-29-densities-that-steepen.md)."""
 WARMUP_STEPS = 100
 HELD = 0.5
-"""Share of a training with the whole rate."""
+"""Share of a training, from its beginning, during which the learning rate is not lowered."""
 
 
 def rate_factor(step: int, progress: float) -> float:
-    """The factor of the learning rates: linear warm-up from 1 % over 100 steps, 1 for the first half of the
-    training, then in a straight line to 0.
+    """Return the factor of the learning rates: a linear warm-up from 1 % over 100 steps, 1 for the first half
+    of the training, then a linear fall to 0.
 
     `progress` in [0, 1] is the share of the training that is done.
 
@@ -45,7 +45,7 @@ def rate_factor(step: int, progress: float) -> float:
 
 @torch.no_grad()
 def shrink(tensors: Iterable[Tensor], share: float) -> None:
-    """Take a `share`, from 0 to 1, of every entry away, in place.
+    """Shrink every entry by a `share` from 0 to 1, in place.
 
     >>> weight = torch.tensor([4.0, -2.0])
     >>> shrink([weight], 0.5)
@@ -57,12 +57,12 @@ def shrink(tensors: Iterable[Tensor], share: float) -> None:
 
 
 class Adam:
-    """Adam (Kingma and Ba, ICLR 2015) for tensors, whose `grad` is read. One without a gradient stays as it
-    is, and its step does not count.
+    """Adam (Kingma and Ba, ICLR 2015) for tensors with a `grad`. A tensor without a gradient stays as it is,
+    and the step is not counted for it.
 
-    The step is torch's function. The class `torch.optim.Adam` imports torch's compiler when the first is
-    made, which takes three seconds of every start, and does more around each step of a small network than the
-    step takes.
+    The step itself is torch's function `adam`. The class `torch.optim.Adam` is not used: it imports torch's
+    compiler when it is first made, which adds three seconds to every start, and its overhead for a step of a
+    small network is longer than the step.
 
     >>> weight = torch.ones(3)
     >>> weight.grad = torch.tensor([1.0, -2.0, 0.0])
@@ -82,7 +82,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """Move everything along the gradients."""
+        """Take one step with all tensors that have a gradient."""
         of_step = zip(self._parameters, self._means, self._squares, self._counts, strict=True)
         moved = [(p, p.grad, *moments) for p, *moments in of_step if p.grad is not None]
         if not moved:
@@ -99,11 +99,12 @@ class Adam:
             parameter.grad = None
 
     def state(self) -> dict[str, Any]:
-        """All that later steps depend on, in tensors."""
+        """Return all that later steps depend on, as tensors."""
         return {"means": self._means, "squares": self._squares, "counts": self._counts}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` returned. Raises ValueError or RuntimeError if that is of other tensors."""
+        """Continue from what `state` returned. Raises ValueError or RuntimeError if that was of other
+        tensors."""
         for name, tensors in self.state().items():
             for tensor, of_state in zip(tensors, state[name], strict=True):
                 if tensor.shape != of_state.shape:
@@ -112,38 +113,38 @@ class Adam:
 
 
 class TableAdam(ABC):
-    """Adam on a hash table [n_entries, n_channels], to whose gradient others add until it takes its step."""
+    """Adam for a hash table [n_entries, n_channels]. Others add to the table's gradient until the step."""
 
     def __init__(self, table: Tensor) -> None:
         self.table = table
 
     @property
     def gradient(self) -> Tensor:
-        """[n_entries, n_channels] gradient of the step to come."""
+        """[n_entries, n_channels]: the gradient for the next step."""
         assert self.table.grad is not None
         return self.table.grad
 
     @abstractmethod
     def step(self, rate: float) -> None:
-        """Apply and clear the gradient."""
+        """Take one step along the gradient, and clear it."""
 
     @abstractmethod
     def clear(self) -> None:
-        """Drop the gradient of a step that is not to be taken."""
+        """Clear the gradient without taking a step."""
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """All that later steps depend on, in tensors and plain values."""
+        """Return all that later steps depend on, as tensors and plain values."""
 
     @abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` returned."""
+        """Continue from what `state` returned."""
 
 
 class DeviceGridAdam(TableAdam):
-    """torch's Adam on a hash table on a GPU, whose memory is fast enough to step all entries.
+    """torch's Adam for a hash table on a GPU, whose memory is fast enough to step all entries.
 
-    So entries without a gradient go on by their momentum for some steps, which `GridAdam`'s do not.
+    Unlike with `GridAdam`, entries without a gradient therefore keep moving by their momentum for some steps.
     """
 
     def __init__(self, table: Tensor) -> None:
@@ -165,7 +166,7 @@ class DeviceGridAdam(TableAdam):
 
 
 class GridAdam(TableAdam):
-    """Adam on a hash table whose gradient is mostly zero; it owns that gradient's buffer."""
+    """Adam for a hash table whose gradient is mostly zero; it owns the buffer of the gradient."""
 
     def __init__(self, table: Tensor) -> None:
         super().__init__(table)
@@ -181,7 +182,7 @@ class GridAdam(TableAdam):
         self.gradient.zero_()
 
     def _next_pace(self, rate: float) -> Pace:
-        """Count a step, and return its numbers."""
+        """Count a step, and return its rate and decay rates."""
         self.n_steps += 1
         beta1, beta2 = GRID_BETAS
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
@@ -196,7 +197,11 @@ class GridAdam(TableAdam):
 
 
 class FusedGridAdam(GridAdam):
-    """`GridAdam` for the table of a `HashGrid`, faster: the table's gradient never exists as a whole."""
+    """Faster `GridAdam` for the table of a `HashGrid`, without a gradient of the whole table.
+
+    The grid appends the points and gradients of a step to `grid.pending`. The step adds them up and applies
+    them level by level.
+    """
 
     def __init__(self, grid: HashGrid) -> None:
         assert isinstance(grid.table, Tensor)

@@ -1,8 +1,8 @@
 """Witnesses and training pixels as the tensors of a model file or a checkpoint.
 
 Keys: counts [n_views] int32 (pixels of each training view), pixels [n_pixels] int32 (row * width + column in
-their view, ascending in each view), rgba [n_pixels, 4] uint8; and of witnesses whole [n_whole] int32
-(ascending numbers of the views that nothing was learned from).
+their view, ascending in each view), rgba [n_pixels, 4] uint8. Witnesses also have whole [n_whole] int32 (the
+numbers, ascending, of the views that nothing was learned from).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ WITNESS_KEYS = KEYS | {"whole": torch.int32}
 
 
 def pixel_content(pixels: ViewPixels) -> dict[str, torch.Tensor]:
-    """The tensors of `pixels`, 8 bytes a pixel: less than 500 kB of witnesses."""
+    """Return the tensors of `pixels`: 8 bytes a pixel, so less than 500 kB for witnesses."""
     keys = WITNESS_KEYS if isinstance(pixels, Witnesses) else KEYS
     return {name: torch.from_numpy(np.ascontiguousarray(getattr(pixels, name))) for name in keys}
 
 
 def restore_training_pixels(content: Any, cameras: Sequence[Camera], where: str) -> ViewPixels:
-    """The training pixels of training `cameras`, one a view, from what `pixel_content` gave.
+    """Restore training pixels from what `pixel_content` returned; `cameras` has one for each training view.
 
     Raises FormatError: a tensor is missing or of another kind or shape, or a number is out of range.
     """
@@ -40,7 +40,7 @@ def restore_training_pixels(content: Any, cameras: Sequence[Camera], where: str)
 
 
 def restore_witnesses(content: Any, cameras: Sequence[Camera], where: str) -> Witnesses:
-    """The same of witnesses."""
+    """Restore witnesses; otherwise as `restore_training_pixels`."""
     _check(content, WITNESS_KEYS, N_WITNESSES, cameras, where)
     found = Witnesses(**{name: content[name].numpy() for name in WITNESS_KEYS})
     n_views, whole = len(cameras), found.whole
@@ -55,7 +55,7 @@ def restore_witnesses(content: Any, cameras: Sequence[Camera], where: str) -> Wi
 def _check(
     content: Any, keys: dict[str, torch.dtype], most: int, cameras: Sequence[Camera], where: str
 ) -> None:
-    """Raises FormatError for tensors that are not at most `most` pixels of `cameras`."""
+    """Check that the tensors hold at most `most` pixels of `cameras`; raises FormatError if they do not."""
     if not isinstance(content, dict):
         raise FormatError(f"{where}: expected dict, got {type(content).__name__}")
     check_kinds(content, dict.fromkeys(keys, torch.Tensor), where)

@@ -1,4 +1,4 @@
-"""A view that is not learned from beside its photograph, while a field learns: to be looked at."""
+"""Preview of a training: a view beside its photograph, written to a file now and then to be looked at."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vfr_bake.training.scores.metrics import comparison, over_background
 from vfr_bake.training.trainer import Trainer
 
 SECONDS = 60.0
-"""Between two previews."""
+"""Seconds of training between two previews."""
 SIDE = 320
-"""Pixels of the longest side, at most: such a picture takes a second or two."""
+"""Pixels of a preview's longest side, at most: such a picture takes a second or two."""
 
 
 def preview_path(model: Path) -> Path:
-    """Path of the preview of the training of `model`.
+    """Return the path of the preview for the training of `model`.
 
     >>> preview_path(Path("a/fox.pt")).name
     'fox.preview.png'
@@ -29,28 +29,29 @@ def preview_path(model: Path) -> Path:
 
 
 class Preview:
-    """One view of a scene, of the test split where there is one, and the file that shows it."""
+    """A view of a scene, from the test split if there is one, and the file that shows it."""
 
     def __init__(self, scene: Scene, path: Path) -> None:
         views = scene.test if scene.test.cameras else scene.train
         number = len(views.cameras) // 2
         self._camera = camera = views.cameras[number].at_most(SIDE)
         rgba = views.images[number]
-        # A picture with alpha is shown over white, as data sets of objects are; another has no background.
+        # Over white where pictures have alpha, as is usual for data sets of objects; else over the mean
+        # colour.
         self._background = np.ones(3) if scene.has_alpha else rgba[..., :3].mean(axis=(0, 1)) / 255
         whole = Image.fromarray(to_8_bit(over_background(rgba, self._background)))
         self._photograph = np.asarray(whole.resize((camera.width, camera.height), Image.Resampling.BOX)) / 255
         self._path = path
-        # Before, all of the box is fog still, and a picture takes many times as long.
+        # Not earlier: while all of the box is still fog, a picture takes many times as long.
         self._due = SECONDS / 4
 
     def update(self, trainer: Trainer) -> None:
-        """`write` if SECONDS of training are over since the last time. Raises OutputError."""
+        """Write the preview if SECONDS of training have passed since the last one. Raises OutputError."""
         if trainer.seconds >= self._due:
             self.write(trainer)
             self._due = trainer.seconds + SECONDS
 
     def write(self, trainer: Trainer) -> None:
-        """Write photograph | rendered | error map, replacing what is there. Raises OutputError."""
+        """Write photograph | rendered | error map, replacing the last preview. Raises OutputError."""
         rgb = render_image(trainer.field, trainer.sampler, self._camera, self._background)
         write_png(self._path, comparison(self._photograph, rgb))

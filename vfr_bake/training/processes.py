@@ -1,7 +1,8 @@
-"""Several processes, each with its share of every batch: `torchrun` starts the same command in all of them.
+"""Training in several processes, each with its share of every batch: `torchrun` starts the same command in
+all of them.
 
-What DistributedDataParallel does, by hand: the hash grid's gradient is written in place by its own kernel, so
-its hooks would not see it. Gradients are summed, so that the processes' batches count as one joint batch.
+This does by hand what DistributedDataParallel does. Its hooks would miss the gradient of the hash grid, which
+is written in place by a kernel. Gradients are summed, so that the processes' shares count as one joint batch.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ T = TypeVar("T")
 
 
 class Processes:
-    """This process among those that `torchrun` started; one alone where it did not.
+    """This process among those that `torchrun` started; the only one if it was started without `torchrun`.
 
     >>> Processes.from_environment().size
     1
@@ -28,7 +29,7 @@ class Processes:
 
     @classmethod
     def from_environment(cls) -> Processes:
-        """Joins the group that the environment variables RANK and WORLD_SIZE speak of."""
+        """Join the process group that the environment variables RANK and WORLD_SIZE describe."""
         size = int(os.environ.get("WORLD_SIZE", "1"))
         if size > 1 and not distributed.is_initialized():
             distributed.init_process_group("gloo")
@@ -36,15 +37,15 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that reports and writes."""
+        """True for the process that reports and writes files."""
         return self.rank == 0
 
     def share(self, rows: Tensor) -> Tensor:
-        """This process' rows of a joint batch: every `size`-th."""
+        """Return this process' rows of a joint batch: every `size`-th."""
         return rows[self.rank :: self.size].contiguous()
 
     def total(self, *values: float) -> list[float]:
-        """The sum of each value over all processes."""
+        """Return the sum of each value over all processes."""
         if self.size == 1:
             return list(values)
         tensor = torch.tensor(values, dtype=torch.float64)
@@ -52,22 +53,23 @@ class Processes:
         return tensor.tolist()
 
     def agree(self, value: float) -> float:
-        """The first process' value, for all: clocks differ."""
+        """Return the first process' value in all processes, for example because clocks differ."""
         return self.total(value if self.first else 0.0)[0]
 
     def add_up(self, gradients: Sequence[Tensor]) -> None:
-        """Replace each tensor by its sum over all processes."""
+        """Replace each tensor by its sum over all processes, in place."""
         if self.size > 1:
             for gradient in gradients:
                 distributed.all_reduce(gradient)
 
     def take_largest(self, values: Tensor) -> None:
-        """Replace each value by the largest that some process has."""
+        """Replace each value by the largest of all processes, in place."""
         if self.size > 1:
             distributed.all_reduce(values, distributed.ReduceOp.MAX)
 
     def in_turn(self, work: Callable[[], T]) -> T:
-        """The result of `work`, done by the first process before the others: they find what it left."""
+        """Do `work` in the first process, then in the others, which find what it left on disk; return the
+        result."""
         if self.first:
             result = work()
             self._wait()
@@ -80,7 +82,7 @@ class Processes:
             distributed.barrier()
 
     def leave(self) -> None:
-        """Wait for the others and end the group."""
+        """Wait for the other processes, and leave the group."""
         self._wait()
         if self.size > 1:
             distributed.destroy_process_group()

@@ -1,5 +1,5 @@
-"""Random pixels of the training pictures, all but the witnesses and what is masked, as rays with their
-colours."""
+"""Random pixels of the training pictures, as rays with their colours; witnesses and masked pixels are never
+drawn."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.detail import detail_lots
 
 CHUNK_SHARE = 0.25
-"""Pixels that are drawn from a chunk, as a share of those in it: few are drawn twice, and what is read from a
-disk is four times what is used."""
+"""Number of pixels drawn from a chunk, as a share of the pixels in it. So few are drawn twice, but four times
+as much is read from the disk as is used."""
 RUN = 64
-"""Pixels whose lots are summed in one number; as many as a line of the cache has bytes."""
+"""Numbers in a run, for which a `Lottery` keeps one sum: their lots, of a byte each, fill a cache line."""
 
 
 @dataclass(frozen=True)
 class RayBatch:
-    """Rays in the model frame and what the photographs show there."""
+    """Rays in the model frame, and what the photographs show there."""
 
     rays_o: Tensor
     """[n_rays, 3] float32."""
@@ -40,30 +40,31 @@ class RayBatch:
 
 @dataclass(frozen=True)
 class Batch(RayBatch):
-    """The rays of one step, and what chance adds to them."""
+    """The rays of one step, and the random numbers drawn for them."""
 
     jitter: Tensor
-    """[n_rays, 3] in [0, 1)."""
+    """[n_rays, 3] in [0, 1): shifts of the samples along each ray."""
     background: Tensor
-    """[n_rays, 3] in [0, 1]."""
+    """[n_rays, 3] in [0, 1]: the colour behind each ray."""
     chances: Tensor
     """[n_rays] in [0, 1): decides whether a ray with a small error is learned from."""
 
 
 class Pixels(NamedTuple):
-    """Pixels of all pictures, which may differ in size: all of them, or one chunk of what lies on a disk
-    (`vfr_bake.data.capture.StoredImages`). Arrays, or tensors on one device."""
+    """Pixels of all pictures, which may differ in size: all of them, or one chunk of those on a disk
+    (`vfr_bake.data.capture.StoredImages`). The members are arrays, or tensors on one device."""
 
     rgba: Any
     """[n_pixels, 4] uint8, or 3 channels if all are opaque, picture after picture."""
     starts: Any
     ends: Any
-    """[n_pictures] int64: the first pixel of each picture here, and the one behind its last."""
+    """[n_pictures] int64: index in `rgba` of each picture's first pixel, and of the one after its last."""
     places: Any
     strides: Any
     sizes: Any
-    """[n_pictures] int64: the place of a picture's first pixel here, and how many pixels the picture has. The
-    pixel at place p is number (stride p) mod size in row-major order; all pixels are in the places 0, 1, 2,
+    """[n_pictures] int64: the place of each picture's first pixel in `rgba`, the picture's stride, and its
+    number of pixels. The pixel at place p has the number (stride p) mod size in row-major order. If all
+    pixels are here, they lie at the places 0, 1, 2,
     ... of stride 1."""
     widths: Any
     heights: Any
@@ -75,7 +76,8 @@ class Pixels(NamedTuple):
 
     @classmethod
     def of(cls, views: PosedImages, joined: np.ndarray | None, chunk: int) -> Pixels:
-        """Those of `views`: `joined` [n_pixels, 4] if they are in memory, and one `chunk` if on a disk."""
+        """Return the pixels of `views`: `joined` [n_pixels, 4] if they are in memory, a `chunk` if on a
+        disk."""
         cameras, images = views.cameras, views.images
         sizes = np.array([camera.width * camera.height for camera in cameras])
         if isinstance(images, StoredImages):
@@ -99,24 +101,25 @@ class Pixels(NamedTuple):
         )
 
     def numbers(self, view: Any, index: Any) -> Any:
-        """The numbers [n] of the pixels `index` [n] in their pictures `view` [n], row-major."""
+        """Return the row-major numbers [n], in their pictures `view` [n], of the pixels at `index` [n]."""
         return (index - self.starts[view] + self.places[view]) * self.strides[view] % self.sizes[view]
 
     def directions(self, view: Any, row: Any, column: Any) -> Any:
-        """Directions [n_rays, 3], not of unit length, through the centres of pixels of the pictures `view`
-        [n_rays]."""
+        """Return directions [n_rays, 3], not of unit length, through the centres of pixels of the pictures
+        `view` [n_rays]."""
         fx, fy, cx, cy = self.intrinsics[view].T
         x, y = (column + 0.5 - cx) / fx, (cy - row - 0.5) / fy
         poses = self.poses[view]
         return x[:, None] * poses[:, :, 0] + y[:, None] * poses[:, :, 1] - poses[:, :, 2]
 
     def shares(self, view: Any, row: Any, column: Any) -> tuple[Any, Any]:
-        """Shares [n_rays] of the width and of the height at the centres of pixels of the pictures `view`."""
+        """Return the centres of pixels of the pictures `view` [n_rays], as shares [n_rays] of the picture's
+        width and of its height."""
         return (column + 0.5) / self.widths[view], (row + 0.5) / self.heights[view]
 
 
 class Lottery:
-    """Draws whole numbers, each as often as it has lots.
+    """Lottery of whole numbers: each has some lots, and is drawn in proportion to them.
 
     >>> lottery = Lottery(np.array([0, 3, 1], np.uint8))
     >>> lottery.n_lots, lottery.numbers(np.arange(4)).tolist()
@@ -124,22 +127,22 @@ class Lottery:
     """
 
     def __init__(self, lots: np.ndarray) -> None:
-        """`lots` [n] uint8 of the numbers below n."""
+        """`lots` [n] uint8: how many lots each of the numbers 0 to n - 1 has."""
         runs = np.zeros((-(-len(lots) // RUN), RUN), np.uint8)
         runs.reshape(-1)[: len(lots)] = lots
         sums = runs.sum(axis=1, dtype=np.int64)
         self.runs: Any = runs
         self.ends: Any = np.cumsum(sums)
-        """[n_runs] int64: the lot behind the last of each run of numbers."""
+        """[n_runs] int64: the lot after the last one of each run of RUN numbers."""
         self.n_lots = int(sums.sum())
 
     def to(self, device: torch.device) -> Lottery:
-        """Work with tensors on a device from now on."""
+        """Turn this lottery's arrays into tensors on a device; return the lottery."""
         self.runs, self.ends = (torch.from_numpy(a).to(device) for a in (self.runs, self.ends))
         return self
 
     def numbers(self, lots: Any) -> Any:
-        """[n] int64: whose the `lots` [n] int64 are, counted from 0 to n_lots - 1."""
+        """Return [n] int64: the numbers that have the `lots` [n] int64, counted from 0 to n_lots - 1."""
         if isinstance(lots, Tensor):
             run = torch.searchsorted(self.ends, lots, right=True)
             sums = self.runs[run].cumsum(1, dtype=torch.int16)
@@ -151,15 +154,15 @@ class Lottery:
 
 
 class PixelSampler:
-    """Draws pixels at random from all training pictures, but for witnesses and what is masked: all alike
-    often, or more often where pictures show detail (`vfr_bake.training.detail`).
+    """Sampler of random pixels of all training pictures, except witnesses and masked pixels. All pixels are
+    equally likely, or those where pictures show detail are likelier (`vfr_bake.training.detail`).
 
-    Of pictures on a disk it draws from one chunk after the other, for CHUNK_SHARE as many pixels as that has:
-    each is an even sample of all pictures, and the disk is read in long runs. There, a pixel's neighbours are
-    not at hand, and all pixels are drawn alike often.
+    From pictures on a disk it draws chunk by chunk: CHUNK_SHARE times as many pixels as a chunk has, then
+    goes on to the next. A chunk is an even sample of all pictures, which the disk reads in one long run. As a
+    pixel's neighbours are not in its chunk, its detail is not known, and all pixels are equally likely.
 
-    In numpy: a batch is so small that torch spends longer waking its threads, for every step of this, than on
-    the step itself.
+    It is written in numpy, because a batch is so small that torch would take longer to wake its threads for
+    an operation than for the operation itself.
     """
 
     def __init__(
@@ -170,9 +173,9 @@ class PixelSampler:
         masked: bool = False,
         by_detail: bool = False,
     ) -> None:
-        """`witnesses`: of `views`; with None all pixels are drawn. `masked`: whether pixels that are not
-        opaque are masked; some must not be (`vfr_bake.data.files.masks.check_masked`). `by_detail`: whether
-        detail of pictures in memory is drawn more often.
+        """`witnesses`: those of `views`; None to draw from all pixels. `masked`: whether pixels that are not
+        opaque are masked; some pixels must be opaque (`vfr_bake.data.files.masks.check_masked`). `by_detail`:
+        whether detail is drawn more often, if the pictures are in memory.
 
         Raises TrainingError: there is nothing to draw.
         """
@@ -187,18 +190,18 @@ class PixelSampler:
 
     @property
     def position(self) -> list[int]:
-        """The chunk that is drawn from, and how many more pixels."""
+        """The number of the current chunk, and how many pixels are still to be drawn from it."""
         return [self._chunk, self._n_left]
 
     def restore(self, position: list[int]) -> None:
-        """Go on from a `position`."""
+        """Continue from a `position`."""
         chunk, n_left = position
         if chunk != self._chunk:
             self._go_to(chunk % self._n_chunks)
         self._n_left = n_left
 
     def _go_to(self, chunk: int) -> None:
-        """Draw from a `chunk`, or from the next one that has something to draw."""
+        """Make `chunk` the current one, or else the next one that has something to draw."""
         for ahead in range(self._n_chunks):
             self._chunk = (chunk + ahead) % self._n_chunks
             self._pixels = Pixels.of(self._views, self._joined, self._chunk)
@@ -209,7 +212,7 @@ class PixelSampler:
         raise TrainingError("training pictures: expected pixels that are not masked, found none")
 
     def _new_lottery(self) -> Lottery:
-        """The lots of the pixels that are there."""
+        """Make the lottery of the current chunk, in which witnesses and masked pixels have no lots."""
         pixels = self._pixels
         if self._by_detail:
             lots = np.concatenate([detail_lots(image).reshape(-1) for image in self._views.images])
@@ -221,7 +224,8 @@ class PixelSampler:
         return Lottery(lots)
 
     def _lots_drawn(self, n_rays: int) -> Tensor:
-        """[n_rays] int64 random lots of the chunk that it is the turn of."""
+        """Draw random lots [n_rays] int64 of the current chunk, after going on to the next if it is used
+        up."""
         if self._n_chunks > 1:
             if self._n_left <= 0:
                 self._go_to((self._chunk + 1) % self._n_chunks)
@@ -230,7 +234,7 @@ class PixelSampler:
         return torch.randint(self._lottery.n_lots, (n_rays,), generator=generator, device=generator.device)
 
     def draw(self, n_rays: int) -> RayBatch:
-        """`n_rays` pixels, with replacement."""
+        """Draw `n_rays` pixels, with replacement."""
         lots, pixels = self._lots_drawn(n_rays).numpy(), self._pixels
         index = self._lottery.numbers(lots)
         view = np.searchsorted(pixels.ends, index, side="right")
@@ -250,7 +254,7 @@ class PixelSampler:
 
 
 class DevicePixelSampler(PixelSampler):
-    """`PixelSampler` with the pixels on a GPU, 5 bytes each; `generator` is of that device."""
+    """`PixelSampler` with the pixels on a GPU, 5 bytes each; its `generator` must be on that GPU."""
 
     def _go_to(self, chunk: int) -> None:
         super()._go_to(chunk)
@@ -277,8 +281,8 @@ class DevicePixelSampler(PixelSampler):
 
 
 def _patches(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, np.ndarray]:
-    """[n] int64 each: the views of the witnesses in patches, counted among the learned ones, and their
-    numbers in these."""
+    """Return two arrays [n] int64 for the witnesses in patches: the view of each, counted among the views
+    that are learned from, and its row-major number in that view."""
     if witnesses is None:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     among = np.full(len(witnesses.counts), -1)
@@ -288,8 +292,8 @@ def _patches(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, n
 
 
 def _indices(pixels: Pixels, view: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """[n] int64: where those of the pixels `number` [n] of the pictures `view` [n] are that are there; the
-    inverse of `Pixels.numbers`."""
+    """Return the indices int64 in `pixels` of the pixels with these row-major numbers [n] in the pictures
+    `view` [n], without those that are not there; the inverse of `Pixels.numbers`."""
     strides = zip(pixels.strides.tolist(), pixels.sizes.tolist(), strict=True)
     inverse = np.array([pow(stride, -1, size) for stride, size in strides], np.int64)
     place = number * inverse[view] % pixels.sizes[view] - pixels.places[view]

@@ -1,7 +1,7 @@
-"""Files of tensors and plain values: how models, checkpoints and weights are read and written.
+"""Reading and writing of files of tensors and plain values: models, checkpoints and weights.
 
-Reading never runs code (`weights_only=True`); writing is beside the target and renamed, so that there is
-always a whole file.
+Reading never runs code (`weights_only=True`). A file is written beside its target and then renamed, so that
+there is always a whole file.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from player.files.json_files import brief
 from player.files.memory import allowed_bytes, check_memory
 
 COPIES = 3
-"""Copies of a file's tensors in memory at most: one is read, one is restored, one is checked."""
+"""Most copies of a file's tensors in memory at a time: one is read, one is restored, one is checked."""
 _PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
-"""The names that a pickle of tensors and plain values may contain."""
+"""Names of functions and types that a pickle of tensors and plain values may contain."""
 
 
 def write_tensors(path: Path, content: dict[str, Any]) -> None:
-    """Write `content`, tensors and plain values, to `path`."""
+    """Write `content`, which holds tensors and plain values, to `path`."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_bytes(path, buffer.getvalue())
 
 
 def read_tensors(path: Path, what: str, max_memory: float | None = None, from_elsewhere: bool = False) -> Any:
-    """The content of `path`, on the CPU; `what` it should be goes into the error.
+    """Return the content of the file `path`, with its tensors on the CPU.
 
     Args:
         path: the file.
-        what: what is expected there, for the message.
-        max_memory: gigabytes that reading may take; a share of what the machine has if None.
-        from_elsewhere: whether it may be a file that `write_tensors` has not written, as older versions of
-            torch wrote them.
+        what: what the file should be, for error messages.
+        max_memory: gigabytes of memory that reading may take; None for a share of what the machine has.
+        from_elsewhere: whether it may be a file that `write_tensors` has not written, such as one in the
+            format of older versions of torch.
 
-    Raises FormatError: there is no such file, it is not a regular one, or its bytes are not of that kind;
-    ConfigError: it takes more memory than it may.
+    Raises FormatError: the file does not exist, is not a regular file, or its bytes are not of that kind;
+    ConfigError: reading it would take more memory than allowed.
 
     >>> read_tensors(Path("nowhere.pt"), "a model")
     Traceback (most recent call last):
@@ -59,7 +59,7 @@ def read_tensors(path: Path, what: str, max_memory: float | None = None, from_el
             _check_archive(file, path, what)
         try:
             content = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch.load has no documented set of errors for bad bytes
+        except Exception as error:  # torch.load does not document which errors it raises
             raise FormatError(f"{path}: not {what}, or cut short") from error
     if not all(_is_whole(tensor) for tensor in _tensors(content)):
         raise FormatError(
@@ -69,8 +69,9 @@ def read_tensors(path: Path, what: str, max_memory: float | None = None, from_el
 
 
 def _check_archive(file: BinaryIO, path: Path, what: str) -> None:
-    """Refuse an archive with more in it than its bytes, and a pickle that names anything but plain tensors:
-    torch would inflate the one, and make objects of any size for the other."""
+    """Check an archive before torch reads it; raises FormatError. Its entries must not be larger than the
+    file, because torch would unpack them. Its pickle must name nothing but plain tensors, because torch would
+    make objects of any size for other names."""
     try:
         with ZipFile(file) as archive:
             entries = archive.infolist()
@@ -81,7 +82,7 @@ def _check_archive(file: BinaryIO, path: Path, what: str) -> None:
             names = {name for entry in pickles for name in _globals(archive.read(entry))}
     except FormatError:
         raise
-    except Exception as error:  # nor have zipfile and pickletools
+    except Exception as error:  # nor do zipfile and pickletools
         raise FormatError(f"{path}: not {what}, or cut short") from error
     finally:
         file.seek(0)
@@ -91,14 +92,14 @@ def _check_archive(file: BinaryIO, path: Path, what: str) -> None:
 
 
 def check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> None:
-    """Raises FormatError unless `tensor` `fits` and is dense; `numbers` are what it should hold, in words."""
+    """Raise FormatError unless `fits` is true and `tensor` is dense; `numbers` says what it should hold."""
     if not fits or tensor.layout is not torch.strided:
         got = f"{tensor.dtype}, {tensor.layout}".replace("torch.", "")
         raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
 
 
 def check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
-    """Raises FormatError unless the value of each key of `kinds` in `content` is of that kind."""
+    """Raise FormatError unless the value of each key of `kinds` in `content` is of that kind."""
     for key, kind in kinds.items():
         if not isinstance(content.get(key), kind):
             raise FormatError(
@@ -107,7 +108,7 @@ def check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> 
 
 
 def _tensors(content: Any) -> Iterator[torch.Tensor]:
-    """Every tensor in plain values, once, however often it is referred to."""
+    """Yield every tensor in plain values once, however often it is referred to."""
     left, seen = [content], set()
     while left:
         value = left.pop()
@@ -123,12 +124,14 @@ def _tensors(content: Any) -> Iterator[torch.Tensor]:
 
 
 def _is_whole(tensor: torch.Tensor) -> bool:
-    """Whether a tensor has its numbers in memory, each by itself, and not one in many places."""
+    """Return whether a tensor's storage has all of its numbers. If not, it shows one number in many
+    places."""
     return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
 def _globals(pickle: bytes) -> Iterator[str]:
-    """What a pickle names; the name of what is on its stack is not known, and none is ours."""
+    """Yield the names in a pickle. For an operation that takes a name from the stack, where it is not known,
+    yield the operation's own name, which is never allowed."""
     for operation, argument, _ in genops(pickle):
         if operation.name == "GLOBAL":
             yield str(argument)

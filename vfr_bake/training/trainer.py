@@ -1,5 +1,5 @@
 """The training loop: pilot steps with standard volume rendering, then volume feature rendering (sections 3
-and 4)."""
+and 4 of the paper)."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ from vfr_bake.training.rays import Batch, DevicePixelSampler, PixelSampler
 from vfr_bake.training.scores.between import WitnessPsnr, witness_psnr
 
 SOLID = 0.9
-"""Opacity above which the exposure of a picture is looked at."""
+"""A picture's exposure is judged by rays where the field's opacity and the photograph's alpha exceed this."""
 FAINT = 0.01
-"""Samples whose gradient is less than so many root mean squares are not learned from: four in ten, with a
-millionth of the sum of squares, for which as many rows of the table would be brought from memory."""
+"""Samples whose gradient is shorter than this many root mean squares are skipped. They are four in ten and
+have a millionth of the sum of squares, but each would fetch as many table rows from memory as the others."""
 MOST_BAD_STEPS = 20
-"""So many steps without a finite loss in a row mean that training has broken down."""
+"""Number of steps in a row without a finite loss after which training is given up."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did, over all processes."""
+    """Figures of one optimiser step, over all processes."""
 
     step: int
     progress: float
@@ -74,14 +74,14 @@ class StepReport:
     n_rays: int
     n_samples: int
     seconds: float
-    """Since training began, interruptions left out."""
+    """Training time so far, interruptions left out."""
 
 
 class Trainer:
-    """Trains a field on a scene; iterate over `run()` and use `field` and `sampler` at any time.
+    """Trainer of a field on a scene: iterate over `run()`; `field` and `sampler` may be used at any time.
 
-    In several processes every one makes the same Trainer and draws the same joint batch, of which it takes
-    its share.
+    With several processes, each makes the same Trainer, draws the same joint batch, and takes its own share
+    of that batch.
     """
 
     def __init__(
@@ -91,11 +91,11 @@ class Trainer:
         processes: Processes | None = None,
         backend: Backend | None = None,
     ) -> None:
-        """Make a field, its optimisers and what samples it.
+        """Make the field, its optimisers and its sampler.
 
-        `backend`: None for numba on a CPU and torch elsewhere; "torch" to do on a CPU what a GPU does.
+        `backend`: None for numba on a CPU and torch on a GPU; "torch" to run the code of a GPU on a CPU.
 
-        Raises ConfigError: there is no such device, or it cannot be shared by several processes.
+        Raises ConfigError: the device is not available, or several processes cannot share it.
         """
         torch.manual_seed(config.seed)
         self.config = config
@@ -113,25 +113,27 @@ class Trainer:
         self.pilot = Pilot(self._field.config).to(self.device)
         self.n_bad_steps = 0
         self.next_step = 0
-        """Number of the next step, which is how many are done."""
+        """Number of the next step, and so the number of steps done."""
         self.seconds = 0.0
         """Training time so far, interruptions left out."""
         self._generator = torch.Generator(self.device).manual_seed(config.seed)
-        # A picture without alpha is opaque everywhere; against one fixed colour a thin fog would do as well.
+        # A random background forces the field to be opaque where the pictures are (without alpha,
+        # everywhere): against one fixed colour, a thin fog could give the same picture.
         self._random_background = scene.has_alpha or scene.unbounded
         self._views = scene.train
         self._masked = scene.masked
         self._background = None if scene.unbounded and not scene.has_alpha else np.ones(3)
-        # Where no alpha tells background from matter, plain pixels are what shows that space is empty; and
-        # the batches of a GPU have detail enough.
+        # Not without alpha: there, only plain pixels of the background show that space is empty. Not on a
+        # GPU: its batches are so large that they have enough detail anyway.
         self._by_detail = scene.has_alpha and self.device.type == "cpu"
         witnesses = choose_witnesses(scene.train)
         self._keep_apart(witnesses.opaque() if scene.masked else witnesses)
         self.minutes = config.minutes_for(self.device.type, scene.unbounded)
-        """Minutes of training at most."""
+        """Largest number of minutes that the training may take."""
         self.duration = Duration(self.pace.steps, self.minutes)
-        """How long the training takes."""
-        # Steps that are asked for are taken, and a GPU is done with its own in minutes.
+        """Length of the training; it gets shorter when the error at the witnesses is flat."""
+        # Training may end early, by the error at the witnesses, but not if a number of steps was asked for,
+        # and not on a GPU, which takes all of its steps in minutes.
         self._looks = self._backend == "numba" and config.steps is None and len(self.witnesses.pixels) > 0
         self._guide: Guide
         self._grid_adam: TableAdam
@@ -141,7 +143,7 @@ class Trainer:
             self._use_numba(scene)
         self._second = SecondThread()
         self._next: Sampled | None = None
-        """The rays and samples of the next step, if they have been taken."""
+        """Rays and samples of the next step, if they have been drawn already."""
         self._parameters = [*self._field.network_parameters(), *self.pilot.parameters()]
         self._adam = Adam(self._parameters, BETAS, EPSILON)
 
@@ -153,7 +155,7 @@ class Trainer:
             self._guide = OccupancyGuide(self.config, self.pace, self._step_length(), self.processes)
         self._field.head.products = fast_products()
         grid = self._field.grid
-        # Several processes have to add up their gradients before the step.
+        # FusedGridAdam never has the whole gradient, which several processes must add up before the step.
         self._grid_adam = GridAdam(grid.table) if self.processes.size > 1 else FusedGridAdam(grid)
 
     def _use_torch(self, scene: Scene) -> None:
@@ -165,23 +167,24 @@ class Trainer:
         self._grid_adam = DeviceGridAdam(self._field.grid.table)
         if can_compile(self.device):
             density = self._field.density
-            # The exponential behind it is a function of its own, which torch warns about when it compiles.
+            # Logits alone: the exponential after them is a custom autograd function: torch warns at compiling
+            # it.
             density.logits = torch.compile(density.logits, dynamic=True)  # type: ignore[method-assign]
             self._field.head.compile(dynamic=True)
             self.pilot.compile(dynamic=True)
 
     def _keep_apart(self, witnesses: Witnesses) -> None:
-        """Draw every pixel of the training views but `witnesses` from now on."""
+        """From now on, draw from all pixels of the training views except the `witnesses`."""
         sampler = DevicePixelSampler if self._backend == "torch" else PixelSampler
         self.witnesses = witnesses
         """The pixels of the training views that no step learns from."""
         self._pixels = sampler(self._views, self._generator, witnesses, self._masked, self._by_detail)
         self._probe: WitnessErrors | None = None
         self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
-        """Changing exposure, and things that move; its pictures are the views that are learned from."""
+        """Corrections for exposure that changes and things that move, for the views that are learned from."""
 
     def training_pixels(self) -> ViewPixels:
-        """Pixels for a bake to learn from: of those that this training draws and learns from, too."""
+        """Choose pixels for a bake to learn from, among those that this training learns from."""
         learned = self.witnesses.learned()
         found = choose_training_pixels(self._views, self.witnesses, learned)
         if self._masked:
@@ -195,27 +198,27 @@ class Trainer:
         return found if still is None else found.chosen(still.cpu().numpy())
 
     def _step_length(self) -> float:
-        """Length of a picture's march steps, model units."""
+        """Return the length in model units of a march step when pictures are rendered."""
         return 2.0 * self.config.step_cells / TRAINING_STEPS / self._field.config.max_resolution
 
     @property
     def field(self) -> VfrField:
-        """The field on the CPU: the one that is trained, or what a GPU's is now."""
+        """The field on the CPU: the one that is trained, or a copy of a GPU's as it is now."""
         return self._field.copied_to_cpu()
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras of the training views, model frame."""
+        """The cameras of the training views, in the model frame."""
         return self._views.cameras
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings of this training, with what followed from the device filled in; plain values."""
+        """The settings of this training as plain values, with those that follow from the device filled in."""
         return asdict(self.config) | asdict(self.pace) | {"device": self.device.type}
 
     @property
     def sampler(self) -> Sampler:
-        """What says where to look the field up, on the CPU."""
+        """The sampler, on the CPU: it decides where along a ray the field is looked up."""
         return self._guide.sampler
 
     def run(self) -> Iterator[StepReport]:
@@ -250,8 +253,8 @@ class Trainer:
         return self._probe.loss, self._probe.errors(self.field, self.sampler)
 
     def witness_psnr(self) -> WitnessPsnr | None:
-        """PSNR at some of the witnesses by now; None for a scene too small to have any, and where it would
-        count what effects take out of the pictures."""
+        """Return the current PSNR at some of the witnesses. None for a scene too small to have witnesses, and
+        while capture effects are on, because their errors would count."""
         if not len(self.witnesses.pixels) or self._is_unclear:
             return None
         loss, errors = self._measured()
@@ -259,11 +262,13 @@ class Trainer:
 
     @property
     def _is_unclear(self) -> bool:
-        """Whether effects leave errors at the witnesses that training does not work on."""
+        """True while capture effects are on: they leave errors at the witnesses that training cannot
+        reduce."""
         return self.effects.exposure_on or self.effects.moving_on
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
-        """One optimiser step; (loss or NaN if it was skipped, rays, samples) over all processes."""
+        """Take one optimiser step. Return (loss, number of rays, number of samples) over all processes; the
+        loss is NaN if the step was skipped."""
         pilot = self._is_pilot(step)
         batch, samples = self._next or self._sampled(step)
         learned = self.effects.learned(batch.pictures, batch.places)
@@ -280,7 +285,7 @@ class Trainer:
             loss = squares.sum() / (3 * max(n_learned, 1))
             if regulariser is not None:
                 loss = loss + regulariser / max(n_rays, 1)
-            # A batch that met nothing (seen by no process) has nothing to teach.
+            # A batch without a sample in any process has nothing to teach.
             self._adam.clear()
             if n_samples == 0 or not self._backward(loss, value, samples, weights, n_rays, pilot):
                 return value if n_samples == 0 else float("nan"), n_rays, n_samples
@@ -295,11 +300,12 @@ class Trainer:
             return value, n_rays, n_samples
 
     def _is_pilot(self, step: int) -> bool:
-        """Whether the pilot gives the colours; where they are composited anyway the head needs none."""
+        """Return whether the pilot network gives the colours of this step. Where colours are composited
+        instead of features, the head needs no pilot."""
         return step < self.config.pilot_steps and self._field.config.compositing == "features"
 
     def _sampled(self, step: int) -> Sampled:
-        """A new batch for a step, with its samples in the field as it is."""
+        """Draw a batch for a step, and sample it in the field as it is now."""
         self._guide.prepare(step, self._field)
         pilot = self._is_pilot(step)
         batch = self._draw(self._guide.n_rays(pilot))
@@ -310,8 +316,9 @@ class Trainer:
 
     @contextmanager
     def _sampling_next(self, step: int, pilot: bool) -> Iterator[None]:
-        """Within it the samples of the next step are taken, on a second thread where there is one, in the
-        field as it is at the beginning; before it changes wait for the second thread."""
+        """While this context lasts, draw and sample the next step, on a second thread where there is one, and
+        in the field as it is at the beginning. Whoever changes the field waits for that thread first. Nothing
+        is sampled ahead of a step for which `_skips` is false."""
         self._next = None
         if not self._skips(pilot):
             yield
@@ -319,13 +326,13 @@ class Trainer:
             with self._second.meanwhile(lambda: self._sampled(step + 1)) as result:
                 yield
             self._next = result.result()
-        else:  # several processes, too, meet in a fixed order
+        else:  # several processes, too: they must communicate in a fixed order
             following = self._sampled(step + 1)
             yield
             self._next = following
 
     def _draw(self, n_rays: int) -> Batch:
-        """This process' share of a joint batch, drawn alike in all of them."""
+        """Draw a joint batch, the same in all processes, and return this process' share of it."""
         rays = self._pixels.draw(n_rays)
         jitter = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         if self._random_background:
@@ -339,9 +346,9 @@ class Trainer:
     def _error(
         self, batch: Batch, samples: RaySamples, learned: Tensor | None, pilot: bool
     ) -> tuple[Tensor, Tensor, Seen | None]:
-        """(Squared error [n_served], summed over the channels, of the rays that were served, 0 for those that
-        are not `learned` from, a bool for each ray or all; weights [n_samples]; what was seen, if that is
-        looked at)."""
+        """Return (squared errors [n_served] of the served rays, summed over the channels; weights
+        [n_samples]; what was seen, or None where effects need it no longer). `learned` [n_rays] bool says
+        which rays are learned from, None all of them: the errors of the others are 0."""
         rgba, background = batch.rgba[samples.rays], batch.background[samples.rays]
         pictures = batch.pictures[samples.rays]
         target = rgba[:, :3] * rgba[:, 3:] + background * (1 - rgba[:, 3:])
@@ -363,7 +370,7 @@ class Trainer:
     def _seen(
         self, batch: Batch, samples: RaySamples, hit: Tensor, colours: Tensor, opacity: Tensor, errors: Tensor
     ) -> Seen:
-        """What the served rays showed, for `CaptureEffects`."""
+        """Collect what the served rays showed, for `CaptureEffects`."""
         rays = samples.rays
         seen_opacity = torch.zeros(len(rays), device=self.device)
         seen_opacity[hit] = opacity.detach()
@@ -378,7 +385,7 @@ class Trainer:
     def _colours(
         self, samples: RaySamples, starts: Tensor, counts: Tensor, dirs: Tensor, pilot: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(Colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of the rays that hit."""
+        """Return (colour times opacity [n_hit, 3], opacity [n_hit], weights [n_samples]) of rays that hit."""
         features = self._field.grid(samples.points, samples.features)
         if self._field.config.unbounded and self.config.near_gradients > 0:
             features = scale_near_gradients(features, samples.t_mid, self.config.near_gradients)
@@ -390,7 +397,7 @@ class Trainer:
         sigmas = self._field.density(features)
         if pilot or self._field.config.compositing == "colour":
             network = self.pilot if pilot else self._field.head
-            # Rays of several chunks: the samples' order is that of the starts.
+            # The samples are in the order of their rays' `starts`; with several chunks rays are not.
             order = torch.argsort(starts)
             values = network(features, dirs[order.repeat_interleave(counts[order])])
             return self._composite(sigmas, values, samples.deltas, starts, counts)
@@ -398,13 +405,14 @@ class Trainer:
         return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
 
     def _skips(self, pilot: bool) -> bool:
-        """Whether a step goes through functions that take no time for rays and samples without a gradient."""
+        """Return whether a step uses the kernels that skip rays and samples without a gradient."""
         return self._backend == "numba" and not pilot and self._field.config.compositing == "features"
 
     def _backward(
         self, loss: Tensor, value: float, samples: RaySamples, weights: Tensor, n_rays: int, pilot: bool
     ) -> bool:
-        """Gradients of all that learns, summed over the processes; False, and none, if any is not finite."""
+        """Compute the gradients of all that learns, summed over the processes. Return False, and drop those
+        of the tables, if the loss or a network's gradient is not finite."""
         tables = [self._grid_adam, *self._guide.tables(samples)]
         if value == value and abs(value) != float("inf"):
             if loss.requires_grad:
@@ -422,8 +430,8 @@ class Trainer:
         return False
 
     def _gradients(self, pilot: bool) -> list[Tensor]:
-        """Gradients of the networks that learn in this step, zero where this process' rays met nothing; other
-        networks have none, which Adam leaves alone."""
+        """Return the gradients of the networks that learn in this step, zero if this process' rays met
+        nothing. Other networks have no gradient, so that Adam leaves them alone."""
         network = self.pilot if pilot else self._field.head
         learning = [*self._field.density.parameters(), *network.parameters()]
         for parameter in learning:
@@ -432,7 +440,7 @@ class Trainer:
         return [parameter.grad for parameter in learning if parameter.grad is not None]
 
     def state(self) -> dict[str, Any]:
-        """All that the steps to come depend on, in CPU tensors and plain values."""
+        """Return all that later steps depend on, as CPU tensors and plain values."""
         state = {
             "step": self.next_step,
             "seconds": self.seconds,
@@ -452,7 +460,7 @@ class Trainer:
         return state if self.device.type == "cpu" else _on_cpu(state)
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave, as if nothing had happened in between."""
+        """Continue from what `state` returned, as if there had been no interruption."""
         self.next_step, self.seconds = state["step"], state["seconds"]
         self.n_bad_steps = state["n_bad_steps"]
         self._generator.set_state(state["generator"])
@@ -469,7 +477,7 @@ class Trainer:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of a `TrainConfig.device`. Raises ConfigError: CUDA is asked for and not there.
+    """Return the device for a `TrainConfig.device`. Raises ConfigError: CUDA is asked for and not available.
 
     >>> choose_device("cpu")
     device(type='cpu')
@@ -481,7 +489,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def _on_cpu(state: Any) -> Any:
-    """Copy plain values with every tensor in them on the CPU."""
+    """Copy plain values, with every tensor in them moved to the CPU."""
     if isinstance(state, Tensor):
         return state.cpu()
     if isinstance(state, dict):

@@ -1,1 +1,1 @@
-"""How much detail of what is stored the pictures need."""
+"""Reduce the stored detail to what the pictures need."""

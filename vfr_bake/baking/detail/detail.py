@@ -1,8 +1,9 @@
-"""What of a finished grid is stored: no more detail than its pictures need.
+"""Reduce a refined grid to the detail that its pictures need.
 
-After refinement, cells are left out that hardly anything sees (`vfr_bake.baking.detail.seen`). Then the
-places are found, first of the densities, then of the features, that a coarser level shows as well
-(`vfr_bake.baking.detail.shown`). How far each goes, the photographs' pixels decide that nothing learned from.
+After refinement, cells that hardly any ray sees are left out (`vfr_bake.baking.detail.seen`). Then, places
+where a coarser level will do are shown by that level, first for the densities, then for the features
+(`vfr_bake.baking.detail.shown`). How far each of these steps goes is decided by the loss on held-out pixels
+of photographs.
 """
 
 from __future__ import annotations
@@ -40,48 +41,47 @@ from vfr_bake.baking.held_out import Head, HeldOut, Shown, Stage
 from vfr_bake.training.length.witness_loss import Loss
 
 N_SEEING = 4_000_000
-"""Rays whose weights tell which cells are seen, roughly, where the views have as many pixels."""
+"""Rough number of rays whose weights decide which cells are seen, if the views have as many pixels."""
 N_COMPARED = 100_000
-"""Rays that tell what a coarser level shows differently."""
+"""Rays on which coarser levels are compared with the finest one."""
 LEAST_SHARE, MOST_SHARE = 1e-6, 0.05
-"""Shares of all weight between which the one is looked for that is given up with cells that are hardly
-seen."""
+"""Range of the share of all sample weight that is given up with cells that are hardly seen."""
 SEEN_LOSS, DENSITY_LOSS, STEP_LOSS, FEATURE_LOSS = 0.25, 0.25, 0.5, 0.5
-"""Shares of the loss that is allowed which may be made by cells that are left out, by coarser densities, by
-longer steps in them, and by coarser features."""
+"""Shares of the allowed loss that may be caused by cells that are left out, by coarser densities, by longer
+steps in them, and by coarser features."""
 LONGEST_STEPS = (4, 2)
-"""Base steps that a sample in coarser densities may stand for, the first that loses little enough. On level l
-they are 2^l at most, as many as its cells are wide."""
+"""Most base steps that a sample in coarser densities stands for; the first value that loses little enough is
+used. On level l the limit is also 2^l steps, as its cells are 2^l times as wide."""
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Which levels show a pyramid, and the values of all of them."""
+    """A pyramid of features, the bricks that are dropped from it, and the values of all its levels."""
 
     choice: Choice
     dropped: list[np.ndarray]
-    """The bricks of each level that are dropped, as in `Choice.dropped`."""
+    """The dropped bricks of each level, as returned by `Choice.dropped`."""
     values: list[np.ndarray]
-    """For each level [n_vertices, n_channels] int16 latent features, the finest first."""
+    """For each level, [n_vertices, n_channels] int16 latent features, the finest first."""
 
 
 @dataclass(eq=False)
 class Needed:
-    """What is to be stored of refined values."""
+    """The refined values that are to be stored."""
 
     layout: Layout
-    """The finest level, of which some bricks are not shown."""
+    """The layout of the whole finest level, some bricks of which are not shown."""
     density: np.ndarray
-    """[n_densities] float32 codes of all vertices of the finest level."""
+    """[n_densities] float32 density codes of all vertices of the finest level."""
     features: np.ndarray
-    """[n_features, n_channels] int16 latent features, the same."""
+    """[n_features, n_channels] int16 latent features of all vertices of the finest level."""
     wanted_densities: Wanted
-    """What of the densities is shown, and what it should be."""
+    """The densities' cells that are shown, and their wanted values."""
     levels_of_features: Levels
 
     def take_features(self) -> Wanted:
-        """The same of the features. It takes the place of `features` and of `levels_of_features`, because
-        there may be no room for them all."""
+        """Return the features' cells that are shown, and their wanted values. This empties `features` and
+        `levels_of_features`, because there may be no memory for all of them."""
         levels = self.levels_of_features
         shown = levels.choice.shown(levels.dropped)
         wanted = wanted_values(levels.choice, levels.values, shown, sampled=False)
@@ -92,17 +92,17 @@ class Needed:
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """The pictures that decide, and what they are made with."""
+    """The choice of the detail to store, with the settings for the pictures by which it is made."""
 
     held_out: HeldOut
     head: Head
     n_fetches: int
-    """Feature fetches of a ray, 0 for all."""
+    """Feature lookups of a ray, 0 for every sample."""
     most_db: float
-    """Loss in dB that is allowed."""
+    """Allowed loss in dB."""
     progress: Progress
     left_out: dict[str, str] = field(default_factory=dict)
-    """What is not stored, and what that changed; set by `needed`."""
+    """Descriptions, by topic, of what is not stored and what that changed; filled by `needed`."""
 
     def needed(
         self,
@@ -112,13 +112,14 @@ class Detail:
         cameras: list[Camera],
         teacher: TeacherRays,
     ) -> Needed:
-        """What is to be stored.
+        """Choose the values to store.
 
         Args:
-            layout: the finest level.
-            density: [n_densities] codes that need not be whole.
+            layout: the layout of the finest level.
+            density: [n_densities] density codes, which need not be whole.
             features: [n_features, n_channels] int16 latent features, changed in place.
-            cameras: views, model frame, that tell what is seen; without any, every cell is stored.
+            cameras: views in the model frame that decide which cells are seen; if there are none, every cell
+                is stored.
             teacher: rays of such views.
         """
         if cameras:
@@ -126,15 +127,18 @@ class Detail:
         grid = layout.grid(density, features)
         rays = teacher.some(N_COMPARED)
         densities, grid = self._densities(layout, density, grid, rays)
-        # The grid has the features' codes, which are found again, with those of the coarser levels.
+        # Free the grid's feature codes: they are computed again, together with those of the coarser levels.
         grid = replace(grid, features=grid.features[:0].copy())
         return Needed(layout, density, features, densities, self._features(layout, features, grid, rays))
 
     def level_steps(self, grid: SparseGrid, max_loss_db: float | None) -> tuple[int, ...]:
-        """For each level of the densities of `grid`, which is that of what is stored, for how many base steps
-        a sample in it stands: the longest steps that lose little enough, and with which the asset loses no
-        more than `max_loss_db`, if that was asked for. Coarser bricks lie also where nothing is shown, and a
-        long step from there may end in finer ones."""
+        """Choose the base steps that a sample stands for in each level of the densities of `grid`, which is
+        the grid of the stored values.
+
+        They are the longest steps that lose little enough, and with which the asset loses at most
+        `max_loss_db`, if that was given. Long steps can lose something, because coarser bricks also lie in
+        empty space, and a long step from there may end in finer bricks.
+        """
         before = self._look(replace(grid, level_steps=np.ones(grid.n_levels, np.int32)))
         for longest in LONGEST_STEPS:
             steps = np.minimum(1 << np.arange(grid.n_levels), longest).astype(np.int32)
@@ -153,8 +157,8 @@ class Detail:
     def _without_unseen(
         self, layout: Layout, density: np.ndarray, features: np.ndarray, cameras: list[Camera]
     ) -> tuple[Layout, np.ndarray, np.ndarray]:
-        """Layout, densities and features without cells in which the samples of all views together weigh next
-        to nothing."""
+        """Return layout, densities and features without the cells in which the samples of all views together
+        weigh next to nothing."""
         grid = layout.grid(density, features)
         weights = block_weights(grid, cameras, N_SEEING, self.progress)
         before = self._look(grid)
@@ -180,8 +184,8 @@ class Detail:
     def _densities(
         self, layout: Layout, density: np.ndarray, grid: SparseGrid, rays: TeacherRays
     ) -> tuple[Wanted, SparseGrid]:
-        """What is wanted of the densities, and the grid that shows about that. Coarser levels have the means
-        of what is dense, not of its logarithm."""
+        """Choose the densities' cells to show. Returns them with their wanted values, and a grid that shows
+        nearly those values. Values of coarser levels are means of densities, not of their logarithms."""
         pyramid = layout.pyramids.densities
         low, high = layout.density_range
         slope = (high - low) / 255
@@ -196,7 +200,8 @@ class Detail:
         return shown, levels.at(choice.levels(dropped))
 
     def _features(self, layout: Layout, features: np.ndarray, grid: SparseGrid, rays: TeacherRays) -> Levels:
-        """Which levels show the features; a vertex counts in the means as much as it is seen."""
+        """Choose the levels that show the features. The values of coarser levels are means, in which each
+        vertex counts by the weight with which rays see it."""
         pyramid = layout.pyramids.features
         n_levels = min(len(pyramid.levels), COARSEST_SHOWN + 1)
         ends = np.cumsum([vertices.n for vertices in pyramid.vertices[:n_levels]])
@@ -214,7 +219,7 @@ class Detail:
     def _shown(
         self, choice: Choice, levels: LevelsOfDensities | LevelsOfFeatures, share: float, name: str
     ) -> list[np.ndarray]:
-        """Which bricks of each level are dropped, for `share` of the loss that is allowed."""
+        """Choose the bricks of each level to drop, for a loss of up to `share` of the allowed loss."""
         if len(choice.errors) == 1:
             return []
         before = self._look(levels.at(0))

@@ -1,15 +1,15 @@
-"""What rays see differently where a coarser level shows a brick.
+"""Measure the error that rays see if a coarser level shows a brick.
 
-Letters: a ray meets samples j at x_j with weights w_j; those in one brick b of the finest level are a segment
-of the ray. Level l says F_l at a place, the finest F_0.
+Letters: a ray meets samples j at x_j with weights w_j. Its samples in one brick b of the finest level form a
+segment of the ray. F_l(x) is the value of level l at the place x; F_0 is that of the finest level.
 
-Features: sum_{j in b} w_j (F_l(x_j) - F_0(x_j)) is the change of what the ray composites, and the error is
-its square, summed over channels and rays. Stored channels are scaled so that an error in any of them weighs
+Features: the ray's composite changes by sum_{j in b} w_j (F_l(x_j) - F_0(x_j)). The error is the square of
+this change, summed over channels and rays. Stored channels are scaled so that an error in any of them counts
 alike in the colours (`vfr_bake.baking.grids`).
 
-Densities: the segment has the optical depth d_0 with the finest level, d_l with the coarser one, and the
-light that reaches it is T. The error is the square of T (exp(-d_l) - exp(-d_0)), by which the ray's colour
-moves from what the segment shows towards what is behind it, summed over the rays.
+Densities: the segment has the optical depth d_0 with the finest level and d_l with the coarser one; T is the
+transmittance in front of it. The ray's colour moves by the share T (exp(-d_l) - exp(-d_0)) from what the
+segment shows towards what is behind it. The error is the square of this share, summed over the rays.
 """
 
 from __future__ import annotations
@@ -30,34 +30,38 @@ from vfr_bake.kernels.sample_weights import add_corner_weights
 from vfr_bake.kernels.stored_features import compose
 
 RAYS_AT_ONCE = 1 << 12
-"""Few, because a ray through fog has hundreds of samples, of 100 to 200 bytes each meanwhile."""
+"""Kept small: a ray through fog has hundreds of samples, and each takes 100 to 200 bytes while they are
+processed."""
 
 _NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 
 
 def alone(pyramid: Pyramid, level: int) -> Pyramid:
-    """The pyramid with one of its levels alone."""
+    """Return the pyramid with all levels but one removed; finer levels stay as empty ones."""
     return Pyramid(pyramid.resolution, (*(_NONE,) * level, pyramid.levels[level]))
 
 
 def finest_numbers(pyramid: Pyramid, n_per_axis: int) -> np.ndarray:
-    """[n_bricks] int64: where the bricks of the finest level are in an array over all bricks."""
+    """Return [n_bricks] int64: the index of each brick of the finest level in a flat array with an entry for
+    every brick of the box."""
     return brick_number(pyramid.levels[0].coords.astype(np.int64).T << 3, n_per_axis)
 
 
 @dataclass(frozen=True, eq=False)
 class LevelsOfFeatures:
-    """Features of which each brick of the finest level may be shown by any of some levels."""
+    """The features of several levels, any of which may show each brick of the finest level."""
 
     grid: SparseGrid
-    """As the player has it, with the features of all these levels."""
+    """The grid as the player has it, with the features of all these levels."""
     entries: np.ndarray
-    """[n_levels, n_bricks] int32: what the table of rows has for each brick of the finest level."""
+    """[n_levels, n_bricks] int32: the entry in the table of rows for each brick of the finest level, if it is
+    shown by that level."""
     numbers: np.ndarray
-    """[n_bricks]: where in the table they are."""
+    """[n_bricks]: the indices of these bricks in the table of rows."""
 
     def at(self, levels: np.ndarray | int) -> SparseGrid:
-        """The grid with each brick of the finest level shown by one of `levels`."""
+        """Return the grid with each brick of the finest level shown by the level in `levels` [n_bricks], or
+        all of them by the same level."""
         rows, bricks = self.grid.rows, self.grid.rows.bricks.copy()
         bricks[self.numbers] = self.entries[levels, np.arange(len(self.numbers))]
         return replace(self.grid, rows=replace(rows, bricks=bricks))
@@ -66,8 +70,8 @@ class LevelsOfFeatures:
 def levels_of_features(
     grid: SparseGrid, pyramid: Pyramid, codes: np.ndarray, n_levels: int
 ) -> LevelsOfFeatures:
-    """The features of the `n_levels` finest levels of a pyramid: `codes` int8 [n_vertices, n_channels], one
-    level's after the other's."""
+    """Make the features of the `n_levels` finest levels of a pyramid, of which any may show each brick.
+    `codes` int8 [n_vertices, n_channels] are those of all levels, one after the other, the finest first."""
     found = [vertex_rows(alone(pyramid, level)) for level in range(n_levels)]
     numbers = finest_numbers(pyramid, found[0].n_per_axis)
     entries, rows = [], []
@@ -86,17 +90,19 @@ def levels_of_features(
 
 @dataclass(frozen=True, eq=False)
 class LevelsOfDensities:
-    """Densities of which each brick of the finest level may be shown by any of some levels."""
+    """The densities of several levels, any of which may show each brick of the finest level."""
 
     grid: SparseGrid
-    """As the player has it, with the densities of all these levels."""
+    """The grid as the player has it, with the densities of all these levels."""
     entries: np.ndarray
-    """[n_levels, n_bricks] int32: what the table has for each brick of the finest level."""
+    """[n_levels, n_bricks] int32: the entry in the grid's table for each brick of the finest level, if it is
+    shown by that level."""
     numbers: np.ndarray
-    """[n_bricks]: where in the table they are."""
+    """[n_bricks]: the indices of these bricks in the table."""
 
     def at(self, levels: np.ndarray | int) -> SparseGrid:
-        """The grid with each brick of the finest level shown by one of `levels`."""
+        """Return the grid with each brick of the finest level shown by the level in `levels` [n_bricks], or
+        all of them by the same level."""
         table = self.grid.table.copy()
         table[self.numbers] = self.entries[levels, np.arange(len(self.numbers))]
         return replace(self.grid, table=table)
@@ -105,8 +111,11 @@ class LevelsOfDensities:
 def levels_of_densities(
     grid: SparseGrid, pyramid: Pyramid, values: Sequence[np.ndarray]
 ) -> LevelsOfDensities:
-    """The densities `values` of the finest levels of a pyramid, uint8 [n_vertices, 1] each; the grid is that
-    of the finest alone."""
+    """Make the densities of the finest levels of a pyramid, of which any may show each brick.
+
+    `values` are the codes of each of these levels, uint8 [n_vertices, 1]; `grid` is the grid of the finest
+    level alone.
+    """
     numbers = finest_numbers(pyramid, grid.n_per_axis)
     nothing = PyramidValues(Pyramid(1, (_NONE,)), (np.zeros((0, 1), np.int8),))
     box = np.stack([grid.aabb_min, grid.aabb_min + grid.resolution / grid.cells_per_unit])
@@ -130,20 +139,20 @@ def levels_of_densities(
 
 
 class Segments(NamedTuple):
-    """Samples of rays, one ray's after the other's, in segments that lie in one brick each."""
+    """Samples of rays, ray by ray. Consecutive samples of a ray in the same brick form a segment."""
 
     points: np.ndarray
-    """[n_samples, 3] float32, cells of the densities' grid."""
+    """[n_samples, 3] float32 places, in cells of the densities' grid."""
     weights: np.ndarray
-    """[n_samples] float32."""
+    """[n_samples] float32 compositing weights."""
     left: np.ndarray
-    """[n_samples] float64: the light that reaches each, T."""
+    """[n_samples] float64: the transmittance T in front of each sample."""
     ray: np.ndarray
-    """[n_samples] int64."""
+    """[n_samples] int64: the ray of each sample."""
 
 
 def samples_of(grid: SparseGrid, rays: TeacherRays) -> Iterator[Segments]:
-    """The samples with weight of the rays, some rays at a time."""
+    """Yield the samples with weight of the rays, in batches of rays."""
     for first in range(0, len(rays.opacity), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
         sampled = sample_rays(grid, rays.rays_o[some], rays.rays_d[some], get_num_threads())
@@ -157,8 +166,8 @@ def samples_of(grid: SparseGrid, rays: TeacherRays) -> Iterator[Segments]:
 
 
 def heavy_vertices(levels: LevelsOfFeatures, n: int, rays: TeacherRays) -> np.ndarray:
-    """[n] float32 above 0: the summed weights of the samples around each vertex of the finest level, and a
-    little for those that nothing sees."""
+    """Return [n] float32 above 0: for each vertex of the finest level, the summed weights of the samples
+    around it, plus a little, so that vertices that no ray sees are not 0."""
     grid, totals = levels.at(0), np.zeros(n, np.float32)
     for samples in samples_of(grid, rays):
         rows, shares = corners(grid.rows, samples.points * grid.feature_scale, MIN_TOTAL)
@@ -167,8 +176,8 @@ def heavy_vertices(levels: LevelsOfFeatures, n: int, rays: TeacherRays) -> np.nd
 
 
 def feature_errors(levels: LevelsOfFeatures, rays: TeacherRays) -> np.ndarray:
-    """[n_levels, n_bricks] float64: the errors of each level in each brick of the finest, those of the finest
-    0."""
+    """Return [n_levels, n_bricks] float64: the error by showing each level in each brick of the finest level;
+    0 for the finest level itself."""
     n_levels, n_bricks = levels.entries.shape
     grids = [levels.at(level) for level in range(n_levels)]
     rows, size = grids[0].rows, np.float32(grids[0].rows.resolution)
@@ -198,7 +207,8 @@ def feature_errors(levels: LevelsOfFeatures, rays: TeacherRays) -> np.ndarray:
 
 
 def density_errors(levels: LevelsOfDensities, rays: TeacherRays) -> np.ndarray:
-    """As `feature_errors`, of densities."""
+    """Return [n_levels, n_bricks] float64: the errors of the densities, as `feature_errors` those of the
+    features."""
     n_levels, n_bricks = levels.entries.shape
     which = np.full(len(levels.grid.table), -1)
     which[levels.numbers] = np.arange(n_bricks)
@@ -213,7 +223,7 @@ def density_errors(levels: LevelsOfDensities, rays: TeacherRays) -> np.ndarray:
             depths = -np.log1p(-np.minimum(samples.weights / np.maximum(samples.left, 1e-9), 1 - 1e-9))
             known = bricks >= 0
             keys = samples.ray[known] * n_bricks + bricks[known]
-            # A ray's samples in a brick follow each other: they are added up before anything is sorted.
+            # A ray's samples in a brick are consecutive: add up their depths before anything is sorted.
             begins = np.flatnonzero(np.diff(keys, prepend=-1))
             depths = np.add.reduceat(depths[known], begins) if len(begins) else depths[:0]
             parts.append((keys[begins], depths, samples.left[known][begins]))

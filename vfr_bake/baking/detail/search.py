@@ -1,4 +1,4 @@
-"""How much can be given up for a loss that is allowed."""
+"""Search for the largest amount of detail that can be given up within an allowed loss."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import NamedTuple
 from vfr_bake.training.length.witness_loss import Loss
 
 N_TRIES = 6
-"""Halvings of the range in which an amount is looked for."""
+"""Halvings of the range in which the amount is searched."""
 
 
 class Amount(NamedTuple):
-    """How much is given up."""
+    """An amount that is given up, and its loss."""
 
     amount: float
     loss: Loss
-    """What is lost by it."""
+    """Loss by giving up `amount`."""
 
 
 def largest(lost: Callable[[float], Loss], low: float, high: float, most_db: float) -> Amount | None:
-    """The largest amount between `low` and `high` that loses no more than `most_db`, with two standard
-    errors to spare, to a 64th of the range; None where even `low` loses more.
+    """Search for the largest amount between `low` and `high` that loses at most `most_db` dB, with two
+    standard errors to spare, to a 64th of the range. Returns None if even `low` loses more.
 
-    `lost` tells what an amount loses. It is asked for some of them, and is taken to rise.
+    `lost` returns the loss of an amount. It is called for a few amounts, and taken to rise with the amount.
 
     >>> largest(lambda amount: Loss(amount**2, 0.0), 0, 1, 0.25).amount
     0.5

@@ -1,13 +1,13 @@
-"""Cells that hardly anything sees, which are left out of what is stored.
+"""Leave out cells that hardly any ray sees.
 
-Whether one sample weighs enough in one view, by which cells are first chosen, says little: what nobody has
-seen holds what training left there, and a single ray of thousands may touch it. Here the weights of all
-samples are summed over the rays of many views, in blocks of 2 x 2 x 2 cells. Blocks are left out that weigh
-least, as many as the pictures lose next to nothing without, by the photographs' pixels that nothing learned
-from.
+At first, a cell is stored if one sample in it weighs enough in one view (`vfr_bake.baking.cells`). That says
+little: unseen space holds whatever training left there, and a single ray of thousands may touch it. Here, the
+weights of all samples are summed over the rays of many views, in blocks of 2 x 2 x 2 cells. The blocks that
+weigh least are left out, as many as can be without losing more than next to nothing on held-out pixels of
+photographs.
 
-With the sums W_b of all blocks b, sorted, a share q of the weight is given up if the blocks left out are
-those of lowest W_b with sum_b W_b <= q sum W.
+Let W_b be the sum in block b. To give up a share q of the weight, leave out the blocks of lowest W_b, as many
+as have sum_b W_b <= q sum W.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ BRICKS_AT_ONCE = 1 << 12
 
 
 def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress: Progress) -> np.ndarray:
-    """[n_bricks, 4, 4, 4] float64: for each block of cells of the bricks of a grid of one level, the weights
-    of the samples of about `n_rays` rays, summed.
+    """Return [n_bricks, 4, 4, 4] float64: for each block of 2 x 2 x 2 cells in the bricks of a grid of one
+    level, the summed weights of the samples of about `n_rays` rays.
 
     Args:
-        grid: as the player has it.
-        cameras: views, model frame; rays are spread evenly over all their pixels.
-        n_rays: how many rays; no pixel has more than one.
-        progress: called with the number of cameras.
+        grid: the grid as the player has it.
+        cameras: views in the model frame; the rays are spread evenly over all their pixels.
+        n_rays: rough number of rays; no pixel has more than one.
+        progress: called with (cameras done, cameras in all).
     """
     totals = np.zeros(len(grid.slot_coords) * BLOCKS**3)
     share = min(np.sqrt(n_rays / sum(camera.width * camera.height for camera in cameras)), 1.0)
@@ -58,8 +58,8 @@ def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress
 
 
 def heavy_blocks(weights: np.ndarray, share: float) -> np.ndarray:
-    """Which blocks are kept if those that weigh least, `share` of all weight together, are left out: bool of
-    the shape of `weights`. What weighs nothing is always left out.
+    """Return the blocks that are kept, as bool of the shape of `weights`, if those that weigh least are left
+    out, up to `share` of the whole weight. Blocks without weight are always left out.
 
     >>> heavy_blocks(np.array([0.0, 6.0, 1.0, 3.0]), 0.15).tolist()
     [False, True, False, True]
@@ -72,7 +72,7 @@ def heavy_blocks(weights: np.ndarray, share: float) -> np.ndarray:
 
 
 def live_of_blocks(blocks: np.ndarray) -> np.ndarray:
-    """[n_bricks, 8] uint64 masks of the cells in the blocks [n_bricks, 4, 4, 4] bool.
+    """Return masks [n_bricks, 8] uint64 of the cells in the marked `blocks` [n_bricks, 4, 4, 4] bool.
 
     >>> masks = live_of_blocks(np.arange(64).reshape(1, 4, 4, 4) == 1)
     >>> np.flatnonzero(stored_bits(masks)).tolist()
@@ -84,23 +84,25 @@ def live_of_blocks(blocks: np.ndarray) -> np.ndarray:
 
 
 class Kept(NamedTuple):
-    """Part of the vertices of a grid."""
+    """The kept vertices of a grid."""
 
     vertices: Vertices
     rows: np.ndarray
-    """[n] int32, ascending: which of all vertices they are."""
+    """[n] int32, ascending: the rows of these vertices among all vertices of the grid."""
 
 
 def corners_within(vertices: Vertices, cells: Bricks) -> Kept:
-    """The corners of `cells`, which are some of the cells of which `vertices` are the corners."""
+    """Return the corners of `cells`, which are a part of the cells that have `vertices` as corners."""
     corners = corners_of(cells)
     rows = vertices.pyramid.vertices[0].rows_of(corners)
     return Kept(Vertices(corners.coords, corners.masks, vertices.index[rows], vertices.resolution), rows)
 
 
 def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) -> Bricks:
-    """The cells of `others`, of a grid of `of_others` cells along each axis, that overlap one of `cells`, of
-    a grid of `resolution` over the same box, which is as fine or finer.
+    """Return those cells of `others` that overlap one of `cells`.
+
+    Both cover the same box: `others` with `of_others` cells along each axis, `cells` with `resolution`, which
+    is as many or more.
 
     >>> cells = Bricks(np.zeros((1, 3), np.uint16), np.array([[1 << 2, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
     >>> every = Bricks(np.zeros((1, 3), np.uint16), np.full((1, 8), ~np.uint64(0)))
@@ -126,18 +128,18 @@ def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) 
 
 
 class Thinned(NamedTuple):
-    """What is left of a layout, and which of its rows."""
+    """The remaining part of a layout, and the rows that it keeps."""
 
     layout: Layout
     densities: np.ndarray
     """[n_densities] int32, ascending: rows of the densities that are kept."""
     features: np.ndarray
-    """[n_features] int32, ascending: the same of the features."""
+    """[n_features] int32, ascending: rows of the features that are kept."""
 
 
 def thinned(layout: Layout, blocks: np.ndarray) -> Thinned:
-    """A layout without the densities outside the kept `blocks` [n_bricks, 4, 4, 4] bool, and without the
-    features where no density is left."""
+    """Return the layout without the densities outside the kept `blocks` [n_bricks, 4, 4, 4] bool, and without
+    the features where no density is left."""
     (cells,) = layout.densities.pyramid.levels
     cells = Bricks(cells.coords, cells.masks & live_of_blocks(blocks)).without_empty()
     densities = corners_within(layout.densities, cells)

@@ -1,18 +1,18 @@
-"""Which level of a pyramid shows a place: a coarser one where it says the same.
+"""Choose the level of a pyramid that shows each place: a coarser one where it looks nearly the same.
 
-A bake begins with all that is stored on the finest level. A brick of it is dropped where the next coarser
-level serves as well, so that this one is shown there; and so is a brick of that level, if all finer ones
-in it are dropped, up to COARSEST_SHOWN. What counts is what the rays of many views see. With E_l(b) for the
-error that showing level l in place of the finest makes in the brick b, and n(b) for its vertices, a brick b
-of level l is dropped if
+A bake begins with all values stored on the finest level. A brick of this level is dropped where the next
+coarser level will do, which is then shown there. A brick of that level is dropped in turn, if all finer
+bricks in it are dropped, up to COARSEST_SHOWN. Errors are those that the rays of many views see
+(`vfr_bake.baking.detail.errors`). Let E_l(b) be the error of showing level l in place of the finest one in a
+finest brick b, and n(b) the number of vertices of a brick. A brick b of level l is dropped if
 
     sum over the finest bricks in b of (E_{l+1} - E_l)  <=  worth n(b),
 
-so that every vertex that stays is worth that much of the error. How much that is the pictures decide.
+so that each vertex that stays saves an error of at least `worth`. `worth` is chosen by the loss of pictures.
 
-A level says what the next finer one says around: the mean of 3 x 3 x 3 vertices with the weights 1, 2, 1
-along each axis, times how much each matters. Vertices opposite each other count alike, as the one that
-matters less, so that a ramp stays the ramp that it is, also at the rim of what is stored.
+The value of a coarser vertex is the weighted mean of the 3 x 3 x 3 finer vertices around it: the weights are
+1, 2, 1 along each axis, times the given weight of each vertex. Vertices opposite each other both get the
+lower given weight of the two, so that a linear ramp is preserved, even at the rim of the stored vertices.
 """
 
 from __future__ import annotations
@@ -29,25 +29,26 @@ from player.asset.bricks import stored_bits
 from player.asset.pyramid import Bricks, Pyramid, Vertices, whole_pyramid
 
 COARSEST_SHOWN = 3
-"""The coarsest level that may show a place: one of its cells is a brick of the finest level, so that live
-cells never reach into places where the finest level has no brick."""
+"""The coarsest level that may show a place. One of its cells is as large as a brick of the finest level, so
+that live cells never reach into places where the finest level has no brick."""
 ROWS_AT_ONCE = 1 << 18
 
 AROUND = np.array(list(np.ndindex(3, 3, 3)), np.int32) - 1
 """Offsets to a vertex and its neighbours."""
 HALF = AROUND[13:]
-"""The middle, and one of each two that are opposite each other."""
+"""The middle offset, and one offset of each opposite pair."""
 
 _NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 
 
 def mean_values(pyramid: Pyramid, finest: np.ndarray, heavy: np.ndarray) -> list[np.ndarray]:
-    """The values of all levels, [n_vertices, n_channels] each, the finest first and the others as float32.
+    """Compute the values of all levels, [n_vertices, n_channels] each: the finest first, the others as
+    float32 means of finer values.
 
     Args:
-        pyramid: of a finest level and what lies beneath.
+        pyramid: a pyramid with the finest level and coarser levels beneath it.
         finest: [n_vertices, n_channels], the values of the finest level.
-        heavy: [n_vertices] above 0, how much each of them matters.
+        heavy: [n_vertices] above 0, the weight of each vertex of the finest level in the means.
     """
     found, weights = [finest], heavy.astype(np.float32)
     for level in range(1, len(pyramid.levels)):
@@ -57,7 +58,8 @@ def mean_values(pyramid: Pyramid, finest: np.ndarray, heavy: np.ndarray) -> list
             some = slice(first, first + ROWS_AT_ONCE)
             places = coarse.index[some] * 2
             total[some], of_total[some] = _around(fine, places, found[-1], weights, HALF)
-            alone = first + np.flatnonzero(of_total[some] == 0)  # nothing is stored there, nor all around
+            # Without pairs where neither the middle nor both vertices of an opposite pair are stored.
+            alone = first + np.flatnonzero(of_total[some] == 0)
             total[alone], of_total[alone] = _around(fine, places[alone - first], found[-1], weights, AROUND)
             total[some] /= of_total[some, None]
         found.append(total)
@@ -68,9 +70,11 @@ def mean_values(pyramid: Pyramid, finest: np.ndarray, heavy: np.ndarray) -> list
 def _around(
     fine: Vertices, places: np.ndarray, values: np.ndarray, weights: np.ndarray, offsets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The weighted sums [n, n_channels] of values around places [n, 3], and the sums of the weights [n]:
-    of what is at `offsets` and, if that is HALF, of what is opposite; each as much as the one of the two that
-    matters less."""
+    """Sum the finer `values` at `offsets` around `places` [n, 3], weighted. If `offsets` is HALF, each is
+    summed together with its opposite, both with the lower weight of the two.
+
+    Returns the weighted sums [n, n_channels], and the sums of the weights [n].
+    """
     sums, n = np.zeros((len(places), values.shape[1]), np.float32), np.zeros(len(places), np.float32)
     for offset in offsets:
         rows = fine.rows(places + offset)
@@ -90,22 +94,24 @@ def _around(
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What may be dropped of a pyramid that shows its finest level, and what that costs."""
+    """A pyramid that shows its finest level, and the errors by dropping bricks of it."""
 
     pyramid: Pyramid
     errors: tuple[np.ndarray, ...]
-    """For each level from the finest on, of which nothing is known to be wrong, to the coarsest that may be
-    shown, [n_bricks] float64: the error in each brick of the finest level where this level shows it."""
+    """For each level, from the finest one to the coarsest that may be shown, [n_bricks] float64: the error in
+    each brick of the finest level if this level shows it; 0 for the finest level."""
 
     @cached_property
     def parents(self) -> list[np.ndarray]:
-        """For each level but the coarsest, [n_bricks]: which brick of the next coarser level each is in."""
+        """For each level but the coarsest, [n_bricks]: the brick of the next coarser level that contains each
+        brick."""
         levels = self.pyramid.levels
         return [coarse.find(fine.coords >> 1) for fine, coarse in pairwise(levels)]
 
     @cached_property
     def _n_vertices(self) -> list[np.ndarray]:
-        """For each level that may be dropped [n_bricks]: the vertices of each brick, 1 or more."""
+        """For each level whose bricks may be dropped, [n_bricks]: the number of vertices of each brick, at
+        least 1."""
         found = []
         for level in range(len(self.errors) - 1):
             vertices = self.pyramid.vertices[level].bricks
@@ -115,10 +121,10 @@ class Choice:
 
     @cached_property
     def _gains(self) -> list[np.ndarray]:
-        """For each level that may be dropped [n_bricks]: the error that a brick's being dropped adds, for
-        each of its vertices."""
+        """For each level whose bricks may be dropped, [n_bricks]: the error that is added if the brick is
+        dropped, divided by the number of its vertices."""
         found = []
-        bricks = np.arange(len(self.pyramid.levels[0]))  # of each level, those that the finest ones are in
+        bricks = np.arange(len(self.pyramid.levels[0]))  # for each finest brick, its brick of `level`
         for level, (own, coarser) in enumerate(zip(self.errors[:-1], self.errors[1:], strict=True)):
             size = len(self.pyramid.levels[level])
             found.append(np.bincount(bricks, coarser - own, size) / self._n_vertices[level])
@@ -126,8 +132,8 @@ class Choice:
         return found
 
     def dropped(self, worth: float) -> list[np.ndarray]:
-        """For each level that may be dropped, [n_bricks] bool: which bricks are, where a vertex is worth so
-        much of the error."""
+        """Choose the bricks to drop if a vertex is kept only for an error above `worth`. Returns [n_bricks]
+        bool for each level whose bricks may be dropped."""
         found, whole = [], np.ones(len(self.pyramid.levels[0]), bool)
         for level, gains in enumerate(self._gains):
             found.append(whole & (gains <= worth))
@@ -136,7 +142,8 @@ class Choice:
         return found
 
     def levels(self, dropped: Sequence[np.ndarray]) -> np.ndarray:
-        """[n_bricks] int: the level that shows the place of each brick of the finest level."""
+        """Return [n_bricks] int: the level that shows the place of each brick of the finest level, without
+        the `dropped` bricks."""
         bricks = np.arange(len(self.pyramid.levels[0]))
         found = np.zeros(len(bricks), np.int64)
         for level, of_level in enumerate(dropped):
@@ -145,7 +152,7 @@ class Choice:
         return found
 
     def shown(self, dropped: Sequence[np.ndarray]) -> Pyramid:
-        """The pyramid without the bricks that are dropped."""
+        """Return the pyramid without the `dropped` bricks."""
         levels = self.pyramid.levels
         leaves = [levels[0], *(_NONE,) * (len(levels) - 1)]
         for level, of_level in enumerate(dropped):
@@ -158,26 +165,28 @@ class Choice:
         return whole_pyramid(self.pyramid.resolution, leaves)
 
     def worth(self, share: float) -> float:
-        """The worth of a vertex at which bricks are dropped that have about `share` of all vertices of the
-        finest level."""
+        """Return the `worth` with which the dropped bricks have about a `share` of all vertices of the finest
+        level."""
         order = np.argsort(self._gains[0])
         running = np.cumsum(self._n_vertices[0][order])
         return float(self._gains[0][order[np.searchsorted(running, share * running[-1])]])
 
 
 class Wanted(NamedTuple):
-    """What is shown of a pyramid, and the values that its vertices should have."""
+    """The pyramid that remains to be shown, and the values that its vertices should have."""
 
     pyramid: Pyramid
-    """The cells that are left."""
+    """The remaining cells."""
     values: list[np.ndarray]
-    """For each level [n_vertices, n_channels]: codes as floats, or latent features as int16."""
+    """For each level, [n_vertices, n_channels]: codes as floats, or latent features as int16."""
 
 
 def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, sampled: bool) -> Wanted:
-    """The values where `shown` is left of the pyramid of `choice`, from those of all levels of the whole
-    pyramid, as `mean_values` finds them; they are changed. If they are `sampled`, a coarser vertex that has a
-    finer one at its place has the value of that."""
+    """Return the wanted values of `shown`, the remaining part of the pyramid of `choice`.
+
+    `values` are those of all levels of the whole pyramid, from `mean_values`; they are overwritten. With
+    `sampled`, a coarser vertex with a finer vertex at the same place has the value of the finer one.
+    """
     found: list[np.ndarray] = []
     for level, (whole, left) in enumerate(zip(choice.pyramid.vertices, shown.vertices, strict=True)):
         of_level = take_rows(values[level], whole.rows_of(left.bricks))
@@ -189,7 +198,8 @@ def wanted_values(choice: Choice, values: Sequence[np.ndarray], shown: Pyramid, 
 
 
 def take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """`values[rows]` of ascending rows, in the place of `values`: there may be no room for them twice.
+    """Return `values[rows]` for ascending rows, moved to the front of `values` in place, because there may be
+    no memory for a copy.
 
     >>> take_rows(np.arange(8), np.array([1, 4, 7])).tolist()
     [1, 4, 7]

@@ -1,1 +1,1 @@
-"""What a set of pictures is good for, said before the minutes of a training go."""
+"""A check of what a set of pictures is good for, before minutes are spent on training."""

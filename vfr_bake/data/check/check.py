@@ -1,4 +1,4 @@
-"""A set of pictures, judged in seconds: what there is, what is likely to come out, what to photograph."""
+"""Judge a set of pictures in seconds: what there is, what is likely to come out, and what to photograph."""
 
 from __future__ import annotations
 
@@ -32,52 +32,53 @@ from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import Progress
 
 PLAIN_FEATURES = 30
-"""With fewer features at the size of the check there is nothing to recognise."""
+"""A picture with fewer features, at the size of the check, shows nothing that could be recognised."""
 
 
 @dataclass(frozen=True)
 class CheckedPicture:
-    """One picture of a set."""
+    """One picture of a set, and what the check found out about it."""
 
     name: str
     size: tuple[int, int] | None
-    """Width and height in pixels, upright; None where it cannot be read."""
+    """Width and height in pixels, upright; None if the picture cannot be read."""
     used: tuple[int, int] | None
     """Width and height at the working size."""
     look: Look | None
-    """None where there was no time for it, or it cannot be read."""
+    """What was seen of the picture; None if there was no time to look at it, or if it cannot be read."""
     partners: int | None
-    """Pictures that share features with it, of those that it was compared with; None if with none."""
+    """Number of the pictures that share features with this one, of those that it was compared with; None if
+    it was compared with none."""
     found: bool | None
     """Whether its camera is known; None where cameras have not been looked for yet."""
     why: str | None
-    """What is wrong with it, or why it has no camera."""
+    """The fault of the picture, or the reason why it has no camera; None if there is neither."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What is known of a set of pictures."""
+    """The result of checking a set of pictures."""
 
     data: str
     kind: str
-    """Where the cameras come from: transforms.json, COLMAP, or "none yet"."""
+    """Source of the cameras: "transforms.json", "COLMAP", or "none yet"."""
     pictures: list[CheckedPicture]
     cameras: list[Camera]
     figures: dict[str, Any]
     verdict: str
     """GOOD, DOUBTFUL or BAD."""
     likely: list[str]
-    """What is likely to come out, in sentences."""
+    """Sentences on what is likely to come out."""
     advice: list[str]
-    """What to photograph, in sentences; empty where there is nothing to add."""
+    """Sentences on what to photograph; empty if there is nothing to add."""
     seconds: float = 0.0
 
     def lines(self) -> list[str]:
-        """The check in a few lines for people."""
+        """Return the check in a few lines for people."""
         return [*_summary(self.figures), f"{self.verdict}: {' '.join(self.likely)}", *self.advice]
 
     def document(self) -> dict[str, Any]:
-        """The check as data, for JSON."""
+        """Return the check as data, for JSON."""
         return {
             "data": self.data,
             "cameras": self.kind,
@@ -100,11 +101,11 @@ class _Set:
     found: list[bool | None]
     cameras: list[Camera] = field(default_factory=list)
     why: dict[str, str] = field(default_factory=dict)
-    """Why pictures have no camera, as far as their estimation told."""
+    """The reasons why pictures have no camera, by their names, as far as the estimation recorded them."""
 
 
 class _Describing(PictureReader):
-    """Takes note of what is to be read, and reads nothing."""
+    """A reader that takes note of what is to be read, and reads nothing."""
 
     described: Sequence[DescribedView] = ()
 
@@ -124,14 +125,15 @@ def check_data(
     progress: Progress | None = None,
     most: int | None = None,
 ) -> Check:
-    """Look at the pictures that `data` names.
+    """Check the pictures that `data` names.
 
     Args:
         data: a folder of pictures with or without cameras, or a video, as for `load_scene`.
         size: the working size.
-        seconds: about how long to look; what is not seen in that time is a sample's rest.
+        seconds: about how long to look; if the time is over before all pictures are seen, those seen are a
+            sample.
         progress: called with the number of pictures seen and to see.
-        most: pictures to look at, at most.
+        most: number of pictures to look at, at most.
 
     Raises DataError, FormatError: there is no such folder, or no picture in it. ConfigError: the built-in
     scene has no pictures. MissingExtraError: a package that reads pictures is missing.
@@ -149,7 +151,7 @@ def check_data(
         if pictures.found[number] is False and why is None:
             why = pictures.why.get(name, "the estimation of cameras found no place for it")
         if isinstance(look, str):
-            full = None  # its header may be whole where its pixels are not
+            full = None  # the pixels cannot be read, although the header may be whole
         else:
             full = look.size if look else _size(pictures.paths[number])
         checked.append(
@@ -220,7 +222,8 @@ def _size(path: Path) -> tuple[int, int] | None:
 
 
 def _blurred(looks: Sequence[Look | None]) -> set[int]:
-    """The numbers of the pictures that training would leave out, as far as they were looked at."""
+    """Return the numbers of the pictures that training would leave out as blurred, of those that were looked
+    at."""
     there = [i for i, look in enumerate(looks) if look is not None]
     return {there[n] for n in blurred([look.blur for look in looks if look is not None])}
 
@@ -268,7 +271,8 @@ def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], S
 
 
 def _largest_group(shared: dict[tuple[int, int], Shared]) -> float:
-    """The share of the compared pictures in the largest group that hangs together by shared features."""
+    """Return the share of the compared pictures that are in the largest group that is connected by shared
+    features."""
     leader: dict[int, int] = {}
 
     def lead(i: int) -> int:

@@ -1,4 +1,5 @@
-"""What a quick look at a picture tells: its sharpness, its exposure, and what could be recognised in it."""
+"""Look quickly at pictures: their sharpness, their exposure, and the features that could be recognised in
+them."""
 
 from __future__ import annotations
 
@@ -28,47 +29,48 @@ from vfr_bake.data.quality.sharpness import blur
 from vfr_bake.data.threads import Progress, n_threads, one_by_one
 
 FEATURE_SIDE, N_FEATURES = 480, 400
-"""Pixels of the longest side in which features are looked for, and how many are kept."""
+"""Pixels of the longest side at which features are looked for, and the number of features that are kept."""
 THUMBNAIL_SIDE = 144
 MIN_SHARED = 18
-"""Features that two pictures must share to be said to show the same; of different scenes, they were seen to
-share 13."""
+"""Number of features that two pictures must share to be said to show the same. Pictures of different scenes
+were seen to share up to 13."""
 MOST_COMPARED = 120
-"""Each of so many pictures, spread evenly, is compared with each other: seven thousand pairs."""
+"""Number of pictures, spread evenly, each of which is compared with each other: seven thousand pairs."""
 GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
 class Look:
-    """What was seen of one picture."""
+    """The features and measurements of one picture."""
 
     size: tuple[int, int]
     """Width and height in pixels, upright."""
     sharpness: float
     """Mean square of the Laplacian of the grey levels (0 to 255) at SHARPNESS_SIDE."""
     blur: float
-    """From 0 (sharp) to 1: what training leaves pictures out by."""
+    """From 0 (sharp) to 1: the measure by which training leaves pictures out."""
     exposure: float
     """Mean of log2 of the luminance: one more is twice the light."""
     descriptors: np.ndarray
     """[n_features, 128] float32 of unit length."""
     points: np.ndarray
-    """[n_features, 2] float32: where they are, in units of the longer side from the picture's centre, y
-    down."""
+    """[n_features, 2] float32: the positions of the features, in units of the longer side from the picture's
+    centre, y down."""
     levels: np.ndarray
     """[n_features] float32: log2 of the luminance around each feature."""
     thumbnail: bytes
-    """JPEG."""
+    """A JPEG file."""
 
 
 class Shared(NamedTuple):
-    """What two pictures have in common."""
+    """The features that two pictures have in common."""
 
     n_features: int
     change: float
-    """How much brighter the second shows it, in powers of two."""
+    """Brightness of these features in the second picture against that in the first, in powers of two."""
     points: tuple[np.ndarray, np.ndarray] | None = None
-    """[n, 2] in either, of the features that agree with one geometry; of neighbours alone."""
+    """[n, 2] in each picture: the features that agree with one geometry; None unless the pictures are
+    neighbours."""
 
 
 def look(path: Path) -> Look:
@@ -99,13 +101,13 @@ def look(path: Path) -> Look:
 
 
 def _light(grey: np.ndarray) -> np.ndarray:
-    """Log2 of the luminance of grey levels (sRGB, uint8); float32, 0 for white."""
+    """Return log2 of the luminance of grey levels (sRGB, uint8), as float32; 0 for white."""
     return (2.2 * np.log2((grey.astype(np.float32) + 1) / 256)).astype(np.float32)
 
 
 def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Descriptors [n, 128] of a picture, their points [n, 2], and its `light` [height, width] around each
-    [n]."""
+    """Return the descriptors [n, 128] of a picture's features, their points [n, 2], and the `light` [height,
+    width] around each, [n]."""
     small = shrunk(cv2, rgba, FEATURE_SIDE)
     sift = cv2.SIFT.create(nfeatures=N_FEATURES, contrastThreshold=0.02)
     mask = np.where(small[..., 3] > 127, np.uint8(255), np.uint8(0))
@@ -123,11 +125,11 @@ def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray
 def look_at(
     paths: Sequence[Path], seconds: float, progress: Progress | None = None, most: int | None = None
 ) -> list[Look | str | None]:
-    """Look at pictures for about so many `seconds`, and at no more than `most`.
+    """Look at pictures for about `seconds`, and at no more than `most`.
 
-    Pairs of neighbours are taken in an order that spreads them over all pictures, so that what is seen in the
-    time is a sample of everything. Returns for each picture what was seen, why it cannot be read, or None
-    where the time was over. Raises MissingExtraError.
+    Pairs of neighbours are taken in an order that spreads them over all pictures, so that those seen in the
+    time are a sample of all. Returns for each picture what was seen, the reason why it cannot be read, or
+    None if the time was over. Raises MissingExtraError.
     """
     end = time.monotonic() + seconds
     pairs = sorted(range((len(paths) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
@@ -150,8 +152,9 @@ def look_at(
 
 
 def compare(looks: Sequence[Look | None], seconds: float) -> dict[tuple[int, int], Shared]:
-    """What pairs (i, j), i < j, of pictures share: neighbours in their order, and then, for about so many
-    `seconds`, each of a sample with each other. Pairs that were not compared are missing."""
+    """Return what pairs (i, j), i < j, of pictures share. All neighbours in the order of the pictures are
+    compared, and then, until about `seconds` are over, each picture of a sample with each other. Pairs that
+    were not compared are missing."""
     end = time.monotonic() + seconds
     there = [i for i, seen in enumerate(looks) if seen is not None]
     pairs = [(i, i + 1) for i in there if i + 1 < len(looks) and looks[i + 1] is not None]
@@ -174,7 +177,8 @@ def compare(looks: Sequence[Look | None], seconds: float) -> dict[tuple[int, int
 
 
 def _agreeing(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the matched points [n, 2] and [n, 2] that agree with one geometry of two pictures."""
+    """Return those of the matched points [n, 2] and [n, 2] that agree with one geometry of the two
+    pictures."""
     if len(a) < MIN_MATCHES:
         return a[:0], b[:0]
     cv2 = opencv("pictures: expected OpenCV to compare them", "train")

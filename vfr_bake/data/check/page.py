@@ -1,6 +1,6 @@
-"""A check as one HTML file: thumbnails, what is wrong with which picture, and the cameras in 3D.
+"""Write a check as one HTML file: thumbnails, what is wrong with which picture, and the cameras in 3D.
 
-Everything is inside it, nothing is loaded from elsewhere.
+Everything is inside the file; nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from vfr_bake.data.check.check import Check, CheckedPicture
 from vfr_bake.data.check.verdict import level_axes
 
 MARK = "<!-- vfr-train --check -->"
-"""The second line of every such page: one that is there may be replaced."""
+"""Second line of every page of a check. An existing file that has it may be replaced."""
 SIDE, MARGIN = 380, 24
-"""Pixels of a drawing of the cameras, and of its margin."""
+"""Pixels along a side of a drawing of the cameras, and of its margin."""
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #222
 } .good { color: #070 } .doubtful { color: #850 } .bad { color: #b00 }
@@ -69,7 +69,7 @@ paint();
 
 
 def check_page(check: Check) -> bytes:
-    """The page of a check."""
+    """Return the page of a check, as the bytes of an HTML file."""
     title = escape(f"Check of {check.data}")
     summary = "".join(f"<p>{escape(line)}</p>" for line in check.lines()[:2])
     advice = "".join(f"<li>{escape(line)}</li>" for line in check.advice)
@@ -108,14 +108,15 @@ def _figure(picture: CheckedPicture) -> str:
 
 
 def cameras_drawing(cameras: Sequence[Camera]) -> str:
-    """The cameras in 3D, turned by dragging, and two SVG drawings, from above and from the side: a dot where
-    each is, a line where it looks; up is a red line from where they look at."""
+    """Return HTML that draws the cameras in 3D, turned by dragging, and as two SVG drawings, from above and
+    from the side. A dot marks where a camera is, and a line where it looks. In 3D a red line points up from
+    the point that the cameras look at; in the SVG drawings a red circle marks that point."""
     up = world_up(cameras)
     right, back = level_axes(up)
     focus = focus_point(cameras)
     places = np.stack([camera.c2w[:3, 3] for camera in cameras]) - focus
     looks = -np.stack([camera.c2w[:3, 2] for camera in cameras])
-    # Most of them: one that strayed must not shrink the rest.
+    # The drawing has room for most of them: one that strayed must not shrink the rest.
     reach = 1.1 * float(np.quantile(np.linalg.norm(places, axis=1), 0.95)) or 1.0
     drawings = []
     for title, axes in (("from above", (right, back)), ("from the side", (right, -up))):

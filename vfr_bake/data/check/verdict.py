@@ -1,4 +1,4 @@
-"""What the figures of a check mean: what is likely to come out, and what to photograph."""
+"""Judge the figures of a check: what is likely to come out, and what to photograph."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from player.cameras.camera import Camera, focus_point, world_up
 from vfr_bake.data.poses import MIN_PICTURES, MIN_SHARE
 
 SOFT_SHARPNESS = 15.0
-"""Where the median sharpness is less, all are out of focus, blurred, or enlarged."""
+"""If the median sharpness is less, all pictures are out of focus, blurred, or enlarged."""
 GOOD_SHARED = 40
-"""Neighbours that share as many features, at the size of the check, overlap well."""
+"""Neighbours that share at least this many features, at the size of the check, overlap well."""
 UNEVEN = 0.7
-"""Where pictures show the same by more brighter or darker than each other (powers of two; 95 in 100 pairs
-less), it becomes fog."""
+"""Largest difference in brightness, in powers of two, between pictures that show the same; a larger one
+becomes fog. It is compared with the difference that 95 in 100 pairs of pictures do not exceed."""
 FEW, GOOD_NUMBER = 20, 40
-"""Pictures: fewer leave holes; about as many show a subject from all sides."""
+"""Numbers of pictures: fewer than FEW leave holes; about GOOD_NUMBER show a subject from all sides."""
 TURNED, ALL_TURNED = 0.4, 0.8
-"""Where the camera turned on the spot in so many steps, depth is weak, and cameras are hardly found."""
+"""Shares of the steps in which the camera turned on the spot. Above TURNED, depth is weak; above ALL_TURNED,
+cameras are hardly found."""
 GAP_DEGREES = 90.0
-"""A wider gap in the walk around the subject is a side that nobody has seen."""
+"""Degrees. A wider gap in the walk around the subject is a side that nobody has seen."""
 NAMED = 3
-"""Pictures that cannot be read are named up to so many."""
+"""Number of pictures that are named, at most, of those that cannot be read."""
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
 def judged(
     figures: dict[str, Any], cameras: Sequence[Camera], unreadable: Sequence[str]
 ) -> tuple[str, list[str], list[str]]:
-    """Verdict, what is likely to come out, and what to photograph; `unreadable`: the names of pictures at
-    which training stops."""
+    """Return the verdict, what is likely to come out, and what to photograph. `unreadable`: the names of
+    pictures that would make training stop."""
     n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
     likely, advice, bad, doubts = [], [], False, False
     turned = figures["share_turned_on_the_spot"] or 0.0
@@ -109,8 +110,8 @@ def judged(
 
 
 def widest_gap(cameras: Sequence[Camera]) -> float | None:
-    """Degrees of the widest gap between cameras, seen from above from where they look at; None for too few,
-    or where they look outwards."""
+    """Return the widest gap between the cameras, in degrees, seen from above around the point that they look
+    at; None for too few cameras, or if they look outwards."""
     if len(cameras) < 3:
         return None
     focus, up = focus_point(cameras), world_up(cameras)
@@ -124,7 +125,7 @@ def widest_gap(cameras: Sequence[Camera]) -> float | None:
 
 
 def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions [3] of unit length at right angles to `up` [3] and to each other."""
+    """Return two directions [3] of unit length at right angles to `up` [3] and to each other."""
     right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     right /= np.linalg.norm(right)
     return right, np.cross(right, up)

@@ -1,1 +1,1 @@
-"""Files of people, which are read within limits: pictures and videos."""
+"""Reading of users' files within limits: pictures, masks, ZIPs and videos."""

@@ -1,7 +1,7 @@
-"""A ZIP of pictures, as phones and drives share it -> a folder.
+"""Unpack a ZIP of pictures, as phones and drives share it, into a folder.
 
-A ZIP is written by strangers. Everything that it says is checked before the first byte is unpacked: names
-that leave the folder, links, passwords, and how much it unpacks to.
+A ZIP may come from strangers. So everything that it says is checked before the first byte is unpacked: names
+that leave the folder, links, passwords, and the number of bytes that it unpacks to.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from vfr_bake.data.threads import Progress
 
 SUFFIX = ".zip"
 KEPT = (*SUFFIXES, ".bmp", ".json", ".bin")
-"""Pictures and masks, and the cameras of a data set; what else there may be is left packed."""
+"""Suffixes of the files that are unpacked: pictures and masks, and the cameras of a data set. Other files are
+left packed."""
 MOST_ENTRIES = 50_000
 MOST_BYTES = 1 << 37
-"""128 GB: ten thousand pictures of 12 MB."""
+"""137 GB, more than ten thousand pictures of 12 MB."""
 MOST_OF_ONE = 1 << 30
 MOST_TIMES, SPARED = 50, 64 << 20
-"""What is unpacked is at most so many times as large as the ZIP, beyond the bytes that are spared: pictures
-are compressed already."""
+"""The unpacked files may take at most MOST_TIMES the bytes of the ZIP and SPARED bytes more: pictures are
+compressed already, and hardly grow."""
 FREE = 0.9
-"""Share of the free disk that is taken at most."""
+"""Largest share of the free disk that is used."""
 _AT_ONCE = 1 << 20
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeError)
-"""What a damaged ZIP raises; the last one where a name is said to be UTF-8, and is not."""
+"""Exceptions that a damaged ZIP raises; the last one if a name is marked as UTF-8, and is not."""
 
 
 def is_archive(path: Path) -> bool:
-    """Whether `path` is a file that goes by the name of a ZIP.
+    """Return whether `path` is a file with the suffix of a ZIP.
 
     >>> is_archive(Path("surely/not/there.zip"))
     False
@@ -44,7 +45,7 @@ def is_archive(path: Path) -> bool:
 
 
 def unpacked_folder(archive: Path) -> Path:
-    """The folder into which a ZIP is unpacked: `garden.zip` -> `garden_unpacked`.
+    """Return the folder into which a ZIP is unpacked: `garden.zip` -> `garden_unpacked`.
 
     >>> unpacked_folder(Path("a/garden.zip")).name
     'garden_unpacked'
@@ -55,14 +56,14 @@ def unpacked_folder(archive: Path) -> Path:
 def unpack(archive: Path, progress: Progress) -> Path:
     """Unpack the pictures and cameras of a ZIP into `<stem>_unpacked/` beside it.
 
-    Returns what is to be loaded: that folder, or the only one in it.
+    Returns the folder to load: the new folder, or the one inside it if that is all it contains.
 
     `progress`: called with the number of files unpacked and to unpack. The folder appears when it is
-    complete; one that is there is taken as it is.
+    complete; one that exists is used as it is.
 
-    Raises DataError: not a ZIP, damaged, with a password, nothing in it that is read, a name that leaves
-    the folder or that not every system can write, a link, or more bytes than it may unpack to; OutputError:
-    the disk is too full.
+    Raises DataError: not a ZIP, damaged, with a password, no pictures in it, a name that leaves the folder or
+    that not every system can write, a link, or more bytes than it may unpack to; OutputError: the disk is too
+    full.
     """
     folder = unpacked_folder(archive)
     if folder.is_dir():
@@ -83,7 +84,7 @@ def unpack(archive: Path, progress: Progress) -> Path:
 
 
 def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo, PurePosixPath]]:
-    """The entries to unpack, and their names within the folder. Raises DataError."""
+    """Return the entries to unpack, with their names within the folder. Raises DataError, OutputError."""
     if len(file.infolist()) > MOST_ENTRIES:
         raise DataError(f"{archive}: ZIP: expected at most {MOST_ENTRIES} files, got {len(file.infolist())}")
     entries = []
@@ -123,7 +124,7 @@ def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo
 
 
 def _safe_name(archive: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
-    """The name of an entry, which stays in the folder. Raises DataError."""
+    """Return the name of an entry, which is checked to stay in the folder. Raises DataError."""
     name = PurePosixPath(_decoded(entry).replace("\\", "/"))
     on_windows = PureWindowsPath(str(name))
     if ".." in name.parts or name.is_absolute() or on_windows.drive or on_windows.root:
@@ -136,7 +137,8 @@ def _safe_name(archive: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _decoded(entry: zipfile.ZipInfo) -> str:
-    """The entry's name: many programs write UTF-8 without saying so, which is read as code page 437."""
+    """Return the entry's name. Many programs write UTF-8 without saying so, and `zipfile` reads it as code
+    page 437."""
     if entry.flag_bits & 0x800:
         return entry.filename
     try:
@@ -162,7 +164,8 @@ def _twice(names: list[str]) -> str:
 
 
 def _inner(folder: Path) -> Path:
-    """The folder itself, or the only one in it, and so on: phones pack a folder and not what is in it."""
+    """Return the folder itself, or, as long as a folder has nothing but one other folder in it, that one:
+    phones pack a folder instead of its contents. A folder `images` is not entered."""
     while True:
         inside = list(folder.iterdir())
         if len(inside) != 1 or not inside[0].is_dir() or inside[0].name == "images":

@@ -1,5 +1,5 @@
-"""What is kept beside the cameras that were estimated from pictures: which pixels they belong to, and which
-pictures were left out or found no place."""
+"""The record that is kept beside cameras estimated from pictures: which pixels the cameras belong to, and
+which pictures were left out or not placed."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ NAME = "pictures.json"
 
 @dataclass(frozen=True)
 class EstimateRecord:
-    """What an estimate says of its pictures."""
+    """The facts about its pictures that an estimate records."""
 
     upright: bool
     """Whether the cameras belong to pictures turned upright as EXIF says, and not to the pixels as stored."""
     repeated: dict[str, str] = field(default_factory=dict)
-    """Pictures that were left out because another shows the same, and which."""
+    """Names of pictures that were left out, each with the name of the picture that shows the same."""
     unplaced: dict[str, str] = field(default_factory=dict)
-    """Why a picture found no place, by its name."""
+    """The reason why a picture was not placed, by the picture's name."""
     apart: tuple[int, ...] = ()
-    """Numbers of pictures of the groups that have places of their own, which fit nothing of the rest."""
+    """Number of pictures in each further group, whose pictures were placed relative to each other but not to
+    the rest."""
 
 
 def write_record(model: Path, record: EstimateRecord) -> None:
@@ -34,8 +35,8 @@ def write_record(model: Path, record: EstimateRecord) -> None:
 
 
 def read_record(model: Path) -> EstimateRecord:
-    """The record in the folder of a COLMAP model; pixels as stored where there is none, because the model was
-    made by another program. Raises FormatError.
+    """Read the record in the folder of a COLMAP model. If there is none, the model was made by another
+    program, and its cameras belong to the pixels as stored. Raises FormatError.
 
     >>> read_record(Path("surely/not/there")).upright
     False

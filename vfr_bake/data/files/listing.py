@@ -1,4 +1,4 @@
-"""The pictures in a folder, as cameras, phones and people put them there."""
+"""Find the pictures in a folder, as cameras, phones and people put them there."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from vfr_bake.data.files.masks import FOLDER as MASKS
 from vfr_bake.data.files.opening import SUFFIXES
 
 MOST = 20_000
-"""Pictures of one capture at most: more are a whole life, and not a scene."""
+"""Number of pictures of one capture at most: more are a whole collection, and not a scene."""
 NOT_PICTURES = (MASKS, "sparse", "colmap", "__MACOSX", "@eaDir")
-"""Folders in which pictures are something else: masks, and the previews of some systems."""
+"""Folders that are not searched: masks, COLMAP's models, and the previews of some systems."""
 OWN = ("transforms.json", "transforms_train.json", "sparse", "manifest.json")
-"""A folder within a folder that has one of these is a data set or an asset of its own."""
+"""A subfolder that has one of these is a data set or an asset of its own, and is not searched."""
 
 
 def find_pictures(folder: Path) -> tuple[Path, list[Path]]:
-    """The place that pictures lie in, `images/` or else the folder itself, and the pictures in it and in the
-    folders within it, in the order of their names: numbers by their value, so that 9 comes before 10.
+    """Find the pictures in `images/`, or else in the folder itself, and in the folders within. Returns the
+    folder that was searched, and the pictures in the order of their names: numbers by their value, so that 9
+    comes before 10.
 
-    Raises DataError: far too many, or a name that is not Unicode.
+    Raises DataError: far too many pictures, or a name that is not Unicode.
 
     >>> find_pictures(Path("surely/not/there"))[1]
     []
@@ -37,7 +38,7 @@ def find_pictures(folder: Path) -> tuple[Path, list[Path]]:
 def _below(place: Path) -> list[Path]:
     found: list[Path] = []
     for folder, folders, names in os.walk(place):
-        # Names that begin with a dot are what systems leave behind (`._a.jpg` is no picture).
+        # Files whose names begin with a dot are left behind by systems (`._a.jpg` is no picture).
         folders[:] = sorted(
             name
             for name in folders
@@ -70,7 +71,8 @@ def _order(name: str) -> list[tuple[int, str]]:
 
 
 def other_kinds(folder: Path) -> str:
-    """A clause on the files in a folder which are pictures that are not read; empty if there are none."""
+    """Return a clause on the files in a folder that are pictures of formats that are not read; empty if there
+    are none."""
     kinds = {
         path.suffix.lower()
         for place in (folder, folder / "images")

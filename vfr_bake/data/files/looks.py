@@ -1,4 +1,4 @@
-"""What has to be known of each photograph before its camera is looked for."""
+"""Find out what has to be known of each photograph before its camera can be estimated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vfr_bake.data.mapping import Sensor
 
 @dataclass(frozen=True)
 class Look:
-    """One picture, turned upright and without what is masked."""
+    """The features and measurements of one picture, turned upright and without what is masked."""
 
     sensor: Sensor
     features: Features
@@ -34,8 +34,8 @@ class Look:
 def look_at(
     pictures: Sequence[tuple[Path, Path | None]], kept: KeptMatches, progress: threads.Progress | None
 ) -> list[Look]:
-    """What is seen in each picture; `pictures`: each with its mask, where it has one; `kept`: what is known
-    of some of them, to which the others are added. Raises DataError."""
+    """Return the look of each picture. `pictures`: each with its mask, if it has one. `kept`: has what is
+    known of some of them; what is found in the others is added to it. Raises DataError."""
 
     def look(picture: tuple[Path, Path | None]) -> Look:
         path, mask = picture
@@ -52,31 +52,31 @@ def look_at(
 
 def _found_in(path: Path, mask: Path | None) -> Found:
     width, height = picture_size(path, upright=True)
-    # A mask belongs to all pixels.
+    # A picture with a mask is decoded at its full size, because its mask has that size.
     rgba = read_picture(path, True, None if mask is not None else enough_for((width, height), MAX_SIDE))
     if mask is not None:
         rgba = apply_mask(rgba, path, mask, upright=True)
     grey = Image.fromarray(rgba).convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it")
     found = find_features(rgba)
-    # What a JPEG decoder leaves out is a whole number of times, rounded up at the edge.
+    # A JPEG decoder reduces by a whole factor, and rounds up at the edge.
     points = found.points * max(1, round(width / rgba.shape[1]))
     found = replace(found, points=points.clip(0, (width, height)))
     return Found(width, height, found, np.asarray(grey).reshape(-1), sharpness(cv2, rgba))
 
 
 def sensor_of(path: Path, width: int, height: int) -> Sensor:
-    """What took a picture, as EXIF has it; `width`, `height` of the picture upright."""
+    """Return the sensor that took a picture, from EXIF; `width`, `height`: of the picture turned upright."""
     try:
         with open_photograph(path) as file:
             exif = exif_of(file)
             details = exif.get_ifd(0x8769)
     except (FormatError, struct.error, KeyError, IndexError):  # damaged EXIF is as good as none
         return Sensor(width, height, (), None)
-    # Maker, model; focal length, and the same as it would be on 35 mm film.
+    # The tags 271 maker, 272 model, 0x920A focal length; 0xA405 is the same as it would be on 35 mm film.
     device = tuple(str(tags.get(tag, "")) for tags, tag in ((exif, 271), (exif, 272), (details, 0x920A)))
     film = _positive(details.get(0xA405))
-    # The standard (CIPA DC-008, 4.6.5) compares by diagonals; that of film is 43.27 mm.
+    # The standard (CIPA DC-008, 4.6.5) compares by diagonals; the diagonal of film is 43.27 mm.
     focal = film / 43.27 * float(np.hypot(width, height)) if film else None
     return Sensor(width, height, device, focal)
 

@@ -1,8 +1,9 @@
-"""Masks: pictures beside the pictures, black where something is to be ignored.
+"""Masks: pictures that are black where a photograph is to be ignored.
 
-`masks/` holds a PNG for each picture that has one, called as the picture is, with or without the picture's
-own ending (`IMG_1.png` as well as COLMAP's `IMG_1.jpg.png` for `IMG_1.jpg`). What is masked is neither
-matched nor learned. In memory a masked pixel is a transparent one, of a capture that says that it is masked.
+The folder `masks/` beside the photographs holds a PNG for each one that has a mask. It has the photograph's
+name, with or without the photograph's own suffix (`IMG_1.png` as well as COLMAP's `IMG_1.jpg.png` for
+`IMG_1.jpg`). Masked pixels are neither matched nor learned. In memory, a masked pixel is a transparent pixel
+of a capture that says that it is masked.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from vfr_bake.data.files.orientation import as_stored, read_layout, turned_uprig
 
 FOLDER = "masks"
 SEEN = 128
-"""A mask's level from which on a pixel is seen: masks that a program has resampled or packed as JPEG have
-greys."""
+"""Level of a mask from which on a pixel counts as seen. Masks that a program has resampled or packed as JPEG
+have greys."""
 
 
 def mask_of(root: Path, picture: str) -> Path | None:
-    """The mask of a picture of the data set in the folder `root`, if there is one.
+    """Return the mask of a picture of the data set in the folder `root`; None if it has none.
 
-    `picture`: the name of its file, seen from `root` or from `root/images`.
+    `picture`: the name of its file, relative to `root` or to `root/images`.
 
     >>> mask_of(Path("surely/not/there"), "images/IMG_1.jpg") is None
     True
@@ -44,11 +45,11 @@ def mask_of(root: Path, picture: str) -> Path | None:
 
 
 def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np.ndarray:
-    """The picture [height, width, 4] uint8, transparent where its mask is black.
+    """Return the picture, [height, width, 4] uint8, transparent where its mask is black.
 
     `upright`: whether the picture was turned upright. A mask may be drawn on the picture as one sees it or on
-    the pixels as stored; where the two differ in size, its own size tells. Raises DataError: another size, or
-    no picture.
+    the pixels as stored; if these differ in size, the size of the mask decides. Raises DataError: the mask
+    has another size, or is no picture.
     """
     try:
         with open_photograph(mask) as file:
@@ -70,7 +71,8 @@ def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np
 
 
 def check_masked(name: str, images: Sequence[np.ndarray]) -> None:
-    """Refuse pictures [height, width, 4] of which (nearly) all is masked. Raises DataError."""
+    """Raise DataError unless at least a hundredth of all pixels of the pictures, [height, width, 4] each, is
+    opaque, that is, not masked."""
     n_seen = sum(int((image[..., 3] == 255).sum()) for image in images)
     n_all = sum(image.shape[0] * image.shape[1] for image in images)
     if n_seen < 0.01 * n_all:

@@ -1,9 +1,9 @@
-"""Photographs are opened here, in the formats that cameras and phones write, and limits hold before they are
+"""Open photographs in the formats that cameras and phones write, within limits that hold before anything is
 decoded.
 
-Pillow reads the header of a file and says how large the picture is; one of more pixels than Pillow's own
-limit is refused before any of them is decoded. What a file is follows from its content and not from its name:
-phones share JPEG files called `.heic`, and the other way round.
+Pillow reads the header of a file, which says how large the picture is. A picture of more pixels than Pillow's
+own limit is refused before any of them is decoded. The format is told by a file's content and not by its
+name: phones share JPEG files called `.heic`, and the other way round.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from player.files.files import open_file
 from player.files.images import MAX_FILE_BYTES, open_picture
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".avif", ".webp", ".tif", ".tiff")
-"""Names of photographs end in one of these, in small or capital letters."""
+"""Suffixes of photographs, in small or capital letters."""
 FORMATS = ("JPEG", "PNG", "AVIF", "WEBP", "TIFF", "BMP")
-"""What a photograph that is not HEIC may be, whatever its name is, by Pillow's names."""
+"""Formats, by Pillow's names, that a photograph may have if it is not HEIC, whatever its file is called."""
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")
 AVIF_BRANDS = (b"avif", b"avis")
 
 
 @contextmanager
 def open_photograph(path: Path) -> Iterator[Image.Image]:
-    """A photograph, opened by Pillow, as a context manager; its pixels are not decoded yet.
+    """Open a photograph by Pillow, as a context manager; its pixels are not decoded yet.
 
-    Raises FormatError as `open_picture` does, MissingExtraError for HEIC where nothing reads it.
+    Raises FormatError as `open_picture` does, and MissingExtraError for HEIC if pillow-heif is missing.
     """
     heic = is_heic(path)
     if heic:
@@ -48,7 +48,7 @@ def open_photograph(path: Path) -> Iterator[Image.Image]:
 
 
 def is_heic(path: Path) -> bool:
-    """Whether the file begins as a HEIC picture does (ISO/IEC 23008-12, 10.2). Raises FormatError."""
+    """Return whether the file begins as a HEIC picture does (ISO/IEC 23008-12, 10.2). Raises FormatError."""
     with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         head = file.read(64)
     if head[4:8] != b"ftyp":
@@ -59,10 +59,10 @@ def is_heic(path: Path) -> bool:
 
 
 def exif_of(picture: Image.Image) -> Image.Exif:
-    """EXIF of an opened photograph, whose pixels are not decoded for it.
+    """Return the EXIF data of an opened photograph without decoding its pixels.
 
-    Some programs write EXIF behind the pixels of a PNG, and Pillow decodes all of these to come to it. Here
-    they are stepped over.
+    Some programs write EXIF behind the pixels of a PNG, and Pillow decodes all pixels to get to it. Here the
+    pixels are skipped.
     """
     if isinstance(picture, PngImagePlugin.PngImageFile) and "exif" not in picture.info and picture.fp:
         place = picture.fp.tell()
@@ -76,7 +76,7 @@ def exif_of(picture: Image.Image) -> Image.Exif:
 
 
 def _read_heic_from_now_on(path: Path) -> None:
-    """Have Pillow read HEIC files. Raises MissingExtraError."""
+    """Register pillow-heif, so that Pillow reads HEIC files. Raises MissingExtraError."""
     try:
         import pillow_heif
     except ImportError as error:

@@ -1,12 +1,12 @@
-"""How a camera was held, as EXIF says it, and pictures turned accordingly.
+"""The orientation of pictures, as EXIF has it, and the turning of pictures by it.
 
-A camera that is held upright stores the rows of its sensor as ever, so that the picture lies on its side, and
+A camera that is held upright stores the rows of its sensor as always, so that the picture lies on its side.
 EXIF's orientation (CIPA DC-008, 4.6.4; 1 to 8) says how it is to be turned for looking at. Pictures whose
 cameras are estimated are turned *upright*. Cameras that come with a data set were found by programs that read
-the pixels *as stored*, and those are not turned.
+the pixels *as stored*, so those pictures are not turned.
 
-Some decoders turn the pixels by themselves: that of HEIC, where a box of the file does what EXIF does
-elsewhere, and Pillow's of TIFF.
+Some decoders turn the pixels by themselves: that of HEIC, because a box of the file does what EXIF does
+elsewhere, and Pillow's decoder of TIFF.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 TAG = 0x0112
 INVERSE = {6: 8, 8: 6}
-"""Numbers whose inverse is another; the others are undone by doing them again."""
+"""The two orientations that are each other's inverse. Every other orientation is its own inverse."""
 
 
 class Layout(NamedTuple):
@@ -34,11 +34,11 @@ class Layout(NamedTuple):
     height: int
     """Pixels, as stored."""
     number: int
-    """EXIF's orientation of the stored pixels: 1 for none, up to 8."""
+    """EXIF's orientation of the stored pixels, from 1 (no turn) to 8."""
     turned: bool
     """Whether the decoder turns the pixels upright by itself."""
     boxed: bool
-    """Whether the turn is part of the format, so that all programs read the picture upright."""
+    """Whether the turn is part of the file format, so that all programs read the picture upright."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -47,7 +47,7 @@ class Layout(NamedTuple):
 
     @property
     def upright_size(self) -> tuple[int, int]:
-        """Width and height once it is turned upright.
+        """Width and height once the picture is turned upright.
 
         >>> Layout(40, 30, 6, False, False).upright_size
         (30, 40)
@@ -56,7 +56,7 @@ class Layout(NamedTuple):
 
 
 def layout_of(picture: Image.Image) -> Layout:
-    """The layout of an opened picture whose pixels are not decoded yet."""
+    """Return the layout of an opened picture, without decoding its pixels."""
     turned = picture.format in ("HEIF", "TIFF")
     if picture.format == "HEIF":
         number = picture.info.get("original_orientation")  # the entry in EXIF is reset to 1
@@ -73,17 +73,19 @@ def layout_of(picture: Image.Image) -> Layout:
 
 
 def read_layout(path: Path) -> Layout:
-    """The layout of a picture file, which is not decoded. Raises FormatError."""
+    """Return the layout of a picture file, without decoding it. Raises FormatError."""
     with open_photograph(path) as picture:
         return layout_of(picture)
 
 
 def is_taken_upright(layout: Layout, size: tuple[float, float] | None) -> bool:
-    """Whether a camera that comes with a data set belongs to the picture upright, and not as stored.
+    """Return whether a camera that comes with a data set belongs to the picture upright, and not to the
+    pixels as stored.
 
-    `size`: (width, height) of the camera's picture where the data set has it; it may be of a picture that was
-    made smaller or larger. It decides where the turn exchanges width and height and they differ. Everywhere
-    else pixels are as stored, but those of HEIC are upright, for no program reads them otherwise.
+    `size`: (width, height) of the camera's picture if the data set has it; the picture may have been made
+    smaller or larger since. It decides if the turn exchanges width and height and these differ. In all other
+    cases the pixels are taken as stored, except those of HEIC, which are upright, because no program reads
+    them otherwise.
 
     >>> is_taken_upright(Layout(40, 30, 6, False, False), (30, 40))
     True
@@ -98,7 +100,7 @@ def is_taken_upright(layout: Layout, size: tuple[float, float] | None) -> bool:
 
 
 def turned_upright(pixels: np.ndarray, number: int) -> np.ndarray:
-    """Stored pixels [height, width, ...] turned as EXIF's orientation `number` asks for.
+    """Return stored pixels [height, width, ...] turned as EXIF's orientation `number` asks for.
 
     >>> turned_upright(np.array([[1, 2, 3], [4, 5, 6]]), 6).tolist()  # by a quarter, clockwise
     [[4, 1], [5, 2], [6, 3]]
@@ -113,7 +115,7 @@ def turned_upright(pixels: np.ndarray, number: int) -> np.ndarray:
 
 
 def as_stored(pixels: np.ndarray, number: int) -> np.ndarray:
-    """The inverse of `turned_upright`.
+    """Undo `turned_upright`: return upright pixels as they are stored.
 
     >>> as_stored(np.array([[4, 1], [5, 2], [6, 3]]), 6).tolist()
     [[1, 2, 3], [4, 5, 6]]

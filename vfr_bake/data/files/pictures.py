@@ -1,4 +1,4 @@
-"""Picture files: read whole, turned, masked, lens distortion undone, made smaller."""
+"""Read picture files, turn them upright, undo lens distortion, and reduce them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import as_stored, layout_of, read_layout, turned_upright
 
 SHARPNESS_SIDE = 800
-"""Pixels of the longest side at which sharpness is measured: blur that it does not show is below two pixels
-at the working size."""
+"""Pixels of the longest side at which sharpness is measured. Blur that does not show at this size is below
+two pixels at the working size."""
 
 
 class DescribedView(NamedTuple):
-    """A picture file with what a data set says of its camera."""
+    """A picture file with the camera that a data set describes."""
 
     path: Path
     camera: Camera
-    """Scaled to the picture where it speaks of another size."""
+    """The camera. If its size differs from that of the picture, it is scaled to the picture when the picture
+    is read."""
     distortion: dict[str, float]
     """Keyword arguments of `undistort`."""
     upright: bool = False
@@ -37,14 +38,14 @@ class DescribedView(NamedTuple):
 
 
 def viewed_size(view: DescribedView) -> tuple[int, int]:
-    """Width and height of a view's picture, turned as its camera is; the file is not decoded. Raises
-    DataError."""
+    """Return the width and height of a view's picture, turned as its camera is, without decoding the file.
+    Raises DataError."""
     return picture_size(view.path, view.upright)
 
 
 def picture_size(path: Path, upright: bool = False) -> tuple[int, int]:
-    """Width and height of a picture file as `read_picture` returns it; it is not decoded. Raises
-    DataError."""
+    """Return the width and height of a picture as `read_picture` returns it, without decoding the file.
+    Raises DataError."""
     try:
         layout = read_layout(path)
     except FormatError as error:
@@ -53,10 +54,11 @@ def picture_size(path: Path, upright: bool = False) -> tuple[int, int]:
 
 
 def reduced(views: PosedImages, factor: int) -> PosedImages:
-    """The views with pixels `factor` times as large along each side, each the mean of those it replaces.
+    """Return the views with pixels `factor` times as large along each side, each the mean of those it
+    replaces.
 
-    Rows and columns that do not fill a pixel are cut off at the right and below. Raises DataError where
-    nothing would be left.
+    Rows and columns that do not fill a pixel are cut off at the right and below. Raises DataError if nothing
+    would be left.
     """
     if factor == 1:
         return views
@@ -81,21 +83,23 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def premultiplied(image: np.ndarray) -> np.ndarray:
-    """[height, width, 4] float32 in [0, 255]: colours under zero alpha mean nothing, so it is this that has a
-    mean."""
+    """Return the picture with premultiplied alpha, [height, width, 4] float32 in [0, 255]. Means must be
+    taken of this, because colours under zero alpha mean nothing."""
     weighted = image.astype(np.float32)
     weighted[..., :3] *= weighted[..., 3:] / 255
     return weighted
 
 
 def straight(weighted: np.ndarray) -> np.ndarray:
-    """[height, width, 4] uint8 with straight alpha; the inverse of `premultiplied`, in place."""
+    """Return the picture with straight alpha, [height, width, 4] uint8: the inverse of `premultiplied`. It
+    works in place, and changes `weighted`."""
     weighted[..., :3] /= np.maximum(weighted[..., 3:], 1e-6) / 255
     return (weighted + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def enough_for(size: tuple[int, int], side: int) -> tuple[int, int]:
-    """Width and height of a picture of this `size` that is reduced until no side is longer than `side`.
+    """Return the width and height of a picture of this `size` once it is reduced so that no side is longer
+    than `side`.
 
     >>> enough_for((4000, 3000), 1600), enough_for((40, 30), 1600)
     ((1600, 1200), (40, 30))
@@ -105,16 +109,18 @@ def enough_for(size: tuple[int, int], side: int) -> tuple[int, int]:
 
 
 def read_picture(path: Path, upright: bool = False, least: tuple[int, int] | None = None) -> np.ndarray:
-    """A picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures too.
+    """Read a picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures
+    too.
 
-    `upright`: turned as EXIF says that it is to be looked at, not as stored. `least`: width and height, of
-    the picture as it is returned, that are enough. A JPEG file that is twice, four or eight times as large is
-    then decoded at a half, a quarter or an eighth of its size, rounded up, in a fraction of the time.
+    `upright`: the picture is turned as EXIF says that it is to be looked at; otherwise it is as stored.
+    `least`: a width and height that are enough for the returned picture. A JPEG file that is twice, four or
+    eight times as large is then decoded at a half, a quarter or an eighth of its size, rounded up, in a
+    fraction of the time.
 
     Raises DataError for what Pillow cannot read to its end, and for floating-point pictures.
     """
     try:
-        with open_photograph(path) as file:  # so that one of 16 bits is no larger than one of 8 may be, too
+        with open_photograph(path) as file:  # also for 16 bits, so that the same limits hold
             layout = layout_of(file)
             if least is not None:
                 swapped = upright != layout.turned and layout.number >= 5
@@ -141,7 +147,7 @@ def _decoded(path: Path, file: Image.Image) -> np.ndarray:
 
 
 def _is_16_bit_colour(path: Path) -> bool:
-    """Whether a PNG has 16-bit colour channels, of which Pillow would drop the lower halves."""
+    """Return whether a PNG has 16-bit colour channels, whose lower bytes Pillow would drop."""
     with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         header = file.read(26)
     return (
@@ -168,7 +174,8 @@ def _read_16_bit_colour(path: Path) -> np.ndarray:
 
 
 def opencv(wanted: str, extra: str = "poses") -> Any:
-    """OpenCV. Raises MissingExtraError: `wanted`, and the extra of this project that brings it."""
+    """Return OpenCV. Raises MissingExtraError, which says what was `wanted` and which `extra` of this project
+    brings OpenCV."""
     try:
         import cv2
     except ImportError as error:
@@ -177,11 +184,11 @@ def opencv(wanted: str, extra: str = "poses") -> Any:
 
 
 def sharpness(cv2: Any, image: np.ndarray) -> float:
-    """Mean square of the second derivative of the grey levels of a picture [height, width, 3 or 4] uint8,
+    """Return the mean square of the Laplacian of the grey levels of a picture, [height, width, 3 or 4] uint8,
     where it is not transparent.
 
-    Blur of any direction lowers it. It compares pictures that show the same, of which it finds the sharpest:
-    a plain wall has none. Which pictures of a capture are blurred is told by `vfr_bake.data.quality`.
+    Blur in any direction lowers it. It is for finding the sharpest of several pictures that show the same: a
+    plain wall has none. Which pictures of a capture are blurred is found by `vfr_bake.data.quality`.
     """
     small = shrunk(cv2, image, SHARPNESS_SIDE)
     squares = np.square(cv2.Laplacian(cv2.cvtColor(small[..., :3], cv2.COLOR_RGB2GRAY), cv2.CV_32F))
@@ -191,7 +198,8 @@ def sharpness(cv2: Any, image: np.ndarray) -> float:
 
 
 def shrunk(cv2: Any, image: np.ndarray, side: int, interpolation: int | None = None) -> np.ndarray:
-    """A picture reduced by OpenCV until no side is longer than `side` pixels, by areas if not told how."""
+    """Return a picture reduced by OpenCV until no side is longer than `side` pixels, by areas unless an
+    `interpolation` is given."""
     scale = side / max(image.shape[:2])
     if scale >= 1:
         return image
@@ -209,11 +217,12 @@ def undistort(
     p1: float = 0.0,
     p2: float = 0.0,
 ) -> np.ndarray:
-    """The picture that `camera` would have taken without lens distortion; same size, same intrinsics.
+    """Return the picture that `camera` would have taken without lens distortion; same size, same intrinsics.
 
     The lens model is OpenCV's with nerfstudio's fourth radial term: with r² = x² + y² at x, y = ray / depth,
-    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²), y' the like with p1, p2 exchanged.
-    (`cv2.undistort` has no k4 of this meaning.) Pixels that the lens never saw repeat the picture's edge.
+    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²), and y' likewise with x, y and p1,
+    p2 exchanged. (`cv2.undistort` has no k4 of this meaning.) Pixels that the lens never saw repeat the
+    picture's edge.
 
     `image`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
     """

@@ -1,8 +1,8 @@
-"""Pictures that show what another one shows: bursts, copies, and a camera that stood still.
+"""Find pictures that show what another one shows: bursts, copies, and those of a camera that stood still.
 
-They teach nothing new, and the mapper measures depth badly between them. Two pictures show the same if nearly
-all their features match and have hardly moved: a step that tells depth moves a subject by several hundredths
-of the picture.
+Such pictures teach nothing new, and the mapper measures depth badly between them. Two pictures show the same
+if enough of their features match and nearly all of the matches have hardly moved. A step that tells depth
+moves a subject by several hundredths of the picture.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import numpy as np
 from vfr_bake.data.features import Features, match
 
 MAX_SHIFT = 0.005
-"""Share of the longer side by which features may move: 8 of 1600 pixels, a hand that is held still."""
+"""Distance by which features may move, as a share of the longer side: 8 of 1600 pixels, as with a hand that
+is held still."""
 QUANTILE = 0.9
-"""This share of the matches moves by no more than that."""
+"""Share of the matches that must move by less than MAX_SHIFT."""
 MIN_MATCHES = 50
 MIN_SHARE = 0.3
-"""Share of the features of either picture that match the other's, at least."""
+"""Smallest share of the features of either picture that must match the other's."""
 SAME = 1.5
-"""Grey levels of 255, mean difference of thumbnails: what a camera's noise is below on a tripod."""
+"""Mean difference of two thumbnails, in grey levels of 255, below which pictures look alike. The noise of a
+camera on a tripod stays below it."""
 
 
 def repeats(
@@ -30,10 +32,11 @@ def repeats(
     thumbnails: np.ndarray,
     sharpness: Sequence[float],
 ) -> dict[int, int]:
-    """The numbers of pictures that are not needed, and of the picture that shows the same and is kept.
+    """Return the numbers of pictures that are not needed, each with the number of the picture that shows the
+    same and is kept.
 
-    Each picture is compared with the last one that was different, and with all that look alike at first
-    sight; of those that show the same the sharpest is kept.
+    Each picture is compared with the last one that was different, and with all whose thumbnails look alike.
+    Of those that show the same, the sharpest is kept.
 
     `features`: of each picture, in order. `sizes`: (width, height). `thumbnails`: [n, n_pixels] grey levels.
     `sharpness`: larger for sharper.
@@ -64,7 +67,7 @@ def repeats(
 
 
 def show_same(a: Features, b: Features, size: tuple[int, int]) -> bool:
-    """Whether two pictures of one size (width, height) show the same from the same place."""
+    """Return whether two pictures of one size (width, height) show the same from the same place."""
     pairs = match(a.descriptors, b.descriptors)
     if len(pairs) < max(MIN_MATCHES, MIN_SHARE * max(len(a.points), len(b.points))):
         return False

@@ -1,10 +1,10 @@
-"""A video -> a folder of its sharpest frames, taken where the camera has moved.
+"""Write the sharpest frames of a video into a folder, one each time that the camera has moved.
 
-The video is read once, one frame at a time, however long it is. How far the camera has moved is measured by
-optical flow between small grey frames. Where it has moved by `STEP` of the picture, a stretch ends, and the
-sharpest frame of each stretch is kept. A camera that stands still gives one frame, and one that hurries more
-of them. If the stretches get too many, every two become one, and the step doubles: so a walk of an hour takes
-no more memory and no more disk than one of a minute.
+The video is read once, one frame at a time, however long it is. The movement of the camera is measured by
+optical flow between small grey frames. Each time that the picture has moved by `STEP`, a stretch of the video
+ends, and the sharpest frame of the stretch is kept. A camera that stands still gives one frame, and one that
+hurries gives more. If there are too many stretches, every two become one, and the step doubles. So a walk of
+an hour takes no more memory and no more disk than one of a minute.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ from vfr_bake.data.threads import Progress
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 STEP = 0.03
-"""The shortest stretch: what the picture moves by, as a share of its longer side. A step of 4.5 degrees
-around a subject moves it by some 0.05."""
+"""Movement of the picture in the shortest stretch, as a share of its longer side. A step of 4.5 degrees
+around a subject moves the picture by some 0.05."""
 MOST_FRAMES = 160
-"""Twice as many as are enough for a walk around a subject; where there are more, every two become one."""
+"""Number of frames at most, twice as many as are enough for a walk around a subject. If there are more, every
+two stretches become one."""
 MAX_SIDE = 1920
-"""Frames are reduced to this: a video's compression leaves nothing finer, and 160 frames of 4K are 5 GB."""
+"""Pixels of the longer side to which frames are reduced: a video's compression leaves nothing finer, and 160
+frames of 4K are 5 GB."""
 FLOW_SIDE = 160
-"""Pixels of the longer side of the frames that are compared for how far the camera has moved."""
+"""Pixels of the longer side of the frames between which optical flow is measured."""
 
 
 def frames_folder(video: Path) -> Path:
-    """The folder in which the frames of a video are kept: `walk.mp4` -> `walk_frames`.
+    """Return the folder in which the frames of a video are kept: `walk.mp4` -> `walk_frames`.
 
     >>> frames_folder(Path("a/walk.mp4")).name
     'walk_frames'
@@ -44,10 +46,10 @@ def frames_folder(video: Path) -> Path:
 def extract_frames(video: Path, progress: Progress) -> Path:
     """Write at most `MOST_FRAMES` frames of `video` as JPEG files into `<stem>_frames/images/` beside it.
 
-    Each is the sharpest of a stretch in which the camera has moved by the same part of the picture: a
+    Each is the sharpest of a stretch in which the picture has moved by the same share of its size, because a
     hand-held camera shakes, and one frame in three is blurred. `progress`: called with the number of frames
-    looked at and to look at. The folder appears when it is complete; one that is there is taken as it is.
-    Returns it.
+    looked at and to look at. The folder appears when it is complete; one that exists is used as it is.
+    Returns the folder.
 
     Raises DataError (not a video, no frames), OutputError, MissingExtraError.
     """
@@ -55,10 +57,10 @@ def extract_frames(video: Path, progress: Progress) -> Path:
     if (folder / "images").is_dir():
         return folder
     cv2 = opencv(f"{video}: video: expected OpenCV to read it")
-    # Turned upright by OpenCV where the file says how the camera was held.
+    # OpenCV turns the frames upright where the file says how the camera was held.
     capture = cv2.VideoCapture(str(video))
     try:
-        # The count in a video's header is a guess, and some have none.
+        # The count in a video's header is a guess, and some videos have none.
         n_frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
         read, frame = capture.read() if capture.isOpened() else (False, None)
         if not read:
@@ -92,7 +94,7 @@ class _Stretches:
         self._best: tuple[float, np.ndarray] | None = None
 
     def add(self, frame: Any) -> None:
-        """The next frame [height, width, 3], blue first."""
+        """Add the next frame [height, width, 3], blue first."""
         cv2 = self._cv2
         small = shrunk(cv2, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), FLOW_SIDE)
         if self._before is not None and min(small.shape) >= 16 and small.shape == self._before.shape:
@@ -107,7 +109,7 @@ class _Stretches:
             self._best = sharp, frame
 
     def finish(self) -> None:
-        """End the last stretch, and number the frames that are kept."""
+        """End the last stretch, and rename the frames that are kept to their numbers."""
         if self._best is not None:
             self._end_stretch()
         for number, (_, path) in enumerate(self._kept):

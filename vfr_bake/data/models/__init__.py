@@ -1,1 +1,1 @@
-"""What becomes of the models that the mapper builds: folds are found, and parts are joined."""
+"""Corrections to the models that the mapper builds: folds are found, and parts are joined."""

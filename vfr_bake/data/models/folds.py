@@ -1,10 +1,11 @@
-"""Models that are folded, because the subject looks the same from two sides.
+"""Find models that are folded, because the subject looks the same from two sides, and the pairs that unfold
+them.
 
-A can whose label is printed twice matches itself across the walk around it: a model built from all matches
-takes opposite sides for one, and tears pictures that follow each other apart. The matches of the label agree
-with one geometry, so that nothing in a single pair tells. The walk does: pictures that follow each other
-nearly always show the same side, and a model of them alone says how far the cameras of all other pairs are
-turned. Pairs whose own geometry says something else are left out.
+A can whose label is printed twice matches itself across the walk around it. A model built from all matches
+takes opposite sides for one, and tears apart pictures that follow each other. The matches of the label agree
+with one geometry, so that a single pair does not reveal the mistake. The walk does: pictures that follow each
+other nearly always show the same side, and a model of them alone says how far the cameras of every other pair
+are turned. Pairs whose own geometry says something else are left out.
 """
 
 from __future__ import annotations
@@ -24,20 +25,21 @@ from vfr_bake.data.threads import Progress, in_threads
 
 MIN_KEPT = 0.1
 """Share of the matches of two pictures that follow each other which a model must keep as points that both
-see: it keeps more than half (fox and can: 0.52 to 0.97), and 0 to 0.02 where it is folded."""
+see. It keeps more than half (fox and can: 0.52 to 0.97), and 0 to 0.02 where it is folded."""
 MAX_TURN = 30.0
-"""Degrees between what a pair's own geometry says of the turn and what the walk does. Walks drift, and two
-views of a plane are off by some 10 degrees: of can's pairs that are a lap apart nine in ten are within it,
-and those of opposite sides are off by 90 to 180."""
+"""Largest difference, in degrees, between the turn by a pair's own geometry and the turn by the walk. Walks
+drift, and two views of a plane are off by some 10 degrees: of can's pairs that are a lap apart nine in ten
+are within the limit, and those of opposite sides are off by 90 to 180."""
 WALK_TURN, LEAP_TURN = 20.0, 60.0
-"""Degrees: pictures are a walk if half of them turn by less than the first from one to the next, and leap
-where one turns by more than the second."""
+"""Degrees. Pictures are a walk if half of them turn by no more than WALK_TURN from one to the next. They leap
+where one turns by more than LEAP_TURN."""
 
 
 def torn_neighbours(model: Any, names: Sequence[str], pairs: Sequence[Pair]) -> list[tuple[int, int]]:
-    """The pairs (i, i + 1) that match, but of whose matches a `pycolmap.Reconstruction` keeps next to none.
+    """Return the pairs (i, i + 1) that match, but of whose matches a `pycolmap.Reconstruction` keeps next to
+    none.
 
-    `names`: of the pictures, in the order of their numbers.
+    `names`: names of the pictures, in the order of their numbers.
     """
     points = {
         image.name: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
@@ -56,7 +58,7 @@ def torn_neighbours(model: Any, names: Sequence[str], pairs: Sequence[Pair]) -> 
 
 
 def near_pairs(pairs: Sequence[Pair]) -> list[Pair]:
-    """The pairs of pictures that (nearly) follow each other."""
+    """Return the pairs of pictures that (nearly) follow each other."""
     return [pair for pair in pairs if _is_near(pair)]
 
 
@@ -71,8 +73,8 @@ def agreeing_pairs(
     pairs: Sequence[Pair],
     progress: Progress,
 ) -> list[Pair]:
-    """The near pairs, and those of the others whose turn is the one that `walk`, the model of the near ones,
-    has: where it comes by again."""
+    """Return the near pairs, and those other pairs whose own turn agrees with that in `walk`, the model of
+    the near pairs: they connect the places that the walk comes by again."""
     images: dict[str, Any] = {image.name: image for image in walk.images.values() if image.has_pose}
 
     def agrees(pair: Pair) -> bool:
@@ -92,10 +94,11 @@ def agreeing_pairs(
 
 
 def torn_views(views: PosedImages) -> list[tuple[str, str]]:
-    """Names of neighbours in a walk whose given cameras leap apart, and which match as if they did not.
+    """Return the names of neighbours in a walk whose given cameras leap apart, although their matches say
+    that they do not.
 
-    A hint that the cameras were estimated elsewhere and are folded; needs OpenCV and pycolmap only where
-    cameras leap. Raises MissingExtraError.
+    This is a hint that the cameras were estimated elsewhere and are folded. OpenCV and pycolmap are needed
+    only if cameras leap. Raises MissingExtraError.
     """
     opencv_from_opengl = OPENGL_FROM_OPENCV[:3, :3].T
     rotations = [opencv_from_opengl @ camera.c2w[:3, :3].T for camera in views.cameras]
@@ -122,8 +125,8 @@ def _pinhole(camera: Camera) -> Any:
 
 
 def _own_turn(cameras: Sequence[Any], points: Sequence[np.ndarray], matches: np.ndarray) -> np.ndarray | None:
-    """[3, 3] rotation from the first to the second of two `pycolmap.Camera`s that most matches of their
-    `points` agree with; None if too few agree with any."""
+    """Return the rotation [3, 3] from the first to the second of two `pycolmap.Camera`s with which most
+    matches of their `points` agree; None if too few agree with any."""
     options = two_view_options()
     options.compute_relative_pose = True
     own = pycolmap_module().estimate_calibrated_two_view_geometry(
@@ -135,5 +138,5 @@ def _own_turn(cameras: Sequence[Any], points: Sequence[np.ndarray], matches: np.
 
 
 def _angle(rotation: np.ndarray) -> float:
-    """Angle of a rotation [3, 3] in degrees."""
+    """Return the angle of a rotation [3, 3] in degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))

@@ -1,9 +1,9 @@
-"""Several models of one scene -> one.
+"""Join several models of one scene into one.
 
 The mapper begins another model with pictures that the first one could not take, and takes up to twenty that
 the first one has as well. Points that such pictures see in both models tell how the second one lies in the
-first (a similarity); its other pictures are then placed, all points are found again from the matches, and
-everything is adjusted together.
+first (a similarity). The other pictures of the second one are then placed, all points are triangulated again
+from the matches, and everything is adjusted together.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from typing import Any
 from vfr_bake.data.mapping import adjust, pycolmap_module
 
 MIN_COMMON = 3
-"""Pictures that two models must share: fewer do not tell how one lies in the other."""
+"""Number of pictures that two models must share: fewer do not tell how one lies in the other."""
 MIN_SEEN = 30
-"""Points that each picture must see afterwards: as many as the mapper itself asks for."""
+"""Number of points that each picture must see in the joined model: as many as the mapper itself asks for."""
 MAX_ERROR = 2.0
-"""Pixels: mean error of the joined model at most; one of the mapper's has less than one."""
+"""Largest mean reprojection error of the joined model, in pixels. A model of the mapper has less than one."""
 
 
 def joined(models: Sequence[Any], database: Path, pictures: Path) -> list[Any]:
-    """The `pycolmap.Reconstruction`s, the largest first, of which all that fit the largest are part of it.
+    """Return the `pycolmap.Reconstruction`s, the largest first, once all that fit the largest have been
+    joined into it.
 
-    `database`: what they were built from, of pictures that have a frame of their own each.
+    `database`: what they were built from; each of its pictures has a frame of its own.
     """
     left = sorted(models, key=lambda model: -model.num_reg_images())
     tried = 0
@@ -36,12 +37,12 @@ def joined(models: Sequence[Any], database: Path, pictures: Path) -> list[Any]:
             tried += 1
         else:
             left = [both, *left[1 : 1 + tried], *left[2 + tried :]]
-            tried = 0  # what did not fit the smaller one may fit this one
+            tried = 0  # models that did not fit before may fit the joined one
     return left
 
 
 def _both(first: Any, second: Any, database: Path, pictures: Path) -> Any | None:
-    """The two models as one; None if they do not fit."""
+    """Return the two models as one; None if they do not fit."""
     pycolmap = pycolmap_module()
     names = {image.name for image in first.images.values() if image.has_pose}
     others = {image.name: image for image in second.images.values() if image.has_pose}
@@ -68,7 +69,7 @@ def _both(first: Any, second: Any, database: Path, pictures: Path) -> Any | None
 
 
 def _add(both: Any, model: Any, image: Any) -> None:
-    """Put an image of `model` where it is there into the model `both`, without what it sees."""
+    """Add an image of `model` with its pose to the model `both`, without the points that it sees."""
     pycolmap = pycolmap_module()
     if not both.exists_camera(image.camera_id):
         both.add_camera(model.camera(image.camera_id))

@@ -1,1 +1,1 @@
-"""What is measured of pictures before anything is learned from them."""
+"""Measurements of the quality of pictures, made before anything is learned from them."""

@@ -1,9 +1,9 @@
-"""Which pictures of a capture are blurred: shaken, or out of focus.
+"""Find the pictures of a capture that are blurred: shaken, or out of focus.
 
 The measure is that of Crete et al., "The blur effect", 2007, as scikit-image has it: blur a picture once
-more, and see how much of its differences from pixel to pixel is lost. A sharp picture loses much, a blurred
-one has little to lose. It lies between 0 (sharp) and 1, and depends on the subject as well. So a picture is
-compared with the others of its capture, and with none from elsewhere.
+more, and see how much of the differences between neighbouring pixels is lost. A sharp picture loses much, a
+blurred one has little to lose. The measure lies between 0 (sharp) and 1, and depends on the subject as well.
+So a picture is compared only with the others of its own capture.
 """
 
 from __future__ import annotations
@@ -17,22 +17,25 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.threads import Progress, in_threads
 
 SIDE = 512
-"""Pixels of the longest side on which blur is measured: what is blurred there is so at any size."""
+"""Pixels of the longest side at which blur is measured, at most. A picture that is blurred at this size is
+also blurred at any larger one."""
 WINDOW = 11
-"""Pixels that the picture is blurred over once more."""
+"""Pixels along the window with which the picture is blurred once more."""
 SMALLEST = 2 * WINDOW
-"""Pixels of the shortest side from which on blur can be told."""
+"""Pixels of the shortest side, at least, for blur to be measured."""
 FAR_OFF, LEAST_DIFFERENCE = 5.0, 0.08
-"""A picture is blurred if it is above the median by so many median absolute deviations, and by so much."""
+"""A picture is blurred if its blur exceeds the median by more than FAR_OFF median absolute deviations and by
+more than LEAST_DIFFERENCE."""
 FEWEST = 8
-"""Fewer pictures have no typical one to be compared with."""
+"""Of fewer pictures none is called blurred, because they have no typical one to be compared with."""
 
 
 def blur(image: np.ndarray) -> float:
-    """How blurred an image [height, width, 3 or 4] uint8 is, from 0 (sharp) to 1, along its worse direction.
+    """Return how blurred an image [height, width, 3 or 4] uint8 is, from 0 (sharp) to 1, along its worse
+    direction.
 
-    0 where the picture is too small to tell. Raises ShapeError: it is no such image; MissingExtraError: no
-    scikit-image.
+    Returns 0 where the picture is too small to tell. Raises ShapeError: it is no such image;
+    MissingExtraError: no scikit-image.
 
     >>> noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     >>> smooth = np.cumsum(noise // 64, axis=1).astype(np.uint8)
@@ -56,15 +59,15 @@ def blur(image: np.ndarray) -> float:
         grey = grey * (image[:height, :width, 3] / np.float32(255))
     small = grey.reshape(height // every, every, width // every, every).mean(axis=(1, 3))
     if small.min() == small.max():
-        return 0.0  # a plain picture has nothing to be blurred
+        return 0.0  # a plain picture has nothing that could be blurred
     return float(np.max(blur_effect(small, h_size=WINDOW)))
 
 
 def blurred(blurs: Sequence[float]) -> list[int]:
-    """The numbers of the pictures that are blurred among those of one capture, ascending, of each one's
-    `blur`.
+    """Return the numbers, ascending, of the blurred pictures among those of one capture, from the `blur` of
+    each.
 
-    None of fewer than FEWEST pictures, and none where they are all alike.
+    The list is empty for fewer than FEWEST pictures, and for pictures that are all alike.
 
     >>> blurred([0.3, 0.31, 0.29, 0.3, 0.33, 0.3, 0.6, 0.28, 0.3])
     [6]
@@ -81,7 +84,7 @@ def blurred(blurs: Sequence[float]) -> list[int]:
 
 
 def without_blurred(views: PosedImages, progress: Progress | None = None) -> tuple[PosedImages, list[str]]:
-    """The views without those that are blurred, and the names of these.
+    """Return the views that are not blurred, and the names of those that are.
 
     `progress`: called with the number of pictures done and to do.
 

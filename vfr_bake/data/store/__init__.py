@@ -1,2 +1,2 @@
-"""Pictures at the size that is trained on: held in memory where they are few, on the disk where they are
+"""Pictures at the size at which they are trained on: held in memory if they are few, on the disk if they are
 many."""

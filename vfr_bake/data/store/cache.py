@@ -1,9 +1,10 @@
-"""The folder of the pictures that are kept between runs: what is found there, made and removed.
+"""The folder of the pictures that are kept between runs: its sets are found, made and removed here.
 
-One folder a set of pictures, named by a digest of everything that its pixels depend on: paths, sizes and
-times of the files, cameras and lenses, the working size. A picture that changed is therefore not found, and
-read again. `index.json` says what is in `pixels.bin`; `models.txt` names the models that were trained on
-it, and its time is that of the last use. A set is removed when its models are, and when room is needed.
+There is one folder for each set of pictures, named by a digest of everything that the pixels depend on:
+paths, sizes and times of the files, cameras (without their poses) and lenses, and the working size. If a
+picture changes, its set is therefore not found, and the pictures are read again. `index.json` says what is in
+`pixels.bin`. `models.txt` names the models that were trained on the set, and its modification time is the
+time of the last use. A set is removed once its models are gone, or if its room is needed.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from vfr_bake.data.store.working import WorkingSize
 
 VERSION = 1
 MOST_BYTES = 64_000_000_000
-"""Bytes that all sets take together; those that were not used for longest go first."""
+"""Bytes that all sets may take together; the sets that were not used for longest are removed first."""
 GRACE = 600.0
-"""Seconds since its last use in which no set is removed: its model may be about to be written."""
+"""Seconds after its last use in which a set is not removed: its model may be about to be written."""
 RESERVE = 500_000_000
 """Bytes that stay free on the disk."""
 INDEX, PIXELS, MODELS = "index.json", "pixels.bin", "models.txt"
@@ -46,13 +47,14 @@ class Kept(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """The user's folder of cached pictures: `$XDG_CACHE_HOME/vfr-bake/pictures`, by default in `~/.cache` on
-    Linux, where macOS and Windows have theirs."""
+    """Return the user's folder of kept pictures: `$XDG_CACHE_HOME/vfr-bake/pictures`, by default in
+    `~/.cache` on Linux, and where macOS and Windows have such folders."""
     return user_folder() / "pictures"
 
 
 def digests(described: Sequence[DescribedView], sizes: Sequence[WorkingSize]) -> list[str]:
-    """The names of the sets of these pictures at each of the sizes. Raises OSError: one is gone."""
+    """Return the names of the sets of these pictures, one for each of the sizes. Raises OSError: a picture is
+    gone."""
     parts = [_described(part) for view in described for part in view]
     told = "".join(map(repr, parts)).encode(errors="surrogateescape")
     heads = [json.dumps([VERSION, asdict(size)]).encode() for size in sizes]
@@ -69,8 +71,8 @@ def _described(part: object) -> object:
 
 
 def opened(folder: Path, described: Sequence[DescribedView]) -> Kept | None:
-    """The set in `folder`, with the cameras of the pictures as they are `described`; None where there is
-    none, or none that is whole."""
+    """Open the set in `folder`, with the poses of the pictures as they are `described`; None if there is no
+    set, or none that is whole."""
     try:
         index = parse_json(read_json(folder / INDEX, "an index of pictures"), str(folder))
         if index["version"] != VERSION or len(index["intrinsics"]) != len(described):
@@ -89,7 +91,7 @@ def opened(folder: Path, described: Sequence[DescribedView]) -> Kept | None:
 
 
 def index_bytes(layout: Layout, cameras: Sequence[Camera], n_channels: int, transparent: set[int]) -> bytes:
-    """The `index.json` of a set."""
+    """Return the content of a set's `index.json`."""
     document: dict[str, Any] = {
         "version": VERSION,
         "n_channels": n_channels,
@@ -102,7 +104,7 @@ def index_bytes(layout: Layout, cameras: Sequence[Camera], n_channels: int, tran
 
 @contextmanager
 def new_set(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well. Raises OutputError."""
+    """Yield a temporary folder that becomes `folder` when the block ends well. Raises OutputError."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
@@ -112,7 +114,8 @@ def new_set(folder: Path) -> Iterator[Path]:
 
 
 def reserve(path: Path, n_bytes: int) -> None:
-    """Make a file of so many bytes, which the disk then has. Raises OSError: it has not."""
+    """Make a file of `n_bytes`, and reserve its room on the disk if the system can. Raises OSError: there is
+    no room."""
     with path.open("wb") as file:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(file.fileno(), 0, n_bytes)
@@ -121,13 +124,14 @@ def reserve(path: Path, n_bytes: int) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Bytes that may be written into `folder`, which need not be there. Raises OSError."""
+    """Return the number of bytes, beyond RESERVE, that may be written into `folder`, which need not exist.
+    Raises OSError."""
     there = next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
     return max(0, shutil.disk_usage(there).free - RESERVE)
 
 
 def note_use(folder: Path, model: Path) -> None:
-    """Write down that `model` is trained on the set in `folder`, now."""
+    """Record that `model` is trained on the set in `folder`, now."""
     with suppress(OSError):
         known = _models(folder)
         name = str(model.absolute())
@@ -135,8 +139,8 @@ def note_use(folder: Path, model: Path) -> None:
 
 
 def remove_unused(root: Path, wanted: int, keep: Path) -> None:
-    """Remove the sets in `root` whose models are all gone, and the oldest ones until `wanted` more bytes are
-    allowed and the disk has them; never `keep`, nor one that was used just now."""
+    """Remove the sets in `root` whose models are all gone, and the oldest others until `wanted` more bytes
+    are allowed and the disk has them. `keep`, and sets that were used just now, are never removed."""
     now = time.time()
     sets = []
     with suppress(OSError):

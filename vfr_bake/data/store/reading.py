@@ -1,4 +1,4 @@
-"""Described pictures -> posed pictures at the working size, in memory or on the disk."""
+"""Read described pictures as posed pictures at the working size, into memory or onto the disk."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import Progress, in_threads, n_threads, one_by_one
 
 HELD_BYTES = 1_000_000_000
-"""Pictures that take no more than this are held in memory, nor more than a quarter of what there is for the
-program: the trainer has another copy of those that it learns from."""
+"""Pictures are held in memory if they take no more than this, and no more than a quarter of what the program
+may use: the trainer has another copy of those that it learns from."""
 DECODING_BYTES = 1_000_000_000
-"""Memory for pictures that are being decoded: large ones are read by fewer threads."""
+"""Memory for pictures that are being decoded: the larger they are, the fewer threads read them."""
 LEAST_SIDE = 480
 """Pixels: the longest side is not made smaller than this for want of room."""
 STEP = 16
 """Pixels: a side that is made smaller for want of room is a multiple of this."""
 OPAQUE = (".jpg", ".jpeg", ".heic", ".heif", ".hif")
-"""Photographs that end in one of these have no alpha: three channels are stored."""
+"""Suffixes of photographs that are expected to have no alpha: three channels are stored."""
 
 
 class _TransparentError(Exception):
@@ -44,7 +44,7 @@ class _TransparentError(Exception):
 
 
 class PictureReader:
-    """Reads the pictures of a data set at the working size.
+    """A reader of the pictures of a data set at the working size.
 
     >>> PictureReader(WorkingSize(1600)).size.size(4000, 3000)
     (1600, 1200)
@@ -63,22 +63,24 @@ class PictureReader:
 
         Args:
             size: the working size; None for pictures as they are.
-            model: the model that is trained on them, with which what is kept goes.
-            on_disk: whether pictures that take too much memory are read from the disk.
-            kept: whether they stay there for the next run.
-            may_shrink: whether the pictures may be smaller where the disk has no room.
+            model: the model that is trained on them; pictures that are kept are removed once it is gone.
+            on_disk: whether pictures that would take too much memory are written to the disk and read from
+                it.
+            kept: whether they stay on the disk for the next run.
+            may_shrink: whether the working size may become smaller if the disk has no room.
             say: called with a sentence on what was chosen.
         """
         self.size = size or WorkingSize()
-        """The working size; after reading the one that was used."""
+        """The working size; after `read`, the one that was used."""
         self._model, self._on_disk, self._kept = model, on_disk, kept
         self._may_shrink = may_shrink
         self._say = say or (lambda text: None)
 
     def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
-        """The pictures with the pinhole cameras that would have taken them.
+        """Read the pictures, with the pinhole cameras that would have taken them.
 
-        Raises DataError (a picture), OutputError (a disk without room for them; what is missing).
+        Raises DataError (a picture), OutputError (a disk without room for them, or that cannot be written
+        to).
         """
         sizes = in_threads(viewed_size, described, None)
         if not self._on_disk or _n_bytes(sizes, self.size, 4) <= held_bytes():
@@ -92,7 +94,7 @@ class PictureReader:
                 shutil.rmtree(each, ignore_errors=True)
         n_channels, free = _n_channels(described), cache.free_bytes(root)
         found, folder = None, folders[0]
-        # Where the disk has no room for larger ones, an earlier run may have kept smaller ones.
+        # If the disk has no room at one size, an earlier run may have kept the pictures at a smaller one.
         for size, folder in zip(candidates, folders, strict=True):
             found = cache.opened(folder, described)
             if found is not None:
@@ -123,7 +125,7 @@ class PictureReader:
         return max(max(self.size.size(*size)) for size in sizes)
 
     def _smaller(self, sizes: Sequence[tuple[int, int]]) -> list[WorkingSize]:
-        """The working sizes that `_fit` may choose, the largest first."""
+        """Return the working sizes that `_fit` may choose, the largest first."""
         if not self._may_shrink:
             return []
         sides = range((self._longest(sizes) - 1) // STEP * STEP, LEAST_SIDE - 1, -STEP)
@@ -151,7 +153,7 @@ class PictureReader:
         return PosedImages(cameras, images)
 
     def _fit(self, sizes: Sequence[tuple[int, int]], root: Path, n_channels: int) -> None:
-        """Make the working size smaller if the disk has too little room. Raises OutputError."""
+        """Make the working size smaller if the disk has too little room. Raises OutputError if it cannot."""
         free, needed = cache.free_bytes(root), _n_bytes(sizes, self.size, n_channels)
         if needed <= free:
             return
@@ -187,7 +189,8 @@ class PictureReader:
                     self._fill(new, layout, described, sizes, n_channels, progress)
                     return _whole(new, described)
                 finally:
-                    # What is mapped stays until the process ends, where systems have it so.
+                    # Where the system allows it, the file is deleted now and stays mapped until the process
+                    # ends. Windows cannot delete it now, so it is tried again at the end.
                     shutil.rmtree(new, ignore_errors=True)
                     if os.name == "nt":
                         atexit.register(shutil.rmtree, new, ignore_errors=True)
@@ -236,17 +239,18 @@ class PictureReader:
 
 
 def held_bytes() -> int:
-    """Bytes of pictures that are held in memory."""
+    """Return the number of bytes of pictures that may be held in memory."""
     return min(HELD_BYTES, allowed_bytes() // 4)
 
 
 def _n_bytes(sizes: Sequence[tuple[int, int]], size: WorkingSize, n_channels: int) -> int:
-    """Bytes that pictures of these sizes take at the working size."""
+    """Return the bytes that pictures of these sizes take at the working size."""
     return sum(math.prod(size.size(*each)) for each in sizes) * n_channels
 
 
 def _n_channels(described: Sequence[DescribedView]) -> int:
-    """Channels that the pictures are likely to take, as far as their names and masks tell."""
+    """Return the number of channels that the pictures are likely to need, as far as their names and masks
+    tell."""
     opaque = all(view.mask is None and view.path.suffix.lower() in OPAQUE for view in described)
     return 3 if opaque else 4
 
@@ -266,7 +270,7 @@ def _no_room(folder: Path, needed: int, free: int) -> str:
 
 
 def _named(sizes: Sequence[tuple[int, int]]) -> str:
-    """Sizes in words, the most frequent first.
+    """Return sizes in words, the most frequent first.
 
     >>> _named([(4, 3), (3, 4), (4, 3)]), _named([(1, 1), (2, 2), (3, 3), (4, 4)])
     ('4x3 and 3x4', '1x1 and 3 other sizes')

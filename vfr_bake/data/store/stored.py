@@ -1,13 +1,14 @@
-"""Pictures in one file on a disk, which is mapped into memory, in an order that random draws like.
+"""Pictures in one file on a disk, mapped into memory, in an order that suits random draws.
 
-A step of training wants some hundred pixels from anywhere in all pictures. Read from the pictures where they
-lie, each would be a page of the disk of its own. So every picture's pixels are written in another order, in
-which neighbours come from far apart, and each picture is cut in that order into as many pieces as there are
-*chunks*. A chunk of the file holds one piece of every picture: an even sample of all of them, read at once.
+A step of training wants some hundred pixels from anywhere in all pictures. If pictures lay in the file as
+they are, each of these pixels would need its own page of the disk. So every picture's pixels are written in
+another order, in which neighbours come from far apart. In that order each picture is cut into as many pieces
+as there are *chunks*. A chunk of the file holds one piece of every picture: an even sample of all of them,
+read at once.
 
 The pixel at place p of a picture of n pixels is number (stride p) mod n. The stride is about n times the
 golden ratio and has no common factor with n: any run of places is then spread evenly over the picture, and
-a picture's order takes no memory. Pictures have three channels in the file if all are opaque, else four.
+the order of a picture takes no memory. Pictures have three channels in the file if all are opaque, else four.
 """
 
 from __future__ import annotations
@@ -24,27 +25,28 @@ import numpy as np
 from vfr_bake.data.capture import StoredImages
 
 PIXELS_OF_A_PIECE = 8192
-"""A piece is some 24 kB: a disk reads and writes that about as fast as if it were one file's."""
+"""Approximate number of pixels in a piece. A disk reads and writes scattered pieces of this size, some 24 kB,
+about as fast as one whole file."""
 GOLDEN = (math.sqrt(5) - 1) / 2
 STRIDES_TRIED = 100
 _PLACES_AT_ONCE = 1 << 20
 
 
 class Layout(NamedTuple):
-    """Where the pixels of pictures lie in the file, counted in pixels."""
+    """The positions of the pictures' pixels in the file, counted in pixels."""
 
     sizes: np.ndarray
     """[n_pictures, 2] int64: width and height."""
     edges: np.ndarray
     """[n_pictures, n_chunks + 1] int64: the places at which each picture is cut into pieces."""
     begins: np.ndarray
-    """[n_pictures, n_chunks] int64: where in the file each piece begins."""
+    """[n_pictures, n_chunks] int64: the position in the file at which each piece begins."""
     chunks: np.ndarray
-    """[n_chunks + 1] int64: where in the file each chunk begins, and the end of the last."""
+    """[n_chunks + 1] int64: the position in the file at which each chunk begins, and the end of the last."""
 
     @classmethod
     def of(cls, sizes: Iterable[tuple[int, int]]) -> Layout:
-        """The layout of pictures of `sizes` (width, height), at least one.
+        """Return the layout of pictures of `sizes` (width, height), at least one.
 
         >>> Layout.of([(160, 120), (160, 120), (2, 1)]).chunks.tolist()
         [0, 19201, 38402]
@@ -61,8 +63,8 @@ class Layout(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def stride_of(n_pixels: int) -> int:
-    """The stride of the order of a picture of `n_pixels`: of those around n_pixels times the golden ratio
-    that have no factor in common with it, the one whose runs are spread best.
+    """Return the stride of the order of a picture of `n_pixels`: of the numbers around n_pixels times the
+    golden ratio that have no factor in common with it, the one whose runs are spread best.
 
     >>> stride_of(1), stride_of(100), math.gcd(stride_of(1_920_000), 1_920_000)
     (1, 73, 1)
@@ -74,8 +76,9 @@ def stride_of(n_pixels: int) -> int:
 
 
 def _largest_quotient(a: int, b: int) -> int:
-    """The largest partial quotient of the continued fraction of b / a: the larger, the wider the gaps between
-    the first multiples of b modulo a (Khinchin, Continued fractions; the golden ratio has ones alone)."""
+    """Return the largest partial quotient of the continued fraction of b / a. The larger it is, the wider are
+    the gaps between the first multiples of b modulo a (Khinchin, Continued fractions; the golden ratio has
+    ones alone)."""
     largest = 0
     while b:
         largest = max(largest, a // b)
@@ -84,15 +87,16 @@ def _largest_quotient(a: int, b: int) -> int:
 
 
 def in_order(image: np.ndarray, n_channels: int) -> np.ndarray:
-    """The pixels [height * width, n_channels] of a picture [height, width, 4] uint8, place after place."""
-    # Four bytes at a time: ten times as fast as rows of a few bytes.
+    """Return the pixels [height * width, n_channels] of a picture [height, width, 4] uint8, place after
+    place."""
+    # Pixels are moved as four bytes at a time: ten times as fast as rows of a few bytes.
     whole = np.ascontiguousarray(image).view(np.uint32).reshape(-1)
     pixels = whole.take(_order(len(whole))).view(np.uint8).reshape(-1, 4)
     return np.ascontiguousarray(pixels[:, :n_channels])
 
 
 def write_picture(file: BinaryIO, layout: Layout, number: int, pixels: np.ndarray) -> None:
-    """Put a picture's pixels, as `in_order` has them, into their places in the file. Raises OSError."""
+    """Write a picture's pixels, ordered by `in_order`, to their positions in the file. Raises OSError."""
     n_channels, edges = pixels.shape[1], layout.edges[number]
     for chunk, begin in enumerate(layout.begins[number].tolist()):
         file.seek(begin * n_channels)
@@ -101,7 +105,7 @@ def write_picture(file: BinaryIO, layout: Layout, number: int, pixels: np.ndarra
 
 @lru_cache(maxsize=2)
 def _order(n_pixels: int) -> np.ndarray:
-    """[n_pixels] int32: the number of the pixel at each place."""
+    """Return the number of the pixel at each place, [n_pixels] int32."""
     stride, order = stride_of(n_pixels), np.empty(n_pixels, np.int32)
     for begin in range(0, n_pixels, _PLACES_AT_ONCE):
         places = np.arange(begin, min(begin + _PLACES_AT_ONCE, n_pixels))
@@ -110,7 +114,7 @@ def _order(n_pixels: int) -> np.ndarray:
 
 
 class MappedImages(StoredImages):
-    """Some of the pictures of a file that `write_picture` has filled."""
+    """Some or all of the pictures of a file that `write_picture` has filled."""
 
     def __init__(
         self,
@@ -119,8 +123,11 @@ class MappedImages(StoredImages):
         transparent: frozenset[int],
         numbers: Sequence[int] | None = None,
     ) -> None:
-        """`file`: [n_pixels, 3 or 4] uint8, mapped. `transparent`: the pictures that are not opaque.
-        `numbers`: those of the file's pictures that are meant, in this order; None for all."""
+        """Make a sequence of pictures of a file.
+
+        `file`: [n_pixels, 3 or 4] uint8, mapped. `transparent`: the numbers of the file's pictures that are
+        not opaque. `numbers`: the file's pictures that the sequence has, in this order; None for all.
+        """
         self._file, self._layout, self._transparent = file, layout, transparent
         self._numbers = list(range(len(layout.sizes)) if numbers is None else numbers)
         self.n_chunks = len(layout.chunks) - 1
@@ -172,7 +179,7 @@ class MappedImages(StoredImages):
         pieces = [
             self._file[begins[i] : begins[i] + edges[i, number + 1] - edges[i, number]] for i in self._numbers
         ]
-        # What comes next is read by the system while this one is drawn from.
+        # Prefetch: the system reads the next chunk while pixels are drawn from this one.
         self._expect((number + 1) % self.n_chunks)
         return np.concatenate(pieces)
 
@@ -194,6 +201,7 @@ class MappedImages(StoredImages):
 
 
 def map_pictures(path: Path, layout: Layout, n_channels: int, transparent: frozenset[int]) -> MappedImages:
-    """The pictures of a file, none of which is read yet. Raises OSError, ValueError (it is too short)."""
+    """Map the pictures of a file into memory; none of them is read yet. Raises OSError, ValueError (the file
+    is too short)."""
     file = np.memmap(path, np.uint8, "r", shape=(int(layout.chunks[-1]), n_channels))
     return MappedImages(file, layout, transparent)

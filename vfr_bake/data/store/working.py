@@ -1,7 +1,7 @@
-"""The working size: how large the pictures are that everything after the data set sees.
+"""The working size: the size of the pictures that everything after the loading of the data set works with.
 
-Pictures become smaller by the mean of the area that each new pixel covers, which has no gaps and no ringing
-whatever the factor is, and their cameras by exactly that factor.
+A pixel of a reduced picture is the mean over the area that it covers, which leaves no gaps and no ringing
+whatever the factor is. The camera is scaled by exactly the factor of its picture.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from vfr_bake.data.files.pictures import (
 )
 
 MAX_SIDE = 1600
-"""Pixels of the longest side, where nothing else is asked for: a capture's field resolves no finer detail in
-the minutes that it is trained for, and twelve megapixels take six times the room."""
+"""Pixels of the longest side, if nothing else is asked for: a capture's field resolves no finer detail in the
+minutes that it is trained for, and twelve megapixels take six times the room."""
 BYTES_DECODED, BYTES_UNDISTORTED = 16, 100
-"""Bytes of memory a decoded pixel takes while its picture is read, and where a lens is undone."""
+"""Bytes of memory for each decoded pixel while its picture is read, and while lens distortion is undone."""
 
 
 @dataclass(frozen=True)
 class WorkingSize:
-    """How pictures are reduced: to a longest side, or by a whole factor, which decides where it is given."""
+    """The way that pictures are reduced: to a longest side, or by a whole factor. If both are given, the
+    factor decides."""
 
     max_side: int | None = None
-    """Pixels; None: as they are."""
+    """Pixels of the longest side; None: pictures stay as large as they are."""
     downscale: int | None = None
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height that a picture of `width` x `height` pixels is worked on with.
+        """Return the working size (width, height) of a picture of `width` x `height` pixels.
 
         >>> WorkingSize(1600).size(4032, 3024), WorkingSize(1600).size(400, 400)
         ((1600, 1200), (400, 400))
@@ -56,23 +57,25 @@ class WorkingSize:
         return max(1, round(width * scale)), max(1, round(height * scale))
 
     def reading_bytes(self, view: DescribedView, size: tuple[int, int]) -> int:
-        """About as many bytes of memory are taken while a picture of `size` is read."""
+        """Return the approximate number of bytes of memory that are taken while a picture of `size` is
+        read."""
         bent = any(view.distortion.values())
         step = 1 if self.downscale is not None else self._whole_step(max(size))
         undone = size[0] * size[1] // step**2 * BYTES_UNDISTORTED if bent else 0
         return max(size[0] * size[1] * BYTES_DECODED, undone)
 
     def read(self, view: DescribedView) -> tuple[Camera, np.ndarray]:
-        """A picture as [height, width, 4] uint8 at the working size, transparent where it is masked, its lens
-        undone, with its pinhole camera. Raises DataError."""
+        """Read a picture at the working size, and return its pinhole camera and the picture as [height,
+        width, 4] uint8, transparent where it is masked, with the lens distortion undone. Raises DataError."""
         width, height = viewed_size(view)
         target = self.size(width, height)
         whole = self.downscale is not None or view.mask is not None
         image = read_picture(view.path, view.upright, None if whole else target)
         if view.mask is not None:
             image = apply_mask(image, view.path, view.mask, view.upright)
-        # A JPEG decoder that leaves out the finest frequencies gives half, a quarter or an eighth, rounded
-        # up: the camera is divided by the whole number, and what is rounded up repeats the picture's edge.
+        # A JPEG decoder that leaves out the finest frequencies gives a half, a quarter or an eighth of the
+        # size, rounded up. So the camera is divided by the whole number, and pixels added by rounding up
+        # repeat the picture's edge.
         step = max(1, round(width / image.shape[1]))
         camera = _divided(view.camera.resized(width, height), step, image)
         bent = any(view.distortion.values())
@@ -82,14 +85,15 @@ class WorkingSize:
             views = reduced(PosedImages([camera], [image]), self.downscale or 1)
             return views.cameras[0], views.images[0]
         if bent:
-            # Not below the working size, so that the interpolation blurs nothing that is kept.
+            # The picture is first reduced by a whole number, but not below the working size, so that the
+            # interpolation blurs nothing that is kept.
             step = self._whole_step(max(image.shape[:2]))
             camera, image = resized(camera, image, -(-image.shape[1] // step), -(-image.shape[0] // step))
             image = undistort(image, camera, **view.distortion)
         return resized(camera, image, *target)
 
     def of(self, views: PosedImages) -> PosedImages:
-        """Views that are in memory, at the working size."""
+        """Reduce views that are in memory to the working size, and return them."""
         if self.downscale is not None:
             return reduced(views, self.downscale)
         pairs = [
@@ -103,7 +107,8 @@ class WorkingSize:
 
 
 def resized(camera: Camera, image: np.ndarray, width: int, height: int) -> tuple[Camera, np.ndarray]:
-    """A picture [height, width, 4] and its camera on fewer pixels, each the mean over the area it covers.
+    """Return a picture [height, width, 4] and its camera on fewer pixels, each the mean over the area that it
+    covers.
 
     >>> camera = Camera("a", np.eye(4), 5, 5, 10.0, 10.0, 2.5, 2.5)
     >>> smaller, image = resized(camera, np.full((5, 5, 4), 255, np.uint8), 2, 2)
@@ -120,7 +125,7 @@ def resized(camera: Camera, image: np.ndarray, width: int, height: int) -> tuple
 
 
 def _divided(camera: Camera, step: int, image: np.ndarray) -> Camera:
-    """The camera of a picture that was decoded at one `step`-th of its size."""
+    """Return the camera of a picture that was decoded at one `step`-th of its size."""
     if step == 1:
         return camera
     height, width = image.shape[:2]

@@ -1,1 +1,1 @@
-"""What the head computes between its matrix products, in float32 or bfloat16."""
+"""Kernels for the head's operations between its matrix products, in float32 or bfloat16."""

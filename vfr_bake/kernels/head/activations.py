@@ -1,9 +1,10 @@
-"""GELU of a layer with its slope, and gradients back through it, in one pass each.
+"""Activations of the head's layers with slopes, and gradients back through them, in one pass each. GELU is
 
     gelu(x) = x P(x),    gelu'(x) = P(x) + x p(x)
 
-for the normal distribution's P and density p. With t = 1 / (1 + 0.2316419 |x|), the tail 1 - P(|x|) is p(x)
-times a polynomial of t, to 8e-8 (Abramowitz and Stegun 1964, 26.2.17): one exponential serves all three.
+where P is the normal distribution function and p its density. With t = 1 / (1 + 0.2316419 |x|), the tail 1 -
+P(|x|) is p(x) times a polynomial of t, to 8e-8 (Abramowitz and Stegun 1964, 26.2.17), so that one exponential
+is enough for all of these.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from vfr_bake.kernels.head.bfloat16 import float_of_bits, get, put
 
 PER_LOG = np.float32(1.4426950408889634)
 HIGH, LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-"""log(2) = HIGH + LOW, HIGH with so few digits that whole multiples of it are exact."""
+"""log(2) = HIGH + LOW, where HIGH has so few digits that its integer multiples are exact."""
 HALF, ONE = np.float32(0.5), np.float32(1)
 E1, E2, E3, E4, E5, E6 = map(
     np.float32,
@@ -24,8 +25,8 @@ E1, E2, E3, E4, E5, E6 = map(
 )
 """exp(r) = 1 + r + r^2 (E6 + r (E5 + ...)) for |r| <= log(2) / 2: the polynomial of Cephes."""
 MOST = np.float32(32.0)
-"""Beyond 8 standard deviations, where x^2 / 2 is this, p is taken as 0. It is 5e-15 there, and what follows
-from numbers too small for a float32's exponent takes a hundred times as long."""
+"""Value of x^2 / 2 at 8 standard deviations, from which on p is taken as 0. It is 5e-15 there, and operations
+on numbers too small for a float32's exponent (subnormal ones) take a hundred times as long."""
 SLOPE = np.float32(0.2316419)
 B1, B2, B3, B4, B5 = map(np.float32, (0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429))
 PEAK = np.float32(0.3989422804014327)
@@ -34,8 +35,8 @@ PEAK = np.float32(0.3989422804014327)
 
 @njit(inline="always")
 def exp_of_minus(y):
-    """exp(-y) of a float32 y >= 0 to 1e-7 of itself, in operations that compilers make vectors of; 0 from
-    MOST on."""
+    """Return exp(-y) for a float32 y >= 0, with a relative error of 1e-7, by operations that compilers
+    vectorise; 0 from MOST on."""
     n = np.int32(min(y, MOST) * PER_LOG + HALF)
     r = np.float32(n) * HIGH - min(y, MOST) + np.float32(n) * LOW
     power = E1 * r + E2
@@ -50,8 +51,8 @@ def exp_of_minus(y):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gelu(x, bias, slopes):
-    """Replace `x` [n, width] by the GELU of x + `bias` [width], whose slopes are written to `slopes` [n,
-    width]; to 1e-6 in float32, and rounded to bfloat16 where these are."""
+    """Replace `x` [n, width] by the GELU of x + `bias` [width], and write the slopes to `slopes` [n, width].
+    Both are accurate to 1e-6 in float32, and rounded in bfloat16 arrays."""
     for row in range(x.shape[0]):
         for c in range(x.shape[1]):
             value = get(x, row, c) + bias[c]
@@ -65,8 +66,8 @@ def gelu(x, bias, slopes):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def gelu_backward(grad, slopes, rows, grad_bias):
-    """Multiply `grad` [n, width] by the `rows` [n] of `slopes`, and write the sum over its rows to
-    `grad_bias` [width]."""
+    """Multiply row i of `grad` [n, width] by row `rows[i]` of `slopes`, and write the sum of the rows of
+    `grad` to `grad_bias` [width]."""
     grad_bias[:] = 0
     for row in range(grad.shape[0]):
         behind = rows[row]
@@ -78,7 +79,7 @@ def gelu_backward(grad, slopes, rows, grad_bias):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def times_basis(x, bias, basis):
-    """Add `bias` [width] to `x` [n, width], and multiply its last columns by `basis` [n, n_basis], in
+    """Add `bias` [width] to `x` [n, width], then multiply the last columns of x by `basis` [n, n_basis], in
     place."""
     first = x.shape[1] - basis.shape[1]
     for row in range(x.shape[0]):
@@ -90,8 +91,8 @@ def times_basis(x, bias, basis):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def times_basis_backward(grad, basis, rows, grad_bias):
-    """Multiply the last columns of `grad` [n, width] by the `rows` [n] of `basis`, and write the sum over its
-    rows to `grad_bias` [width]."""
+    """Multiply the last columns of row i of `grad` [n, width] by row `rows[i]` of `basis`, and write the sum
+    of the rows of `grad` to `grad_bias` [width]."""
     first = grad.shape[1] - basis.shape[1]
     grad_bias[:] = 0
     for row in range(grad.shape[0]):
@@ -104,8 +105,9 @@ def times_basis_backward(grad, basis, rows, grad_bias):
 
 @njit(cache=True, fastmath=FLAGS, error_model="numpy")
 def relu_backward(hidden, bias, weights, grad_out, grad_weights, grad_bias):
-    """Back through out = `weights` [width] . relu(h + `bias` [width]), given the h [n, width] in `hidden` and
-    `grad_out` [n]: `hidden` becomes the gradient of h, and the gradients of weights and bias are written."""
+    """Propagate `grad_out` [n] back through out = `weights` [width] . relu(h + `bias` [width]). `hidden`
+    [n, width] holds h, and is replaced by the gradient of h; the gradients of weights and bias are
+    written."""
     zero = hidden.dtype.type(0)
     grad_weights[:] = 0
     grad_bias[:] = 0

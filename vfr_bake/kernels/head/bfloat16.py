@@ -1,6 +1,7 @@
 """Arrays that hold float32 or bfloat16, for kernels that take either.
 
-A bfloat16 is the upper half of a float32. NumPy has no such type: these arrays are int16 and have the bits.
+A bfloat16 is the upper half of a float32. NumPy has no such type, so these arrays are int16 with the same
+bits.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from numba.extending import intrinsic, overload
 from torch import Tensor
 
 HALF_UNIT, NAN = np.int32(0x7FFF), np.int32(0x7FC0)
-"""Half of what a bfloat16 leaves out of a float32, less one; and the bits of a NaN."""
+"""Half of the lowest bit of a bfloat16, in bits of a float32, minus one; and the bits of a bfloat16 NaN."""
 
 
 def fast_products() -> torch.dtype:
-    """bfloat16 where the processor multiplies such matrices in half of the time, float32 elsewhere.
+    """Return bfloat16 if the processor multiplies such matrices in half of the time, float32 otherwise.
 
-    AMD's do from Zen 4 on. Intel's before AMX gain nothing, and a virtual machine may name AMX without having
-    it, where torch's products end the process.
+    AMD's processors do from Zen 4 on. Intel's before AMX gain nothing. A virtual machine may claim to have
+    AMX without having it, and torch's products then end the process.
     """
     has_them = bool(binding.get_host_cpu_features().get("avx512bf16"))
     return torch.bfloat16 if has_them and binding.get_host_cpu_name().startswith("znver") else torch.float32
 
 
 def as_array(tensor: Tensor) -> np.ndarray:
-    """The tensor, float32 or bfloat16 on a CPU, as these kernels take it; they share their memory.
+    """Return a tensor, float32 or bfloat16 on a CPU, as the array that these kernels take; memory is shared.
 
     >>> as_array(torch.tensor([1.0, -2.0]).bfloat16()).tolist()
     [16256, -16384]
@@ -48,18 +49,18 @@ def _reinterpreted(source: Any, target: Any, to: Any) -> Any:
 
 
 float_of_bits: Any = _reinterpreted(types.int32, types.float32, ir.FloatType())
-"""float_of_bits(bits): the float32 whose bits an int32 has."""
+"""float_of_bits(bits): return the float32 that has the bits of an int32."""
 bits_of_float: Any = _reinterpreted(types.float32, types.int32, ir.IntType(32))
-"""bits_of_float(value): the bits of a float32, as an int32."""
+"""bits_of_float(value): return the bits of a float32 as an int32."""
 
 
 def get(array, row, column):
-    """In kernels: `array[row, column]` as a float."""
+    """Return `array[row, column]` as a float, in kernels only."""
     raise NotImplementedError
 
 
 def put(array, row, column, value):
-    """In kernels: write a float to `array[row, column]`, rounded to the nearest, ties to even."""
+    """Write a float to `array[row, column]`, rounded to the nearest, ties to even; in kernels only."""
     raise NotImplementedError
 
 

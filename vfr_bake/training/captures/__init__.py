@@ -1,1 +1,1 @@
-"""What real captures have and a field has not: exposure that changes, and things that move."""
+"""Effects of real captures that a field cannot show: exposure that changes, and things that move."""

@@ -1,8 +1,8 @@
-"""What real captures have and a field has not, found and taken into account while a field is trained.
+"""Effects of real captures that a field cannot show, detected and corrected while a field is trained.
 
 A capture's exposure may change from picture to picture (`exposure`), and things in it may move (`moving`).
-Both are off at first, and looked for after CHECKS steps. What does not show by the last check stays off, and
-costs nothing from then on.
+The corrections for both are off at first; after each number of steps in CHECKS, the effects are looked for.
+An effect that is not found by the last check stays off, and takes no more time.
 """
 
 from __future__ import annotations
@@ -25,36 +25,38 @@ from vfr_bake.training.captures.exposure import (
 from vfr_bake.training.processes import Processes
 
 CHECKS = (256, 512, 1024, 2048, 4096, 8192)
-"""Steps after which changing exposure and moving things are looked for."""
+"""Numbers of steps after which changing exposure and moving things are looked for."""
 STEPS_PER_UPDATE = 16
-"""Steps between two updates of gains, offsets and of what is left out."""
+"""Steps between two updates of the gains, the offsets and the cells that are left out."""
 MEMORY_STEPS, MEMORY_PIXELS = 512, 4096
-"""What is found rests on about so many steps, or so many pixels of each picture where these take longer."""
+"""Length of the moving averages: about this many steps, or as many steps as draw this many pixels of each
+picture, whichever is longer."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a step saw on its rays, of the pictures that it drew from."""
+    """Colours and errors that a step found on its rays."""
 
     pictures: Tensor
-    """[n_rays] int64."""
+    """[n_rays] int64: number of each ray's picture, among those that are drawn from."""
     places: Tensor
-    """[n_rays, 2] in (0, 1): shares of the picture's width and height."""
+    """[n_rays, 2] in (0, 1): each pixel's place, as shares of the picture's width and height."""
     colours: Tensor
-    """[n_rays, 3] the field's colours times opacity."""
+    """[n_rays, 3]: the field's colours times opacity."""
     opacity: Tensor
     """[n_rays]."""
     wanted: Tensor
-    """[n_rays, 3]: the photographs' colours without the background's part in them."""
+    """[n_rays, 3]: the photographs' colours without the part of the background."""
     solid: Tensor
-    """[n_rays] bool: where both the photograph and the field are nearly opaque. At the edges of an object the
-    errors are those of its outline, which no gain explains."""
+    """[n_rays] bool: true where both the photograph and the field are nearly opaque. Errors at the edges of
+    an object are those of its outline, which no gain explains."""
     errors: Tensor
-    """[n_rays, 3]: what was shown, less what was to be shown."""
+    """[n_rays, 3]: the rendered colours minus the target colours."""
 
 
 class CaptureEffects:
-    """Gains and offsets of the pictures, and the parts of them that nothing is learned from."""
+    """Corrections of the pictures: their gains and offsets, and the cells of them that are not learned
+    from."""
 
     def __init__(self, n_pictures: int, processes: Processes, device: torch.device) -> None:
         self._processes = processes
@@ -64,12 +66,13 @@ class CaptureEffects:
         self._halves = torch.zeros(2 * n_pictures, 3, N_SUMS, **number)
         self._cells = torch.zeros(n_pictures * side * side, moving.N_SUMS, **number)
         self._new = [torch.zeros_like(sums) for sums in (self._halves, self._cells)]
-        """What this process has seen since the last update."""
+        """Sums over what this process has seen since the last update."""
         self.exposure_gain: float | None = None
-        """By how many dB gains and offsets reduced the error at the last check; None before the first."""
+        """Reduction of the error in dB by gains and offsets, at the last check; None before the first
+        check."""
         self.exposure_on = False
         self.moving_share: float | None = None
-        """Share of the pictures that stood out at the last check; None before the first."""
+        """Share of the cells that stood out at the last check; None before the first check."""
         self.moving_on = False
         self._contradicting = torch.zeros(n_pictures, side, side, dtype=torch.bool, device=device)
         self._n_steps = 0
@@ -81,32 +84,32 @@ class CaptureEffects:
 
     @property
     def n_steps(self) -> int:
-        """Number of steps that were looked at."""
+        """Number of steps that were observed."""
         return self._n_steps
 
     @property
     def looks(self) -> bool:
-        """Whether steps still have to be observed."""
+        """True if steps still have to be observed."""
         return self.exposure_on or self.moving_on or self._n_steps < CHECKS[-1]
 
     @property
     def share_left_out(self) -> float:
-        """Share of the pictures that nothing is learned from, because something moves there."""
+        """Share of the pictures' area that is not learned from, because something moves there."""
         return float(self._left_out.double().mean())
 
     def shown(self, colours: Tensor, opacity: Tensor, pictures: Tensor) -> Tensor:
-        """How the `pictures` [n] show the field's `colours` [n, 3] times `opacity` [n]; [n, 3], times
-        opacity as well."""
+        """Return the colours [n, 3] with which the `pictures` [n] show the field's `colours` [n, 3]; both are
+        times `opacity` [n]."""
         if not self.exposure_on:
             return colours
         return colours * self._gains[pictures] + self._offsets[pictures] * opacity[:, None]
 
     def learned(self, pictures: Tensor, places: Tensor) -> Tensor | None:
-        """[n] bool: the rays that the field learns from; None for all."""
+        """Return [n] bool: true for the rays that the field learns from; None if it learns from all."""
         return ~self._left_out.view(-1)[self._cell(pictures, places)] if self.moving_on else None
 
     def observe(self, seen: Seen, n_rays: int) -> None:
-        """Take a step of `n_rays` over all processes into account, of which this one has `seen` its share."""
+        """Add what this process has `seen` of a step, which has `n_rays` rays over all processes."""
         halves, cells = self._new
         errors = seen.errors.double()
         squares = errors.square().sum(dim=1, keepdim=True)
@@ -147,7 +150,7 @@ class CaptureEffects:
             self.exposure_gain = gain_on_other_half(self._halves.view(self._n_pictures, 2, 3, N_SUMS))
             self.exposure_on = self.exposure_gain > LEAST_GAIN_DB
             if self.exposure_on:
-                self._cells.zero_()  # it is among these errors
+                self._cells.zero_()  # their errors include those of the exposure
         if not self.moving_on and float(self._cells[:, 0].mean()) >= moving.MEAN_PIXELS:
             errors = self._mean_errors()
             self.moving_share = float(moving.contradicting(errors).double().mean())
@@ -161,7 +164,7 @@ class CaptureEffects:
         self._gains, self._offsets = correction.gains.float(), correction.offsets.float()
 
     def described(self) -> list[str]:
-        """What was found and done, one line for each effect."""
+        """Return what was found and done, one line for each effect."""
         return [self._exposure_described(), self._moving_described()]
 
     def _exposure_described(self) -> str:
@@ -189,7 +192,7 @@ class CaptureEffects:
         )
 
     def figures(self) -> dict[str, Any]:
-        """The same as data, in plain values."""
+        """Return what was found and done as data, in plain values."""
         gains = self.correction.gains.mean(dim=1)
         return {
             "exposure": self.exposure_on,
@@ -200,7 +203,7 @@ class CaptureEffects:
         }
 
     def state(self) -> dict[str, Any]:
-        """All that later steps depend on, in tensors and plain values."""
+        """Return all that later steps depend on, as tensors and plain values."""
         return {
             "halves": self._halves, "cells": self._cells, "new": list(self._new),
             "n_steps": self._n_steps, "n_rays": self._n_rays,
@@ -211,13 +214,13 @@ class CaptureEffects:
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Continue from what `state` returned."""
         self._halves.copy_(state["halves"])
         self._cells.copy_(state["cells"])
         for new, kept in zip(self._new, state["new"], strict=True):
             new.copy_(kept)
             if not self._processes.first:
-                new.zero_()  # the first process brings it
+                new.zero_()  # the first process adds it to the sum over all processes
         self._n_steps, self._n_rays = state["n_steps"], state["n_rays"]
         self.exposure_on, self.exposure_gain = state["exposure_on"], state["exposure_gain"]
         self.moving_on, self.moving_share = state["moving_on"], state["moving_share"]

@@ -1,17 +1,18 @@
-"""Exposure and white balance that change from picture to picture: a gain and an offset for each channel.
+"""Exposure and white balance that change from picture to picture: a gain and an offset for each picture and
+channel.
 
-Letters: a field shows the colour c through the opacity A, and a picture shows it as g c + o, where g [3] are
-the picture's gains and o [3] its offsets. Before a background b a pixel is therefore
+Letters: a field shows the colour c with the opacity A, and a picture shows that colour as g c + o, where g
+[3] are the picture's gains and o [3] its offsets. Before a background b, a pixel y is therefore
 
     y = g (A c) + o A + (1 - A) b,
 
 which is linear in g and o. They are found by least squares: for each picture and channel, a few sums over the
 pixels of the last steps are kept, and two equations with two unknowns are solved now and then. Each picture
-counts as if it also had PRIOR_PIXELS pixels of black and of white that need no correction. The means over all
-pictures are made 1 and 0, so that the field has the mean exposure.
+counts as if it also had PRIOR_PIXELS pixels of black and of white that need no correction. The means of gains
+and offsets over all pictures are made 1 and 0, so that the field has the mean exposure.
 
-Whether this pays is measured in the same way as held-out views are scored: what is fitted on one half of a
-picture is applied to its other half.
+Whether corrections are worth it is measured in the same way as held-out views are scored: a correction that
+is fitted on one half of a picture is applied to its other half.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ import torch
 from torch import Tensor
 
 PRIOR_PIXELS = 1.0
-"""So many pixels of black and of white that need no correction count as part of every picture: enough for a
-picture that shows nothing yet, and too few to pull the gains of others towards 1."""
+"""Number of pixels of black, and of white, that need no correction and count as part of every picture: enough
+for a picture that shows nothing yet, and too few to pull the gains of others towards 1."""
 LEAST_GAIN_DB = 0.2
-"""Gains and offsets are learned where they reduce the error on the other half of the pictures by so much."""
+"""Least reduction in dB, of the error on the other half of the pictures, for which corrections are turned
+on."""
 N_SUMS = 6
 
 
 class Correction(NamedTuple):
-    """How pictures show the field's colours."""
+    """Gains and offsets with which pictures show the field's colours."""
 
     gains: Tensor
     """[n_pictures, 3] float64."""
@@ -38,7 +40,7 @@ class Correction(NamedTuple):
     """[n_pictures, 3] float64."""
 
     def neutral(self) -> Correction:
-        """The same corrections of a field whose colours are corrected by the mean of them.
+        """Return these corrections for a field whose own colours are changed by the mean correction.
 
         >>> fitted = Correction(torch.tensor([[1.0], [3.0]]), torch.tensor([[0.0], [0.2]]))
         >>> neutral = fitted.neutral()
@@ -50,7 +52,7 @@ class Correction(NamedTuple):
 
 
 def products(colours: Tensor, opacity: Tensor, wanted: Tensor) -> Tensor:
-    """The terms of the sums that the fit needs, [n, 3, N_SUMS] float64.
+    """Return the terms of the sums that `fit` needs, [n, 3, N_SUMS] float64.
 
     `colours` [n, 3]: c A; `opacity` [n]: A; `wanted` [n, 3]: y - (1 - A) b.
     """
@@ -60,9 +62,9 @@ def products(colours: Tensor, opacity: Tensor, wanted: Tensor) -> Tensor:
 
 
 def fit(sums: Tensor) -> Correction:
-    """The gains and offsets with the least squared error, and that of the prior pixels.
+    """Return the gains and offsets with the least squared error over the pixels and the prior pixels.
 
-    `sums` [..., 3, N_SUMS], of the terms of `products`.
+    `sums` [..., 3, N_SUMS]: sums of the terms of `products`.
 
     >>> colours = torch.rand(1000, 3, dtype=torch.float64)
     >>> found = fit(products(colours, torch.ones(1000), 0.8 * colours + 0.1).sum(dim=0) * 1000)
@@ -76,15 +78,15 @@ def fit(sums: Tensor) -> Correction:
 
 
 def squared_error(sums: Tensor, correction: Correction) -> Tensor:
-    """[..., 3] sums of the squared errors of corrected colours, of the `sums` that `fit` takes."""
+    """Return [..., 3]: sums of the squared errors of corrected colours, from the `sums` that `fit` takes."""
     aa, ab, bb, at, bt, tt = sums.unbind(dim=-1)
     g, o = correction
     return g * g * aa + 2 * g * o * ab + o * o * bb - 2 * (g * at + o * bt) + tt
 
 
 def gain_on_other_half(halves: Tensor) -> float:
-    """By how many dB a correction of each picture reduces the error on that half of the pictures that it was
-    not fitted on, compared with one correction of all.
+    """Return the dB by which a correction for each picture, fitted on one half of it, reduces the error on
+    the other half, compared with one correction for all pictures.
 
     `halves` [n_pictures, 2, 3, N_SUMS]: sums over the left and the right half of the pictures.
     """

@@ -1,4 +1,4 @@
-"""What a model keeps of its pictures' exposure and white balance, in its file and for what is measured.
+"""Exposure and white balance of the training views, as a model keeps them in its file and for measurements.
 
 Letters as in `vfr_bake.training.captures.exposure`: a picture shows the field's colour c as g c + o.
 
@@ -21,20 +21,21 @@ from vfr_bake.training.tensor_files import check_kinds, check_plain
 
 KEYS = ("gains", "offsets")
 GAINS, OFFSETS = (0.01, 100.0), (-2.0, 2.0)
-"""What is believed of a file, far beyond what a picture can have."""
+"""Ranges of values that are accepted from a file, far wider than those of any picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class PictureColours:
-    """How each training view shows the field's colours."""
+    """Gains and offsets with which each training view shows the field's colours."""
 
     gains: np.ndarray
-    """[n_views, 3] float32, of mean 1 over the views that were learned from."""
+    """[n_views, 3] float32; their mean is 1 over the views that were learned from."""
     offsets: np.ndarray
-    """[n_views, 3] float32, of mean 0 over them; colours are 0 to 1."""
+    """[n_views, 3] float32, for colours of 0 to 1; their mean is 0 over the views that were learned from."""
 
     def neutral(self, pixels: SomePixels) -> SomePixels:
-        """The same `pixels` with the colours that the field would show: (y - o) / g, within 0 to 255.
+        """Return the same `pixels` with the colours that the field would show: (y - o) / g, clipped to 0 to
+        255.
 
         >>> from vfr_bake.data.view_pixels import ViewPixels
         >>> ones = np.ones((1, 3), np.float32)
@@ -49,10 +50,10 @@ class PictureColours:
 
 
 def fitted(colours: np.ndarray, opacity: np.ndarray, rgba: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The gains [3] and offsets [3], float32, with which one picture shows what a field shows.
+    """Fit the gains [3] and offsets [3], float32, with which one picture shows a field's colours.
 
-    `colours` [n, 3]: the field's, times opacity; `opacity` [n]; `rgba` [n, 4] uint8 of the photograph. Over
-    a black background, so that no other is fitted.
+    `colours` [n, 3]: the field's, times opacity; `opacity` [n]; `rgba` [n, 4] uint8: the photograph's. Both
+    are compared over black, so that no background is part of the fit.
     """
     photograph = rgba.astype(np.float32) / 255
     wanted = photograph[:, :3] * photograph[:, 3:]
@@ -62,12 +63,12 @@ def fitted(colours: np.ndarray, opacity: np.ndarray, rgba: np.ndarray) -> tuple[
 
 
 def colours_content(found: PictureColours) -> dict[str, torch.Tensor]:
-    """The tensors of `found`."""
+    """Return the tensors of `found`."""
     return {name: torch.from_numpy(getattr(found, name)) for name in KEYS}
 
 
 def restore_colours(content: Any, n_views: int, where: str) -> PictureColours:
-    """The colours of `n_views` from what `colours_content` gave.
+    """Restore the colours of `n_views` views from what `colours_content` returned.
 
     Raises FormatError: a tensor is missing or of another kind or shape, or a number is out of range.
     """

@@ -1,1 +1,1 @@
-"""How long a training takes, by its errors at pixels that it does not learn from."""
+"""Length of a training, decided by its errors at pixels that it does not learn from."""

@@ -1,12 +1,12 @@
-"""How long a training takes: at most the minutes or the steps that are asked for, and less where the scene
-has nothing more to teach.
+"""Length of a training: at most the minutes or the steps that are asked for, and less if the scene has
+nothing more to teach.
 
 The learning rate is high for the first half of a training and falls in the second
 (`vfr_bake.training.optimiser.rate_factor`). While it is high, the error is measured at the witnesses, pixels
-that are not learned from, FIRST_LOOK seconds after the start and then whenever the time has grown by
-GROWTH. Two looks later the time has doubled. Where doubling it has gained less than FLAT_DB, twice in a row
-and beyond chance, doubling it once more is not worth it: the second half begins there and then, and takes as
-long as the first did.
+that are not learned from: FIRST_LOOK seconds after the start, and then whenever the time has grown by the
+factor GROWTH. So the time has doubled after every two looks. If the last doubling has gained less than
+FLAT_DB, twice in a row and beyond chance, another one is not worth it: the second half of the training begins
+at once, and takes as long as the first did.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ FIRST_LOOK = 60.0
 GROWTH = math.sqrt(2)
 """Factor between the times of two looks."""
 LOOKS_OF_A_DOUBLING = 2
-"""Looks after which the time has doubled."""
+"""Number of looks after which the time has doubled."""
 FLAT_DB = 0.15
-"""Gain in dB, by twice the time, below which the error counts as flat."""
+"""Gain in dB from doubling the time, below which the error counts as flat."""
 FLAT_LOOKS = 2
-"""So many looks in a row must find the error flat."""
+"""Number of looks in a row that must find the error flat before the training is shortened."""
 
 
 class Duration:
-    """The length of a training, which gets shorter when the error is flat.
+    """Length of a training, which gets shorter when the error is flat.
 
     >>> short = Duration(steps=100, minutes=1.0)
     >>> short.progress(50, 6.0), short.progress(50, 60.0)
@@ -42,25 +42,26 @@ class Duration:
     """
 
     def __init__(self, steps: int, minutes: float) -> None:
-        """`steps` and `minutes` at most, each more than 0; `minutes` may be infinite."""
+        """`steps`, `minutes`: the most that the training may take, each more than 0; `minutes` may be
+        infinite."""
         self._steps = steps
         self._seconds = 60 * minutes
         self._next_look = FIRST_LOOK
         self._errors: list[np.ndarray] = []
-        """[n_witnesses] errors of the last LOOKS_OF_A_DOUBLING looks."""
+        """Errors [n_witnesses] at each of the last LOOKS_OF_A_DOUBLING looks."""
         self._n_flat = 0
         self.ended_early = False
-        """Whether the error was found flat."""
+        """True once the error was found flat, and the training shortened."""
 
     def progress(self, step: int, seconds: float) -> float:
-        """Share of the training that is done after `step` steps and so many `seconds`, at least 0; 1 and
+        """Return the share of the training that is done after `step` steps and `seconds`: from 0 on, and 1 or
         more at its end."""
         return max(step / self._steps, seconds / self._seconds)
 
     def look(self, step: int, seconds: float, measure: Callable[[], tuple[WitnessLoss, np.ndarray]]) -> None:
-        """Look at the errors, if it is time, and shorten the training if they are flat.
+        """Look at the errors, if it is time to, and shorten the training if they are flat.
 
-        `measure` gives the witnesses, and their errors [n_witnesses] by now.
+        `measure` returns the loss of the witnesses, and their current errors [n_witnesses].
         """
         if seconds < self._next_look or self.progress(step, seconds) >= HELD:
             return
@@ -68,7 +69,7 @@ class Duration:
         witnesses, errors = measure()
         if len(self._errors) == LOOKS_OF_A_DOUBLING:
             change = witnesses.loss(self._errors.pop(0), errors)
-            gain = 2 * (change.spread or 0.0) - change.db  # at the most, hardly exceeded
+            gain = 2 * (change.spread or 0.0) - change.db  # two standard errors above what was measured
             self._n_flat = self._n_flat + 1 if gain < FLAT_DB else 0
         self._errors.append(errors)
         if self._n_flat == FLAT_LOOKS:
@@ -76,7 +77,8 @@ class Duration:
             self._seconds = min(self._seconds, seconds / HELD)
 
     def state(self) -> dict[str, Any]:
-        """All that later looks depend on, in tensors and plain values; not the length that was asked for."""
+        """Return all that later looks depend on, as tensors and plain values, without the length asked
+        for."""
         return {
             "next_look": self._next_look,
             "errors": [torch.from_numpy(errors) for errors in self._errors],
@@ -85,7 +87,7 @@ class Duration:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave."""
+        """Continue from what `state` returned."""
         self._next_look, self._n_flat = state["next_look"], state["n_flat"]
         self._errors = [errors.numpy() for errors in state["errors"]]
         if state["shortened_to"] is not None:

@@ -1,8 +1,8 @@
-"""What a training is likely to reach, told from its first steps.
+"""Prediction of the PSNR that a training is likely to reach, from its first steps.
 
-What a training gains with each doubling of its steps gets less: it grows with the root of the number of
-doublings, so that what a look after EXPECTED_AT steps finds can be carried forward. How fast it grows differs
-from scene to scene: the result is a range.
+Each doubling of the number of steps gains less than the one before: the total gain grows with the square root
+of the number of doublings. The PSNR after EXPECTED_AT steps is extrapolated by this rule. The factor of the
+root differs from scene to scene, so the result is a range.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from itertools import pairwise
 from vfr_bake.training.guides import GROWTH
 
 TIMED_FROM, EXPECTED_AT = 300, 400
-"""The speed is that of the steps between these two: before them the pilot network learns."""
+"""Steps between which the speed is measured, and at the end of which the result is predicted. Steps before
+the first of them are of the pilot network."""
 DB_OF_DOUBLINGS = {False: (5.0, 7.0), True: (1.5, 4.5)}
-"""Gain in dB at the least and at the most, times the root of the number of doublings, by whether the scene is
-unbounded. From 400 steps to the end of 2 to 12 minutes it was 5.6 with lego, 6.7 to 7.0 with the built-in
-scene, 4.1 with fox and 1.5 with can (docs/notes/2026-11-28-rays-and-steps.md)."""
+"""Least and largest gain in dB for one doubling, which is multiplied by the root of their number, by whether
+the scene is unbounded. From 400 steps to the end of 2 to 12 minutes it was 5.6 with lego, 6.7 to 7.0 with the
+built-in scene, 4.1 with fox and 1.5 with can (docs/notes/2026-11-28-rays-and-steps.md)."""
 LATER_STEP = {False: 1.0, True: 0.45}
-"""How long steps take on the whole, in steps of that look: rays through contracted space have ever fewer
-samples as surfaces form."""
+"""Mean time of the later steps, in units of that of a step at EXPECTED_AT, by whether the scene is unbounded:
+rays through contracted space have fewer and fewer samples as surfaces form."""
 LARGER_BATCH = {False: 0.6, True: 1.0}
-"""What a batch of twice the size takes more, in steps of the first size: samples of an object share ever more
-rows of the table."""
+"""Additional time of a batch of twice the first size, in steps of the first size, by whether the scene is
+unbounded. It is below 1 for objects: the more samples, the more of them share rows of the table."""
 
 
 def typical_step(ends: list[float]) -> float:
-    """Seconds that a step takes, by the seconds at which steps ended, two of them at least: the median,
-    because whatever is compiled in the first of them takes as long as hundreds.
+    """Return the seconds that a step takes, from the times in seconds at which at least two steps ended. It
+    is the median, because compiling code in one of the first steps takes as long as hundreds of steps.
 
     >>> round(typical_step([10.0, 10.01, 14.0, 14.01, 14.02]), 6)
     0.01
@@ -39,7 +40,8 @@ def typical_step(ends: list[float]) -> float:
 
 
 def grown(n: int, unbounded: bool) -> float:
-    """Time of `n` steps on a CPU, in steps of its first batches: those of batches that grow take ever longer.
+    """Return the time of `n` steps on a CPU, in units of a step with the first batch size: as batches grow,
+    steps take longer and longer.
 
     >>> grown(1000, True), grown(4000, True), grown(10_000, True)
     (1000.0, 5000.0, 25000.0)
@@ -51,7 +53,7 @@ def grown(n: int, unbounded: bool) -> float:
 
 
 def steps_of(time: float, unbounded: bool) -> int:
-    """The number of steps that take so much `time`: the inverse of `grown`.
+    """Return the number of steps that take the given `time`: the inverse of `grown`.
 
     >>> [steps_of(grown(n, True), True) for n in (1000, 5000, 20_000)]
     [1000, 5000, 20000]
@@ -62,8 +64,9 @@ def steps_of(time: float, unbounded: bool) -> int:
 def expectation(
     psnr: float, seconds: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool
 ) -> str:
-    """What to expect of a training that has `psnr` dB after EXPECTED_AT steps, which took `seconds`, most of
-    them to compile code, and ends after `n_steps` or `minutes`.
+    """Say what to expect of a training that ends after `n_steps` or `minutes`. It has `psnr` dB after
+    EXPECTED_AT steps, which took `seconds` in all, most of them to compile code, and `seconds_a_step` each at
+    the end.
 
     >>> expectation(18.0, 30.0, 0.025, 1_000_000, 10.0, False)
     '25 ms a step: about 18,000 steps in 10 minutes at most, which give scenes like this 30 to 34 dB'

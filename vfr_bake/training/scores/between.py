@@ -1,7 +1,7 @@
-"""How well a field shows what lies between its pictures, told by the witnesses when training ends.
+"""Check, when training ends, of how well a field shows views between its pictures, by the witnesses.
 
-Fog and holes that no training picture shows are seen from elsewhere alone: on pixels of the pictures that are
-learned from their error is small. Whole pictures that are kept apart show them.
+Fog and holes that no training picture shows can be seen only from other places. They cause hardly any error
+at witnesses in the pictures that are learned from, but they do in whole pictures that are kept apart.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ import numpy as np
 from vfr_bake.training.scores.metrics import decibels
 
 MOST_APART = 4.0
-"""dB by which whole pictures may be worse than pixels of the learned ones: they are by 1.3 dB in can and by
-0.8 dB in the built-in scene. Where fog stood before can's floor, its test views were worse than the views
-that it had learned from by 6 to 8 dB."""
+"""Difference in dB, between the PSNR at patches of learned pictures and that at whole pictures, above which a
+warning is printed. It is 1.3 dB in can and 0.8 dB in the built-in scene. When there was fog before can's
+floor, its test views were 6 to 8 dB worse than the views that it had learned from."""
 
 
 class WitnessPsnr(NamedTuple):
-    """PSNR in dB at the witnesses; None where there are none of a kind."""
+    """PSNR in dB at the witnesses: at all of them, and by kind; None for a kind that does not exist."""
 
     every: float
     patches: float | None
-    """In patches of the pictures that are learned from."""
+    """At patches of the pictures that are learned from."""
     whole: float | None
-    """At pixels of whole pictures that are not."""
+    """At pixels of whole pictures that are not learned from."""
 
     def lines(self) -> list[str]:
-        """What to say of it when training ends, for whoever took the pictures.
+        """Return the lines to print when training ends, for whoever took the pictures.
 
         >>> WitnessPsnr(34.3, 35.52, 33.27).lines()
         ['pixels kept apart: 35.5 dB in pictures that are learned from, 33.3 dB in whole ones that are not']
@@ -50,8 +50,8 @@ class WitnessPsnr(NamedTuple):
 
 
 def witness_psnr(errors: np.ndarray, is_whole: np.ndarray) -> WitnessPsnr:
-    """PSNR of the mean square errors [n] at witnesses, of which `is_whole` [n] says which are of whole
-    pictures; no error counts as one of 1e-12.
+    """Return the PSNR for the mean square errors [n] at witnesses; `is_whole` [n] says which are of whole
+    pictures. An error of 0 counts as 1e-12.
 
     >>> witness_psnr(np.array([0.001, 0.01, 0.01, 0.019]), np.array([False, True, True, False]))
     WitnessPsnr(every=20.0, patches=20.0, whole=20.0)

@@ -1,8 +1,8 @@
-"""The full model against photographs, over its own background.
+"""Evaluation of the full model against photographs, over the model's own background.
 
-Where the exposure of a capture changes, nobody knows that of a view that was not learned from. So it is
-fitted on the left half of the view (`vfr_bake.training.captures`), and the right half is scored, as is usual
-since Martin-Brualla et al., "NeRF in the wild", 2021.
+If the exposure of a capture changes, the exposure of a view that was not learned from is unknown. It is then
+fitted on the left half of the view (`vfr_bake.training.captures`), and only the right half is scored, as is
+usual since Martin-Brualla et al., "NeRF in the wild", 2021.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ class RenderedView:
     """The full model's picture of a view, and the photograph."""
 
     name: str
-    """The camera's."""
+    """Name of the camera."""
     rgb: np.ndarray
     """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
     photograph: np.ndarray
-    """[height, width, 3] float32 in [0, 1], over the same background; as rendered where it is masked."""
+    """[height, width, 3] float32 in [0, 1], over the same background; equal to `rgb` where it is masked."""
     seen: float = 1.0
-    """Share of the pixels that are scored which is not masked."""
+    """Share of the scored pixels that are not masked."""
     first_column: int = 0
-    """Columns from this one on are scored: on those before it the exposure was fitted."""
+    """First column that is scored; on the columns before it the exposure was fitted."""
 
     def score(self, lpips: Distance | None = None) -> ViewScore:
-        """The scores of the columns that are scored; with `lpips`, that distance as well.
+        """Return the scores of the columns from `first_column` on; with `lpips`, that distance as well.
 
-        Raises ShapeError: they are smaller than SSIM's window.
+        Raises ShapeError: these columns are smaller than SSIM's window.
         """
         rgb, photograph = self.rgb[:, self.first_column :], self.photograph[:, self.first_column :]
         return score_view(self.name, rgb, photograph, lpips, self.seen)
@@ -46,7 +46,7 @@ class RenderedView:
 def render_views(
     model: Model, views: PosedImages, n_views: int = 0, masked: bool = False
 ) -> Iterator[RenderedView]:
-    """Views (model frame) rendered with the full model; `n_views` of them spread evenly, 0 for all.
+    """Render views (model frame) with the full model: `n_views` of them, spread evenly, or all if it is 0.
 
     `masked`: whether pixels that are not opaque are masked.
     """
@@ -71,15 +71,15 @@ def beside_photograph(
     exposure: bool,
     masked: bool,
 ) -> RenderedView:
-    """A picture as it is compared with its photograph.
+    """Return a picture and its photograph as they are compared.
 
     Args:
-        name: the camera's.
+        name: name of the camera.
         rgb: [height, width, 3] in [0, 1], over the background.
         opacity: [n_pixels].
         rgba: [height, width, 4] uint8, the photograph.
         background: [3] in [0, 1].
-        exposure: whether the exposure is fitted, on the left half.
+        exposure: whether the exposure is to be fitted on the left half.
         masked: whether pixels that are not opaque are masked.
     """
     first_column = 0
@@ -108,7 +108,7 @@ def evaluate(
     lpips: Distance | None = None,
     masked: bool = False,
 ) -> Iterator[ViewScore]:
-    """The scores of `render_views`' pictures; with `lpips`, that distance as well.
+    """Yield the scores of the pictures of `render_views`; with `lpips`, that distance as well.
 
     Raises ShapeError: a picture is smaller than SSIM's window.
     """

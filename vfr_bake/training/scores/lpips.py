@@ -1,12 +1,13 @@
-"""LPIPS: the distance of two pictures in the features of a network trained to recognise things.
+"""LPIPS: the distance between two pictures in the features of a network that was trained for recognition.
 
 Zhang, Isola, Efros, Shechtman and Wang, "The unreasonable effectiveness of deep features as a perceptual
 metric", 2018, version 0.1: d = sum over layers l of mean over pixels of sum_c w_lc (f_lc - g_lc)^2, with f, g
 the two pictures' activations, of unit length at every pixel, and w the layer's learned weights.
 
-Of the package `lpips` only the weights w are read. Its code needs torchvision, whose build has to fit torch's
-in version and GPU, for two lists of convolutions; they are written down here instead. The weights of the
-convolutions are torchvision's, from where torch keeps what was downloaded. Nothing is downloaded here.
+Only the weights w are read from the package `lpips`. Its code is not used, because it needs torchvision for
+two lists of convolutions, and torchvision's build has to match torch's in version and GPU. The lists are
+written down here instead. The weights of the convolutions are torchvision's, read from the folder where torch
+keeps its downloads. Nothing is downloaded here.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from vfr_bake.training.tensor_files import read_tensors
 
 MEAN = (-0.030, -0.088, -0.188)
 DEVIATION = (0.458, 0.448, 0.450)
-"""What the networks' inputs were normalised by, for values in [-1, 1]."""
+"""Mean and standard deviation by which the networks' inputs, in [-1, 1], were normalised."""
 
 
 class Lpips:
-    """The distance of pictures by one network; 0 for equal ones. Loads the weights once."""
+    """Distance between pictures by one network, 0 for equal pictures. The weights are loaded once."""
 
     def __init__(self, network: str = "alex") -> None:
-        """`network`: "alex" (AlexNet, what papers report most) or "vgg" (VGG-16).
+        """`network`: "alex" (AlexNet, which papers report most) or "vgg" (VGG-16).
 
-        Raises MissingExtraError: no package `lpips`; FormatError: a file of weights is missing or broken.
+        Raises MissingExtraError: the package `lpips` is not installed; FormatError: a file of weights is
+        missing or broken; ConfigError: no such network.
         """
         if network not in _NETWORKS:
             raise ConfigError(f"lpips: network: expected one of {', '.join(_NETWORKS)}, got {network}")
@@ -46,9 +48,9 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
-        """The distance of two pictures [height, width, 3] with values in [0, 1].
+        """Return the distance between two pictures [height, width, 3] with values in [0, 1].
 
-        Raises ShapeError: not of one shape, or so small that the deepest layer has no pixel.
+        Raises ShapeError: the pictures differ in shape, or are so small that the deepest layer has no pixel.
         """
         size = self._settings.min_size
         if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3 or min(a.shape[:2]) < size:
@@ -60,7 +62,7 @@ class Lpips:
         return sum(float((w * (f - g) ** 2).sum(dim=1).mean()) for w, f, g in layers)
 
     def _activations(self, rgb: np.ndarray) -> list[torch.Tensor]:
-        """One tensor [1, n_channels, h, w] a layer, of unit length over the channels."""
+        """Return a tensor [1, n_channels, h, w] for each compared layer, of unit length over the channels."""
         values = (2 * np.asarray(rgb, np.float32) - 1 - np.array(MEAN)) / np.array(DEVIATION)
         x = torch.from_numpy(values).float().permute(2, 0, 1)[None].contiguous()
         taken = []
@@ -71,13 +73,13 @@ class Lpips:
         return taken
 
     def _n_channels(self) -> list[int]:
-        """Channels of every layer that is compared; the layer before each is its convolution."""
+        """Return the channels of each compared layer, which are those of the convolution before it."""
         convolutions = [self._layers[index - 1] for index in self._settings.taken]
         return [layer.out_channels for layer in convolutions if isinstance(layer, nn.Conv2d)]
 
 
 def _alexnet() -> nn.Sequential:
-    """The convolutions of AlexNet, numbered as torchvision's `alexnet().features`."""
+    """Make the convolutions of AlexNet, numbered as torchvision's `alexnet().features`."""
     return nn.Sequential(
         *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
         *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
@@ -88,7 +90,7 @@ def _alexnet() -> nn.Sequential:
 
 
 def _vgg16() -> nn.Sequential:
-    """The convolutions of VGG-16, numbered as torchvision's `vgg16().features`."""
+    """Make the convolutions of VGG-16, numbered as torchvision's `vgg16().features`."""
     layers: list[nn.Module] = []
     n_in = 3
     for n_convolutions, n_out in ((2, 64), (2, 128), (3, 256), (3, 512), (3, 512)):
@@ -104,11 +106,11 @@ def _vgg16() -> nn.Sequential:
 class _Network:
     layers: Callable[[], nn.Sequential]
     checkpoint: str
-    """Its file's name, as torchvision's address has it and torch hub keeps it."""
+    """Name of the file with the weights, both in torchvision's address and in torch hub's folder."""
     taken: tuple[int, ...]
-    """The layers whose activations are compared."""
+    """Numbers of the layers whose activations are compared."""
     min_size: int
-    """Pixels: a picture that is narrower or lower has nothing left at the deepest layer."""
+    """Smallest width and height in pixels with which a picture has a pixel left at the deepest layer."""
 
 
 _NETWORKS = {
@@ -131,7 +133,7 @@ def _load_layers(layers: nn.Sequential, checkpoint: str) -> None:
 
 
 def _layer_weights(network: str, n_channels: list[int]) -> list[torch.Tensor]:
-    """One tensor [1, n_channels, 1, 1] a layer, out of the package `lpips`, which is not imported."""
+    """Read a tensor [1, n_channels, 1, 1] for each layer from the package `lpips`, without importing it."""
     package = find_spec("lpips")
     if package is None or not package.submodule_search_locations:
         raise MissingExtraError(

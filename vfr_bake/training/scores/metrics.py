@@ -2,8 +2,8 @@
 
 Pictures are [height, width, 3] with values in [0, 1]. PSNR = -10 log10(mean squared error). SSIM is that of
 Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error visibility to structural
-similarity", 2004: Gaussian window of standard deviation 1.5 cut at 11 x 11 pixels, K1 = 0.01, K2 = 0.03, the
-mean over all windows that lie wholly inside the picture, and then over the channels.
+similarity", 2004, with a Gaussian window of standard deviation 1.5 cut at 11 x 11 pixels, K1 = 0.01 and K2 =
+0.03: the mean over all windows that lie wholly inside the picture, and then over the channels.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from player.errors import MissingExtraError, ShapeError
 from player.files.images import to_8_bit
 
 SSIM_WINDOW = 11
-"""Pixels: the width and height of SSIM's window, and so of the smallest picture that has one."""
+"""Width and height in pixels of SSIM's window, and so of the smallest picture that has an SSIM."""
 
 BRIGHTEST_ERROR = 0.25
-"""White in the error map is a difference of this or more, in [0, 1]; fixed, so that views can be compared."""
+"""Difference in [0, 1] from which on the error map is white; fixed, so that views can be compared."""
 
 Distance = Callable[[np.ndarray, np.ndarray], float]
-"""A measure of two pictures [height, width, 3] in [0, 1], 0 for equal ones; for example `lpips.Lpips`."""
+"""Distance between two pictures [height, width, 3] in [0, 1], 0 for equal ones; for example `lpips.Lpips`."""
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's agreement with its photograph."""
+    """Scores of one view against its photograph."""
 
     name: str
     psnr: float
-    """In dB, between 8-bit pictures; infinite where they are equal."""
+    """PSNR in dB between 8-bit pictures; infinite where they are equal."""
     ssim: float
     """SSIM between 8-bit pictures; 1 where they are equal."""
     psnr_float: float
-    """In dB, between the pictures before they are rounded to 8 bits."""
+    """PSNR in dB between the pictures before they are rounded to 8 bits."""
     ssim_float: float
     """SSIM between the pictures before they are rounded to 8 bits."""
     lpips: float | None
@@ -45,9 +45,9 @@ class ViewScore:
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of two pictures with values in [0, 1]; infinite for equal ones.
+    """Return the peak signal-to-noise ratio in dB of two pictures with values in [0, 1]; infinite if equal.
 
-    Raises ShapeError: the pictures are not of one shape.
+    Raises ShapeError: the pictures differ in shape.
 
     >>> round(psnr(np.zeros((2, 2, 3)), np.full((2, 2, 3), 0.1)), 3)
     20.0
@@ -57,7 +57,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def decibels(error: float) -> float:
-    """The PSNR of a mean square error of values in [0, 1]; infinite for 0, NaN for NaN.
+    """Return the PSNR in dB for a mean square error of values in [0, 1]; infinite for 0, NaN for NaN.
 
     >>> round(decibels(0.01), 3), decibels(0.0), decibels(math.nan)
     (20.0, inf, nan)
@@ -66,11 +66,13 @@ def decibels(error: float) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity of two pictures [height, width, 3] with values in [0, 1]; 1 for equal ones.
+    """Return the structural similarity of two pictures [height, width, 3] with values in [0, 1]; 1 if equal.
 
-    In float32: half the time of float64, and within 1e-5 of it, where figures are given to four decimals.
+    It is computed in float32, in half the time of float64 and within 1e-5 of it; figures are given to four
+    decimals.
 
-    Raises ShapeError: not of one shape, or smaller than the window; MissingExtraError: no scikit-image.
+    Raises ShapeError: the pictures differ in shape or are smaller than the window; MissingExtraError:
+    scikit-image is not installed.
 
     >>> grey = np.full((16, 16, 3), 0.5)
     >>> ssim(grey, grey), round(ssim(grey, grey + 0.25), 4)  # (2 m n + C1) / (m^2 + n^2 + C1), C1 = 1e-4
@@ -105,11 +107,11 @@ def score_view(
     lpips: Distance | None = None,
     seen: float = 1.0,
 ) -> ViewScore:
-    """All scores of a picture against its photograph, both [height, width, 3] in [0, 1], not rounded.
+    """Return all scores of a picture against its photograph, both [height, width, 3] in [0, 1], not rounded.
 
-    `lpips`: also measure this on the 8-bit pictures. `seen`: share of the pixels, more than 0, that count;
-    elsewhere the two pictures are equal, and PSNR is that of the pixels that count. Raises ShapeError as
-    `ssim` does.
+    `lpips`: a distance to measure on the 8-bit pictures as well. `seen`: share of the pixels, more than 0,
+    that count. The two pictures must be equal at the others; PSNR is that of the pixels that count. Raises
+    ShapeError as `ssim` does.
 
     >>> score = score_view("grey", np.full((16, 16, 3), 0.5), np.full((16, 16, 3), 0.501))
     >>> score.psnr, round(score.psnr_float), score.lpips
@@ -128,7 +130,8 @@ def score_view(
 
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float | None]:
-    """The mean over at least one view of every score, by its name in `ViewScore`; None where a view has None.
+    """Return the mean of every score over at least one view, by its name in `ViewScore`; None where a view
+    has None.
 
     >>> mean_scores([ViewScore("a", 20, 0.5, 21, 0.5, None), ViewScore("b", 30, 1, 31, 1, None)])
     {'psnr': 25.0, 'ssim': 0.75, 'psnr_float': 26.0, 'ssim_float': 0.75, 'lpips': None}
@@ -139,14 +142,15 @@ def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float | None]:
 
 
 def over_background(rgba: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Straight-alpha uint8 pictures [..., 4] over a background [3] in [0, 1]: float32 [..., 3] in [0, 1]."""
+    """Put straight-alpha uint8 pictures [..., 4] over a background [3] in [0, 1]; return float32 [..., 3] in
+    [0, 1]."""
     values = rgba.astype(np.float32) / 255
     alpha = values[..., 3:]
     return values[..., :3] * alpha + (1 - alpha) * background.astype(np.float32)
 
 
 def comparison(photograph: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """Photograph | rendered | error map, [height, 3 width, 3] uint8.
+    """Return photograph | rendered | error map side by side, [height, 3 width, 3] uint8.
 
     `photograph`, `rgb`: [height, width, 3] in [0, 1].
 
@@ -163,9 +167,9 @@ def comparison(photograph: np.ndarray, rgb: np.ndarray) -> np.ndarray:
 
 
 def error_map(photograph: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """The largest difference of the three channels as a colour [height, width, 3] uint8.
+    """Return the largest difference of the three channels as a colour [height, width, 3] uint8.
 
-    Black for none, then red, yellow, and white from `BRIGHTEST_ERROR` on.
+    Equal pixels are black; larger differences go through red and yellow to white, from `BRIGHTEST_ERROR` on.
 
     >>> error_map(np.zeros((1, 3, 3)), np.array([[[0, 0, 0], [0, 0.25 / 3, 0], [1, 1, 1]]])).tolist()
     [[[0, 0, 0], [255, 0, 0], [255, 255, 255]]]
