@@ -1,5 +1,5 @@
-"""The whole way on real input: the lego scene of NeRF-synthetic, shortened. It fails, never skips, where
-that is missing."""
+"""Train, bake and play on real input: the lego scene of NeRF-synthetic, with few steps. If the data set is
+missing the tests fail; they are never skipped."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ SHORT = [
 ]  # fmt: skip
 
 N_WITNESSES = 15_000
-"""A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
+"""Number of witnesses, a quarter of those that a training keeps apart, because a bake plays all of them for
+each of its choices."""
 N_RAYS, N_SEEING = 100_000, 500_000
-"""Rays that tell how much each stored value matters, and which cells are seen: fewer than a bake takes."""
+"""Numbers of rays from which a bake learns how much each stored value matters, and which cells are seen:
+fewer than by default."""
 
 
 @pytest.fixture(scope="module")
 def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Model, asset and frames of a shortened run."""
+    """The folder with the model, the asset and the frames of a shortened run."""
     out = tmp_path_factory.mktemp("lego")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
-        patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
+        patch.setattr("vfr_bake.baking.rate.importance.N_RAYS", N_RAYS)
         patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
         assert train_main([str(lego_400), str(out / "model.pt"), *SHORT]) == 0
         settings = ["--mesh-resolution", "64", "--refine-steps", "60"]
@@ -45,7 +47,7 @@ def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def two_test_views(data: Path, folder: Path) -> Path:
-    """The data set with the two test views that are played: to render all 200 takes minutes."""
+    """Return a copy of the data set with only the two test views that are played: all 200 take minutes."""
     folder.mkdir()
     for name in ("train", "test"):
         (folder / name).symlink_to(data / name)
@@ -90,7 +92,7 @@ def test_the_report_of_playing_is_complete(out: Path) -> None:
     ("suffix", "options"), [("ply", []), ("obj", ["--method", "baked"]), ("glb", ["--method", "baked"])]
 )
 def test_the_mesh_has_the_legos_size_in_every_format(out: Path, suffix: str, options: list[str]) -> None:
-    """The surface that is found for the export, which takes seconds, and the one that is in the asset."""
+    """The surface that the export finds, which takes seconds, and the mesh in the asset have lego's size."""
     import trimesh
 
     assert export([str(out / "asset"), str(out / f"mesh.{suffix}"), *options]) == 0

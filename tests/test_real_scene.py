@@ -1,5 +1,5 @@
-"""The whole way of a scene without end: the fox capture, a phone's pictures with distortion, shortened. It
-fails, never skips, where that is missing."""
+"""Train, bake and play an unbounded scene: the fox capture, phone pictures with lens distortion, with few
+steps. If the data set is missing the tests fail; they are never skipped."""
 
 from __future__ import annotations
 
@@ -41,22 +41,23 @@ BAKE = [
 ]
 
 N_WITNESSES = 15_000
-"""A quarter of the witnesses that a training keeps apart: a bake plays them all for each of its choices."""
+"""Number of witnesses, a quarter of those that a training keeps apart, because a bake plays all of them for
+each of its choices."""
 N_RAYS = 20_000
-"""Rays that tell how much each stored value matters, and what coarser levels show: those of so young a model
-have a hundred samples."""
+"""Number of rays from which a bake learns how much each stored value matters, and what coarser levels show.
+It is small because a ray through a model that was trained so briefly has a hundred samples."""
 N_SEEING = 300_000
-"""Rays that tell which cells are seen, a tenth of all pixels."""
+"""Number of rays that find the cells that are seen: a tenth of all pixels."""
 
 
 @pytest.fixture(scope="module")
 def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Model, asset and one training view, played."""
+    """The folder with the model, the asset and one training view, played."""
     out = tmp_path_factory.mktemp("fox")
     model, asset = str(out / "model.pt"), str(out / "asset")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
-        patch.setattr("vfr_bake.baking.rate.N_RAYS", N_RAYS)
+        patch.setattr("vfr_bake.baking.rate.importance.N_RAYS", N_RAYS)
         patch.setattr("vfr_bake.baking.detail.detail.N_COMPARED", N_RAYS)
         patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
         assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
@@ -80,7 +81,7 @@ def test_training_tells_what_it_knows_of_views_between_the_pictures(out: Path) -
 def test_played_training_views_are_the_photographs_nearly_as_well_as_the_model_knows_them(
     out: Path, fox: Path
 ) -> None:
-    """Every fifth view: a single one loses 0.07 to 0.7 dB, by the last bits of training."""
+    """Every fifth training view is played: one view alone loses 0.07 to 0.7 dB, depending on rounding."""
     model, train = load_model(out / "model.pt"), load_scene(fox, downscale=8).train
     photographs = dict(zip([camera.name for camera in train.cameras], train.images, strict=True))
     known, played = [], []

@@ -66,7 +66,8 @@ from vfr_bake.baking.limits import (
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
 from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
-from vfr_bake.baking.rate import (
+from vfr_bake.baking.rate.importance import importance
+from vfr_bake.baking.rate.price import (
     AIM,
     FIRST_PRICE,
     LOWEST_PRICE,
@@ -74,7 +75,6 @@ from vfr_bake.baking.rate import (
     Prices,
     Spent,
     highest_price,
-    importance,
 )
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side

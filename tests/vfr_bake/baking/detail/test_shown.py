@@ -24,7 +24,7 @@ from vfr_bake.baking.detail.search import largest
 from vfr_bake.baking.detail.shown import Choice, Wanted, mean_values, wanted_values
 from vfr_bake.baking.distillation import TeacherRays
 from vfr_bake.baking.grids import Layout, latent
-from vfr_bake.baking.rate import Choices
+from vfr_bake.baking.rate.choices import Choices
 from vfr_bake.training.length.witness_loss import Loss
 
 

@@ -18,20 +18,9 @@ from vfr_bake.baking.detail.shown import Wanted, mean_values
 from vfr_bake.baking.distillation import collect_training_rays
 from vfr_bake.baking.grids import latent, whole_codes
 from vfr_bake.baking.head import runner
-from vfr_bake.baking.rate import (
-    AROUND,
-    CLOSE,
-    EVERYWHERE,
-    FURTHEST,
-    MOST_PRICES,
-    NEAR,
-    Choices,
-    bits_of,
-    first_bits,
-    highest_price,
-    importance,
-    importance_of_levels,
-)
+from vfr_bake.baking.rate.choices import Choices, bits_of, first_bits
+from vfr_bake.baking.rate.importance import AROUND, EVERYWHERE, importance, importance_of_levels
+from vfr_bake.baking.rate.price import CLOSE, FURTHEST, MOST_PRICES, NEAR, highest_price
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.symbols import add_squares, add_to_coarser, choose, from_coarser
 from vfr_bake.training.model_file import Model
