@@ -9,6 +9,7 @@ from PIL import Image
 
 from player.files.images import to_8_bit, write_png
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.witnesses import whole_views
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.scores.metrics import comparison, over_background
 from vfr_bake.training.trainer import Trainer
@@ -29,11 +30,14 @@ def preview_path(model: Path) -> Path:
 
 
 class Preview:
-    """A view of a scene, from the test split if there is one, and the file that shows it."""
+    """A view of a scene that training does not learn from, and the file that shows it. The view is one of the
+    test split, else one of the whole views that are kept apart (`vfr_bake.data.witnesses`); a scene with
+    fewer views shows one that it learns from."""
 
     def __init__(self, scene: Scene, path: Path) -> None:
         views = scene.test if scene.test.cameras else scene.train
-        number = len(views.cameras) // 2
+        candidates = range(len(views.cameras)) if views is scene.test else whole_views(len(views.cameras))
+        number = int(candidates[len(candidates) // 2]) if len(candidates) else len(views.cameras) // 2
         self._camera = camera = views.cameras[number].at_most(SIDE)
         rgba = views.images[number]
         # Over white where pictures have alpha, as is usual for data sets of objects; else over the mean

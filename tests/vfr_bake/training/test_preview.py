@@ -1,7 +1,8 @@
-"""The picture that is looked at while a field learns."""
+"""The preview: a picture that is written while a field learns."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.witnesses import whole_views
 from vfr_bake.training.preview import SECONDS, SIDE, Preview
 from vfr_bake.training.trainer import Trainer
 
@@ -31,6 +33,14 @@ def test_the_photograph_stands_beside_the_picture_and_what_is_wrong(tmp_path: Pa
     over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
     assert np.abs(photograph / 255 - over_white).max() < 0.01
     assert rendered.shape == photograph.shape and error.max() > 0
+
+
+def test_without_a_test_split_a_view_that_is_kept_apart_is_shown(tmp_path: Path):
+    scene = demo_scene(size=16, n_train=40, n_test=1)
+    train = replace(scene, test=scene.test.some([]))
+    camera = Preview(train, tmp_path / "a.preview.png")._camera
+    shown = [place for place, view in enumerate(scene.train.cameras) if np.array_equal(view.c2w, camera.c2w)]
+    assert set(shown) <= set(whole_views(40).tolist()) and len(shown) == 1
 
 
 def test_large_pictures_are_reduced_and_written_once_a_minute(tmp_path: Path):
