@@ -23,7 +23,6 @@ from exporters.head.asset_head import head_bytes
 from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
 from exporters.pages import export_page
 from exporters.pictures import export_pictures
-from exporters.progress import Report, silent
 from exporters.shapes.crop import parse_crop
 from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.volume import asset_volume
@@ -36,6 +35,7 @@ from player.cameras.views import asset_cameras, read_views
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
 from player.page.page import is_site_file
+from player.progress import Report, silent
 
 Facts = dict[str, Any]
 """Description of an export: JSON values by name."""

@@ -19,7 +19,6 @@ from exporters.mesh.paint import paint
 from exporters.mesh.simplify import simplify_mesh
 from exporters.mesh.unwrap import unwrap
 from exporters.options import TEXTURE_FACES, ExportOptions
-from exporters.progress import Report
 from exporters.shapes.crop import crop_mesh, parse_crop
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import AssetSurface
@@ -28,6 +27,7 @@ from exporters.surface.few_faces import few_faces
 from player.asset.asset import Asset
 from player.errors import ConfigError
 from player.files.files import write_together
+from player.progress import Report
 
 _SECONDS = 300.0
 """Seconds that the layout of a texture may take unless another limit is asked for."""

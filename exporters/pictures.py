@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from exporters.formats.exr import exr_channels, exr_header, load_openexr, write_exr
-from exporters.progress import Progress, silent
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import new_folder
+from player.progress import Progress, silent
 from player.render import Renderer, check_size
 
 

@@ -26,7 +26,7 @@ class FormatError(VfrError, ValueError):
 
 
 class VersionError(FormatError):
-    """A file needs a newer reader."""
+    """A file has a version that this program does not read."""
 
 
 class IntegrityError(FormatError):

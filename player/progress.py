@@ -1,10 +1,18 @@
-"""Progress of work on stderr: a bar if that is a terminal, else a line now and then."""
+"""Progress of work: the functions that long-running work calls, and a bar on stderr if that is a terminal, or
+else a line now and then."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 import time
+from collections.abc import Callable
+
+Progress = Callable[[int, int], object]
+"""A function called with (done, of): the steps done and their total."""
+
+Report = Callable[[str, int, int], object]
+"""A function called with (stage, done, of): the name of the stage, its steps done and their total."""
 
 SECONDS_BETWEEN_LINES = 30.0
 """Seconds between two lines of progress, which are written instead of a bar where stderr is no terminal."""
@@ -12,6 +20,10 @@ SECONDS_BETWEEN_BARS = 0.1
 """Least time in seconds until a bar is drawn again, except for the last time."""
 CELLS = 24
 """Length of a bar in characters."""
+
+
+def silent(*_: object) -> None:
+    """Ignore the call: a Progress or Report for callers that want none."""
 
 
 class Bar:

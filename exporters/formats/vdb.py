@@ -57,7 +57,8 @@ def vdb_bytes(volume: Volume) -> bytes:
     """
     if not len(volume.index) or volume.index.max() >= _ROOT_CHILD:
         raise ConfigError(
-            f"VDB: volume: expected 1 or more vertices below {_ROOT_CHILD}, got {len(volume.index)}"
+            f"VDB: volume: expected 1 or more vertices with indices below {_ROOT_CHILD}, got "
+            f"{len(volume.index)} up to {volume.index.max(initial=0)}"
         )
     grids = {"density": (volume.index, volume.density[:, None])}
     if volume.colours is not None:

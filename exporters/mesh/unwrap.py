@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from exporters.progress import Progress, silent
 from exporters.shapes.mesh import TriangleMesh, crossed_edges
 from player.child import python_command
 from player.errors import ConfigError, DataError, MissingExtraError
+from player.progress import Progress, silent
 
 GUTTER = 2
 """Texels left free between two charts."""

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from exporters.mesh.rays import MeshRays
-from exporters.progress import Report
 from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import Surface, TriangleMesh, take_faces
 from exporters.surface.components import remove_small_components
@@ -31,6 +30,7 @@ from exporters.surface.tsdf import fuse_depth
 from player.asset.asset import Asset
 from player.errors import DataError, MissingExtraError
 from player.files.images import to_8_bit
+from player.progress import Report
 
 FLOATER_FRACTION = 1e-4
 """Connected parts with a smaller share of the faces than this are floaters, which are removed."""

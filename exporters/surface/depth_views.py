@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exporters.progress import Progress, silent
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
+from player.progress import Progress, silent
 from player.render import Renderer
 
 MAX_VIEWS = 100

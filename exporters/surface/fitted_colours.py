@@ -17,10 +17,10 @@ import numpy as np
 
 from exporters.extras import needs
 from exporters.mesh.rays import MeshRays
-from exporters.progress import Progress, silent
 from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.depth_views import DepthView
+from player.progress import Progress, silent
 
 SMOOTH = 0.03
 """Weight of an edge; a pixel has weight 1."""

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from exporters.extras import needs
-from exporters.progress import silent
 from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
 from player.asset.grid import SparseGrid
 from player.errors import ConfigError, DataError, ShapeError
+from player.progress import silent
 
 BLOCK = 64
 """Cells along each side of a block, whose codes take 1 MB."""

@@ -13,13 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from exporters.progress import Progress, silent
 from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import unit
 from exporters.surface.depth_views import TOLERANCE, DepthView, cosines_in_view
 from exporters.surface.marching_cubes import voxel_size
 from player.asset.asset import Asset
 from player.head.head import Head
+from player.progress import Progress, silent
 from player.render import choose_march
 from player.threads import default_threads
 

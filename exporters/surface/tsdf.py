@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from exporters.extras import require_open3d
-from exporters.progress import Progress, silent
 from exporters.shapes.mesh import Surface, has_three_corners, unit_normals
 from exporters.surface.depth_views import DepthView
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError
+from player.progress import Progress, silent
 
 TRUNCATION = 3.0
 """Truncation distance in voxels: a depth takes effect up to so far before and behind it."""

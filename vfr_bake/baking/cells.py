@@ -11,7 +11,6 @@ sample. So a cell is stored only if samples that the model's sampler chose on so
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import torch
 
 from player.errors import TrainingError
 from player.march.contracted import MAX_SPEED
+from player.progress import Progress
 from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, Shown, views_between, widened
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.density import LIMITS
@@ -52,9 +52,6 @@ WEIGHT_FLOOR = 0.01
 it; with 0.003 it would have half again as many vertices."""
 CELL_SHARE = 0.008
 """Share of the cells of contracted space that is expected to be stored, before a scene is examined."""
-
-Progress = Callable[[int, int], object]
-"""Progress callback, called with (steps done, steps in all)."""
 
 
 class Resolutions(NamedTuple):

@@ -4,19 +4,16 @@ fewer bytes, and get coarser levels beneath, so that the asset's first part alre
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.files.files import check_target
+from player.progress import Progress
 from vfr_bake.baking.coarser_levels import with_coarser_levels
 
 STEPS = 6
 """Number of steps that are reported to `progress`."""
-
-Progress = Callable[[int, int], object]
-"""Progress callback, called with (steps done, steps in all)."""
 
 
 @dataclass(frozen=True)

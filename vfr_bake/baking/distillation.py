@@ -25,7 +25,7 @@ from player.errors import TrainingError
 from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
 from player.march.march import MIN_OPACITY, MarchResult
 from player.march.path import path_of
-from vfr_bake.baking.cells import Progress
+from player.progress import Progress
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.kernels.stored_features import compose, composite, corner_rows, interpolate, padded, take_runs
 from vfr_bake.rendering.render import head_colours

@@ -28,7 +28,8 @@ from player.asset.density import encode_density
 from player.asset.grid import SparseGrid, VertexRows, build_grid, vertex_rows
 from player.asset.pyramid import Pyramid, PyramidValues
 from player.asset.single_level import VertexBricks, from_vertices
-from vfr_bake.baking.cells import Progress, Resolutions, corners_of, subdivided
+from player.progress import Progress
+from vfr_bake.baking.cells import Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
 from vfr_bake.field.networks import Head
 from vfr_bake.kernels.latent_rows import LARGEST_LATENT, PARTS, PARTS_BITS

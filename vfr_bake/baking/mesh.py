@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exporters.progress import Report
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.depth_views import FEW_PIXELS
@@ -15,6 +14,7 @@ from exporters.surface.few_faces import few_faces
 from exporters.surface.inner_region import inner_region
 from player.asset.asset import Asset
 from player.errors import ConfigError, DataError
+from player.progress import Report
 
 VIEWS = 50
 """Most views that are rendered for the mesh."""

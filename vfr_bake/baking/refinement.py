@@ -25,7 +25,7 @@ from exporters.head.ranges import activation_ranges
 from player.asset.density import decode_constants
 from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
-from vfr_bake.baking.cells import Progress
+from player.progress import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import Layout, Parts, move_towards, remainders, whole_codes, with_remainders
 from vfr_bake.baking.head import FoldedHead, between, runner, small_head

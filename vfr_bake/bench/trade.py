@@ -11,7 +11,6 @@ from __future__ import annotations
 import shlex
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, DataError
 from player.march.interpolation import Quality
+from player.progress import Report
 from player.threads import bounded_threads
 from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.commands import bake_command, play_command
@@ -40,8 +40,6 @@ N_FIRST_PICTURES = 3
 """Number of times that an asset is opened to time its first picture; the median counts."""
 MODEL_FRAMES = 3
 """Frames of the full model at each size except the photographs' own, at which every view is rendered."""
-
-Progress = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Views:
         return views
 
 
-def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Progress) -> Trade:
+def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report) -> Trade:
     """Play the assets with every k and quality at every size, and return what was measured; `progress` is
     called with (stage, done, of).
 
@@ -156,7 +154,7 @@ class _Run:
     """Views, settings and files that all measurements share."""
 
     def __init__(
-        self, folder: Path, views: Views, config: BenchConfig, lpips: Distance | None, progress: Progress
+        self, folder: Path, views: Views, config: BenchConfig, lpips: Distance | None, progress: Report
     ) -> None:
         self._views = views
         self._lpips = lpips
@@ -290,7 +288,7 @@ def played_bytes(asset: Asset) -> int:
     return sum(entry.bytes for name, entry in files if not name.startswith("report."))
 
 
-def _read_views(config: BenchConfig, assets: list[Asset], progress: Progress) -> Views:
+def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> Views:
     train = assets[0].manifest.provenance.get("train", {})
     scene = load_scene(
         config.data,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from player.cameras.colmap import colmap_folder
+from player.progress import Progress
 from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.files.archives import is_archive, unpack
@@ -17,7 +18,6 @@ from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
-from vfr_bake.data.threads import Progress
 from vfr_bake.data.world import scaled
 
 __all__ = [

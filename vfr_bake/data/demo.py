@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from player.cameras.camera import Camera
+from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo_shading import shade
 from vfr_bake.data.demo_solids import (
@@ -34,7 +35,7 @@ from vfr_bake.data.demo_solids import (
     scene_distance,
 )
 from vfr_bake.data.scene import Scene, build_scene
-from vfr_bake.data.threads import Progress, in_threads
+from vfr_bake.data.threads import in_threads
 
 __all__ = [
     "AABB",

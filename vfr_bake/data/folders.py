@@ -15,6 +15,7 @@ from player.cameras.colmap import colmap_folder, read_cameras, read_images, read
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
 from player.files.json_files import brief
+from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.masks import mask_of
@@ -22,7 +23,6 @@ from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.orientation import Layout, is_taken_upright, read_layout
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.store.reading import PictureReader
-from vfr_bake.data.threads import Progress
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 

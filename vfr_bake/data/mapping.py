@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from player.errors import MissingExtraError
+from player.progress import Progress
 from vfr_bake.data.features import Features, match
-from vfr_bake.data.threads import Progress, in_threads, n_threads
+from vfr_bake.data.threads import in_threads, n_threads
 
 MIN_MATCHES = 15
 MIN_FOR_PRINCIPAL_POINT = 20

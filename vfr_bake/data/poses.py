@@ -17,6 +17,7 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError, OutputError
 from player.files.files import check_target, new_folder, read_bytes
 from player.kept_code import user_folder
+from player.progress import Report
 from vfr_bake.data.features import Features, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
@@ -64,8 +65,6 @@ ADVICE = (
     "they are, and keep textured surroundings in the picture: a plain, shiny or transparent subject alone "
     "gives nothing to hold on to"
 )
-
-Progress = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def has_pictures(folder: Path) -> bool:
 
 
 def estimate_cameras(
-    photos: Path, progress: Progress, say: Callable[[str], object] | None = None
+    photos: Path, progress: Report, say: Callable[[str], object] | None = None
 ) -> PoseReport:
     """Estimate the camera of every picture, and keep the result as `sparse/0` beside the pictures.
 
@@ -279,7 +278,7 @@ def _placed(
     sensors: Sequence[Sensor],
     features: Sequence[Features],
     pairs: Sequence[Pair],
-    progress: Progress,
+    progress: Report,
 ) -> list[Any]:
     """Return the `pycolmap.Reconstruction`s of the pictures in the folder `place`, the largest first, after
     joining those into it that fit. If the largest is folded, models built from a walk are returned instead,

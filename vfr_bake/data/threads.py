@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+from player.progress import Progress
 from player.threads import default_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Progress = Callable[[int, int], object]
-"""A function that is called with the number of items that are done and the number of all items."""
 
 
 def n_threads() -> int:

@@ -74,7 +74,9 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     random = np.random.default_rng(SEED)
     pixels = [
         spread(n, of, random) if view in whole else patches(n, camera.width, camera.height, random)
-        for view, (n, of, camera) in enumerate(zip(counts, n_pixels, views.cameras, strict=True))
+        for view, (n, of, camera) in enumerate(
+            zip(counts.tolist(), n_pixels.tolist(), views.cameras, strict=True)
+        )
     ]
     counts = np.array([len(some) for some in pixels], np.int32)
     rgba = [views.pixels(view, rows) for view, rows in enumerate(pixels)]

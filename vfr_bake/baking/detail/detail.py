@@ -15,7 +15,7 @@ import numpy as np
 
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera
-from vfr_bake.baking.cells import Progress
+from player.progress import Progress
 from vfr_bake.baking.detail.errors import (
     LevelsOfDensities,
     LevelsOfFeatures,

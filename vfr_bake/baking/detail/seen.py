@@ -24,7 +24,7 @@ from player.asset.grid import SparseGrid
 from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
 from player.compiled.samples import sample_rays
-from vfr_bake.baking.cells import Progress
+from player.progress import Progress
 from vfr_bake.baking.grids import Layout, Vertices
 from vfr_bake.kernels.sample_weights import BLOCKS, add_block_weights
 

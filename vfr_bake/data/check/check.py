@@ -15,6 +15,7 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
+from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
 from vfr_bake.data.check.turning import share_turned
@@ -22,14 +23,13 @@ from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures
-from vfr_bake.data.files.pictures import DescribedView
+from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import is_video
 from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
-from vfr_bake.data.threads import Progress
 
 PLAIN_FEATURES = 30
 """A picture with fewer features, at the size of the check, shows nothing that could be recognised."""
@@ -213,8 +213,6 @@ def _listed(data: str) -> _Set:
 
 
 def _size(path: Path) -> tuple[int, int] | None:
-    from vfr_bake.data.files.pictures import picture_size
-
     try:
         return picture_size(path, upright=True)
     except DataError:

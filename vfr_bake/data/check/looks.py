@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from player.errors import DataError
+from player.progress import Progress
 from vfr_bake.data.check.turning import MIN_MATCHES, OFF
 from vfr_bake.data.features import match
 from vfr_bake.data.files.pictures import (
@@ -26,7 +27,7 @@ from vfr_bake.data.files.pictures import (
     shrunk,
 )
 from vfr_bake.data.quality.sharpness import blur
-from vfr_bake.data.threads import Progress, n_threads, one_by_one
+from vfr_bake.data.threads import n_threads, one_by_one
 
 FEATURE_SIDE, N_FEATURES = 480, 400
 """Pixels of the longest side at which features are looked for, and the number of features that are kept."""

@@ -14,8 +14,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from player.errors import DataError, OutputError
 from player.files.files import new_folder
+from player.progress import Progress
 from vfr_bake.data.files.opening import SUFFIXES
-from vfr_bake.data.threads import Progress
 
 SUFFIX = ".zip"
 KEPT = (*SUFFIXES, ".bmp", ".json", ".bin")

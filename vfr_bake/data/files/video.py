@@ -17,8 +17,8 @@ from PIL import Image
 
 from player.errors import DataError
 from player.files.files import new_folder
+from player.progress import Progress
 from vfr_bake.data.files.pictures import opencv, sharpness, shrunk
-from vfr_bake.data.threads import Progress
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 STEP = 0.03

@@ -18,10 +18,11 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.cameras.rotations import OPENGL_FROM_OPENCV
+from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
 from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_options
-from vfr_bake.data.threads import Progress, in_threads
+from vfr_bake.data.threads import in_threads
 
 MIN_KEPT = 0.1
 """Share of the matches of two pictures that follow each other which a model must keep as points that both

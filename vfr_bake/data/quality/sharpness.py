@@ -13,8 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from player.errors import MissingExtraError, ShapeError
+from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.threads import Progress, in_threads
+from vfr_bake.data.threads import in_threads
 
 SIDE = 512
 """Pixels of the longest side at which blur is measured, at most. A picture that is blurred at this size is

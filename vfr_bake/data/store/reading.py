@@ -19,12 +19,13 @@ from player.cameras.camera import Camera
 from player.errors import OutputError
 from player.files.memory import allowed_bytes
 from player.files.replace import PART, held
+from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView, viewed_size
 from vfr_bake.data.store import cache
 from vfr_bake.data.store.stored import Layout, in_order, write_picture
 from vfr_bake.data.store.working import WorkingSize
-from vfr_bake.data.threads import Progress, in_threads, n_threads, one_by_one
+from vfr_bake.data.threads import in_threads, n_threads, one_by_one
 
 HELD_BYTES = 1_000_000_000
 """Pictures are held in memory if they take no more than this, and no more than a quarter of what the program
