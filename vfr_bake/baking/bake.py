@@ -30,6 +30,7 @@ from player.errors import ConfigError
 from player.files.files import check_target
 from player.files.memory import give_back
 from player.head.head import Head
+from player.progress import Report
 from vfr_bake import __version__
 from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
 from vfr_bake.baking.detail.detail import Detail, Needed
@@ -67,15 +68,7 @@ from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
 from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
 from vfr_bake.baking.rate.importance import importance
-from vfr_bake.baking.rate.price import (
-    AIM,
-    FIRST_PRICE,
-    LOWEST_PRICE,
-    PRICES_TRIED,
-    Prices,
-    Spent,
-    highest_price,
-)
+from vfr_bake.baking.rate.price import Prices, PriceSearch
 from vfr_bake.baking.refinement import Stored, Tuning
 from vfr_bake.baking.report import BakeReport, side_by_side
 from vfr_bake.config import BakeConfig
@@ -84,8 +77,6 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
-Report = Callable[[str, int, int], object]
-"""Progress callback, called with (stage, steps done, steps in all)."""
 N_PROJECTED = 100_000
 """Number of rays from which the projection to fewer feature channels is computed: they give the directions in
 feature space that the colours depend on, and the second moment of the features."""
@@ -327,7 +318,7 @@ class _Bake:
         """Choose the codes to store: the fewest bits whose loss on the witnesses stays within the limit and
         that fit the bytes asked for."""
         held_out, config, layout = self.held_out, self.config, needed.layout
-        head, progress = runner(weights, ranges), self._progress("codes")
+        head = runner(weights, ranges)
         stored = Stored(weights, needed.features, needed.density)
         grid = layout.grid(stored.density, stored.features)
         matters = importance(stored, layout, grid, teacher, ranges, self.model.background)
@@ -336,61 +327,24 @@ class _Bake:
         prices = Prices(layout, needed.wanted_densities, needed.take_features(), matters)
         layout.forget()
         del matters
-        others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
-        tried: list[float] = []
-        kept: dict[float, Spent] = {}
-        """The result at the best price so far, so that it need not be computed again."""
-        losses: dict[float, float] = {}
-        """Loss in dB at each price that was tried."""
-
-        def at(price: float) -> Spent:
-            if price in kept:
-                return kept[price]
-            tried.append(price)
-            progress(len(tried), max(len(tried) + 1, PRICES_TRIED))
-            spent = prices.at(price)
-            give_back()  # free what the threads of `at` have used before a grid is built of the result
-            return spent
-
-        def keep(price: float, spent: Spent) -> None:
-            kept.clear()
-            kept[price] = spent
-
-        def lost(price: float) -> float:
-            """Return the loss at a price as a share of the allowed loss."""
-            if price not in losses:
-                spent = at(price)
-                after = held_out.look("codes", layout.played(spent.arrays), head, self.n_fetches)
-                if left is not None:
-                    losses[price] = after.loss.db - refined.loss.db
-                else:
-                    losses[price] = held_out.loss_of_change(refined.shown, after.shown)
-                if losses[price] <= most or price < min(kept, default=np.inf):
-                    keep(price, spent)
-            return losses[price] / most if most > 0 else np.inf
-
-        def taken(price: float, max_mb: float) -> float:
-            """Return the bytes of all files at a price as a share of the allowed bytes."""
-            spent = at(price)
-            n_bytes = others + spent.n_bytes
-            share = (n_bytes + mesh_bytes(round(n_bytes), None)) / (1e6 * max_mb)
-            if share <= 1:
-                keep(price, spent)
-            return share
-
-        allowed = self.choice.code_loss_db
         left = None if config.max_loss_db is None else config.max_loss_db - refined.loss.db
-        most = allowed if left is None else left
-        first, lowest = (share * held_out.model_error for share in (FIRST_PRICE, LOWEST_PRICE))
-        price = highest_price(lost, first, 0.0 if left is not None and left > 0 else lowest)
-        if left is None and losses[price] > most:
-            # Rounding to whole codes alone loses more than `most`. Allow that loss plus what a price may add.
-            most = losses[price] + allowed
-            price = highest_price(lost, first, lowest)
-        if (max_mb := config.max_mb) is not None and (share := taken(price, max_mb)) > 1:
-            # The bytes fall roughly as the square root of the price.
-            price = 1 / highest_price(lambda rate: taken(1 / rate, max_mb), (AIM / share) ** 2 / price)
-        return at(price).arrays
+
+        def loss_db(arrays: GridArrays) -> float:
+            after = held_out.look("codes", layout.played(arrays), head, self.n_fetches)
+            if left is not None:
+                return after.loss.db - refined.loss.db
+            return held_out.loss_of_change(refined.shown, after.shown)
+
+        search = PriceSearch(prices, loss_db, held_out.model_error, self._progress("codes"))
+        price = search.for_preset(self.choice.code_loss_db) if left is None else search.for_loss(left)
+        if config.max_mb is not None:
+            others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
+
+            def megabytes(values: float) -> float:
+                return (others + values + mesh_bytes(round(others + values), None)) / 1e6
+
+            price = search.for_bytes(price, megabytes, config.max_mb)
+        return search.at(price).arrays
 
     def _qualities(self, manifest: Manifest, arrays: GridArrays, head: bytes, refined: Stage) -> Qualities:
         """Choose the settings of `high` and `fast` pictures of the asset."""

@@ -14,6 +14,7 @@ from player.asset.asset import GridArrays
 from player.asset.pyramid import Pyramid
 from player.asset.sections import Grid
 from player.asset.structure import encode_structure
+from player.files.memory import give_back
 from vfr_bake.baking.detail.shown import Wanted
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.rate.choices import Choices
@@ -96,6 +97,85 @@ def _shown_importance(grid: Grid, wanted: Wanted, whole: Pyramid, finest: np.nda
             importance_of_levels(grid, whole, finest), whole.vertices, wanted.pyramid.vertices, strict=True
         )
     ]
+
+
+class PriceSearch:
+    """The search for the price of a bit. Only the values that are stored at the best price so far are kept,
+    because those of all prices would not fit into the memory."""
+
+    def __init__(
+        self,
+        prices: Prices,
+        loss_db: Callable[[GridArrays], float],
+        model_error: float,
+        progress: Callable[[int, int], object],
+    ) -> None:
+        """
+        Args:
+            prices: what is stored at any price.
+            loss_db: the dB that pictures lose if these values are stored in place of the refined ones.
+            model_error: mean square error of the model's pictures, which prices are relative to.
+            progress: called with the number of prices that were tried, and that of all.
+        """
+        self._prices, self._loss_db, self._progress = prices, loss_db, progress
+        self._first, self._lowest = FIRST_PRICE * model_error, LOWEST_PRICE * model_error
+        self._n_tried = 0
+        self._kept: tuple[float, Spent] | None = None
+        """The best price so far, and what is stored at it."""
+        self._losses: dict[float, float] = {}
+        """dB that are lost at the prices that were tried."""
+
+    def at(self, price: float) -> Spent:
+        """Choose the values to store at `price`."""
+        if self._kept is not None and self._kept[0] == price:
+            return self._kept[1]
+        self._n_tried += 1
+        self._progress(self._n_tried, max(self._n_tried + 1, PRICES_TRIED))
+        spent = self._prices.at(price)
+        give_back()  # what its threads have used, before there is a grid of it
+        return spent
+
+    def for_loss(self, most_db: float) -> float:
+        """Return the highest price at which pictures lose at most `most_db`, nearly."""
+        return highest_price(self._share_of(most_db), self._first, 0.0 if most_db > 0 else self._lowest)
+
+    def for_preset(self, allowed_db: float) -> float:
+        """Return the same price for a loss that a preset allows, which is a wish and no limit: if rounding to
+        whole codes alone loses more, a price may add `allowed_db` to that."""
+        price = highest_price(self._share_of(allowed_db), self._first, self._lowest)
+        if self._losses[price] <= allowed_db:
+            return price
+        most_db = self._losses[price] + allowed_db
+        return highest_price(self._share_of(most_db), self._first, self._lowest)
+
+    def for_bytes(self, price: float, megabytes: Callable[[float], float], max_mb: float) -> float:
+        """Return `price`, or the lowest one, nearly, at which the files have at most `max_mb` megabytes.
+        `megabytes`: of all files, from the bytes of densities and features."""
+
+        def share(price: float) -> float:
+            spent = self.at(price)
+            found = megabytes(spent.n_bytes) / max_mb
+            if found <= 1:
+                self._kept = price, spent
+            return found
+
+        if (found := share(price)) <= 1:
+            return price
+        # Bytes fall about with the square root of the price.
+        return 1 / highest_price(lambda rate: share(1 / rate), (AIM / found) ** 2 / price)
+
+    def _share_of(self, most_db: float) -> Callable[[float], float]:
+        """Return the function that gives what pictures lose at a price, as a share of `most_db`."""
+
+        def share(price: float) -> float:
+            if price not in self._losses:
+                spent = self.at(price)
+                self._losses[price] = self._loss_db(spent.arrays)
+                if self._losses[price] <= most_db or self._kept is None or price < self._kept[0]:
+                    self._kept = price, spent
+            return self._losses[price] / most_db if most_db > 0 else math.inf
+
+        return share
 
 
 def highest_price(share: Callable[[float], float], first: float, lowest: float = 0.0) -> float:
