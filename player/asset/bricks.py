@@ -30,6 +30,23 @@ def bricks_per_axis(resolution: int) -> int:
     return -(-(resolution + 1) // BRICK)
 
 
+def keys_of(coords: np.ndarray) -> np.ndarray:
+    """Return a number [n] int64 for each of the coordinates [n, 3], from -1 to 2^19. The numbers rise with
+    (x, y, z).
+
+    >>> keys = keys_of(np.array([[0, 1, 0], [1, 0, 0]]))
+    >>> (keys[0] < keys[1]).item(), coords_of(keys).tolist()
+    (True, [[0, 1, 0], [1, 0, 0]])
+    """
+    x, y, z = np.asarray(coords, np.int64).T
+    return (x << 40) + (y << 20) + z
+
+
+def coords_of(keys: np.ndarray) -> np.ndarray:
+    """Return the coordinates [n, 3] int64, of 0 and more, of `keys_of` coordinates [n]."""
+    return np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=-1)
+
+
 def pack_vertices(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pack vertices into bricks.
 
@@ -47,12 +64,12 @@ def pack_vertices(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     """
     vertices = np.asarray(vertices, np.int64).reshape(-1, 3)
     high, low = vertices >> 3, vertices & 7
-    bricks = (high[:, 0] << 40) | (high[:, 1] << 20) | high[:, 2]
     bits = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
-    order = np.lexsort((bits, bricks))
-    names, index = np.unique(bricks, return_inverse=True)
-    coords = np.stack([names >> 40, (names >> 20) & 0xFFFFF, names & 0xFFFFF], axis=-1).astype(np.uint16)
-    stored = np.zeros((len(names), 512), bool)
+    keys = keys_of(high)
+    order = np.lexsort((bits, keys))
+    keys, index = np.unique(keys, return_inverse=True)
+    coords = coords_of(keys).astype(np.uint16)
+    stored = np.zeros((len(keys), 512), bool)
     stored[index.reshape(-1), bits] = True
     masks = np.packbits(stored, axis=1, bitorder="little").view("<u8").astype(np.uint64).reshape(-1, 8)
     return coords, masks, order

@@ -20,7 +20,7 @@ from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.coder.lanes import Neighbours
 from player.asset.folder import check_size, compare_sums
 from player.asset.manifest import Manifest
-from player.asset.pyramid import Bricks, Pyramid, PyramidValues, values_of
+from player.asset.pyramid import NO_BRICKS, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
 from player.asset.structure import decode_structure
 from player.asset.symbols import LevelRows, decode_level, level_rows
@@ -36,7 +36,6 @@ LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127,
 DTYPES: dict[Grid, type[np.generic]] = {"densities": np.uint8, "features": np.int8}
 
 
-NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 GRIDS: tuple[Grid, Grid] = ("densities", "features")
 MAX_THREADS = 8
 """The most sections that are decoded at a time: each takes memory of its own."""
@@ -62,7 +61,7 @@ class PyramidReader:
         self.n_channels = manifest.n_channels if grid == "features" else 1
         self._steps = manifest.feature_steps if grid == "features" else manifest.density_steps
         self._limits, self._dtype = LIMITS[grid], DTYPES[grid]
-        self.pyramid = Pyramid(manifest.resolutions[grid], (NONE,) * n_levels)
+        self.pyramid = Pyramid(manifest.resolutions[grid], (NO_BRICKS,) * n_levels)
         self._symbols = [np.zeros((0, self.n_channels), np.int16)] * n_levels
 
     def read_structure(self, stored: StoredSection) -> None:
@@ -100,7 +99,7 @@ class PyramidReader:
     def forget(self, section: Section) -> None:
         """Undo that a section was read or begun. The section added last must be forgotten first."""
         if section.kind == "structure":
-            self.pyramid = self.pyramid.with_level(section.level, NONE)
+            self.pyramid = self.pyramid.with_level(section.level, NO_BRICKS)
             self._symbols[section.level] = self._symbols[section.level][:0]
         else:
             self._symbols[section.level][:, section.first_channel : section.end_channel] = 0

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from player.asset.bricks import BRICK, bricks_per_axis, stored_bits
+from player.asset.bricks import BRICK, bricks_per_axis, coords_of, keys_of, stored_bits
 from player.asset.prediction.prediction import Places, values_from
 
 MAX_LEVELS = 8
@@ -48,7 +48,7 @@ class Bricks:
 
     @cached_property
     def _keys(self) -> np.ndarray:
-        return _keys(self.coords)
+        return keys_of(self.coords)
 
     def find(self, coords: np.ndarray) -> np.ndarray:
         """Return the index [n] int64 of the brick at each of the coordinates [n, 3]; -1 where there is none.
@@ -59,7 +59,7 @@ class Bricks:
         """
         if not len(self):
             return np.full(len(coords), -1)
-        keys = _keys(coords)
+        keys = keys_of(coords)
         index = np.minimum(np.searchsorted(self._keys, keys), len(self) - 1)
         return np.where(self._keys[index] == keys, index, -1)
 
@@ -74,9 +74,8 @@ class Bricks:
         return self if some.all() else Bricks(self.coords[some], self.masks[some])
 
 
-def _keys(coords: np.ndarray) -> np.ndarray:
-    x, y, z = np.asarray(coords, np.int64).T
-    return (x << 40) + (y << 20) + z  # rises with (x, y, z) for components from -1 to 2^19
+NO_BRICKS = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
+"""The bricks of an empty level."""
 
 
 def _no_masks(n: int) -> np.ndarray:
@@ -240,7 +239,7 @@ def corners_of(cells: Bricks) -> Bricks:
 def _neighbourhood(coords: np.ndarray, low: int, high: int) -> np.ndarray:
     """Return the coordinates [n, 3] int64, sorted, that are at offsets with components from `low` to `high`
     from any of `coords`."""
-    keys = _keys(coords)
+    keys = keys_of(coords)
     offsets = np.arange(low, high + 1)
     for shift in (0, 20, 40):
         keys = np.unique((keys[:, None] + (offsets << shift)).reshape(-1))
@@ -287,8 +286,8 @@ def coarser(bricks: Bricks) -> Bricks:
     >>> found.coords.tolist(), np.flatnonzero(stored_bits(found.masks)).tolist()
     ([[1, 0, 0]], [321])
     """
-    keys, owner = np.unique(_keys(bricks.coords >> 1), return_inverse=True)
-    coords = np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], axis=-1)
+    keys, owner = np.unique(keys_of(bricks.coords >> 1), return_inverse=True)
+    coords = coords_of(keys)
     x, y, z = (bricks.coords & 1).T
     halved = _halved(bricks.masks) << (32 * y + 4 * z).astype(np.uint64)[:, None]
     whole = np.zeros((len(keys), 2, 4), np.uint64)
@@ -325,8 +324,7 @@ def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
     levels = [leaves[0].without_empty()]
     for own in leaves[1:]:
         below = coarser(levels[-1])
-        coords = np.unique(np.concatenate([_keys(own.coords), _keys(below.coords)]))
-        coords = np.stack([coords >> 40, (coords >> 20) & 0xFFFFF, coords & 0xFFFFF], axis=-1)
+        coords = coords_of(np.unique(np.concatenate([keys_of(own.coords), keys_of(below.coords)])))
         octants = np.zeros((len(coords), 2, 1, 2, 1, 2, 1), bool)
         at = Bricks(coords, _no_masks(len(coords))).find(levels[-1].coords >> 1)
         x, y, z = (levels[-1].coords & 1).T

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.bricks import stored_bits
+from player.asset.check_bricks import check_inside
 from player.asset.coder.coder import Decoder, decode, encode
 from player.asset.coder.lanes import Neighbours
 from player.asset.pyramid import Bricks, Pyramid, coarser, packed_bits
@@ -126,7 +127,7 @@ def decode_structure(
             bricks = _decode_children(part, octants, np.ones(len(octants.coords), bool), where)
         if len(bricks) != n_bricks:
             raise FormatError(f"{where}: expected {n_bricks} bricks, got {len(bricks)}")
-    _check_inside(bricks, cells_per_axis, where)
+    check_inside(bricks, cells_per_axis, "cells", where)
     return bricks
 
 
@@ -147,19 +148,6 @@ def _parts(data: bytes, n_parts: int, where: str) -> list[bytes]:
     if at != len(data):
         raise FormatError(f"{where}: expected {at} bytes, got {len(data)}")
     return parts
-
-
-def _check_inside(bricks: Bricks, cells_per_axis: int, where: str) -> None:
-    """Raise FormatError if a cell lies outside the grid."""
-    cells = stored_bits(bricks.masks).reshape(-1, 8, 8, 8)
-    for axis in range(3):
-        first = bricks.coords[:, axis].astype(np.int64) * 8
-        edge = np.flatnonzero(first + 8 > cells_per_axis)
-        along = cells[edge].any(axis=tuple(other + 1 for other in range(3) if other != axis))
-        if (along & (first[edge, None] + np.arange(8) >= cells_per_axis)).any():
-            raise FormatError(
-                f"{where}: expected cells below {cells_per_axis} along each axis, got one behind"
-            )
 
 
 def _octants(bricks: Bricks) -> _Octants:

@@ -10,7 +10,7 @@ import numpy as np
 from player.asset.parts import LIMITS
 from player.asset.pyramid import (
     MAX_LEVELS,
-    Bricks,
+    NO_BRICKS,
     Pyramid,
     PyramidValues,
     Vertices,
@@ -27,15 +27,15 @@ COARSEST = 16
 def pyramid_beneath(finest: Pyramid) -> Pyramid:
     """Return the pyramid of a grid of one level, `finest`, with coarser levels added.
 
+    >>> from player.asset.pyramid import Bricks
     >>> one = Bricks(np.zeros((1, 3), np.uint16), np.ones((1, 8), np.uint64))
     >>> [len(level) for level in pyramid_beneath(Pyramid(64, (one,))).levels]
     [1, 1, 1]
     """
-    none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
     n_coarser = 0
     while n_coarser + 1 < MAX_LEVELS and finest.resolution > COARSEST << n_coarser:
         n_coarser += 1
-    return whole_pyramid(finest.resolution, [finest.levels[0], *[none] * n_coarser])
+    return whole_pyramid(finest.resolution, [finest.levels[0], *[NO_BRICKS] * n_coarser])
 
 
 def values_beneath(pyramid: Pyramid, finest: np.ndarray, grid: Grid, step: int = 1) -> PyramidValues:

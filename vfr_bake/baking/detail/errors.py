@@ -22,7 +22,7 @@ import numpy as np
 from numba import get_num_threads
 
 from player.asset.grid import SPARE, SparseGrid, brick_number, build_grid, vertex_rows
-from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.asset.pyramid import NO_BRICKS, Pyramid, PyramidValues
 from player.compiled.samples import sample_rays
 from player.march.fetches import MIN_TOTAL
 from vfr_bake.baking.distillation import TeacherRays, corners
@@ -33,12 +33,10 @@ RAYS_AT_ONCE = 1 << 12
 """Kept small: a ray through fog has hundreds of samples, and each takes 100 to 200 bytes while they are
 processed."""
 
-_NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
-
 
 def alone(pyramid: Pyramid, level: int) -> Pyramid:
     """Return the pyramid with all levels but one removed; finer levels stay as empty ones."""
-    return Pyramid(pyramid.resolution, (*(_NONE,) * level, pyramid.levels[level]))
+    return Pyramid(pyramid.resolution, (*(NO_BRICKS,) * level, pyramid.levels[level]))
 
 
 def finest_numbers(pyramid: Pyramid, n_per_axis: int) -> np.ndarray:
@@ -117,7 +115,7 @@ def levels_of_densities(
     level alone.
     """
     numbers = finest_numbers(pyramid, grid.n_per_axis)
-    nothing = PyramidValues(Pyramid(1, (_NONE,)), (np.zeros((0, 1), np.int8),))
+    nothing = PyramidValues(Pyramid(1, (NO_BRICKS,)), (np.zeros((0, 1), np.int8),))
     box = np.stack([grid.aabb_min, grid.aabb_min + grid.resolution / grid.cells_per_unit])
     entries, parts = [], []
     n_slots = 0

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from player.asset.bricks import stored_bits
-from player.asset.pyramid import Bricks, Pyramid, Vertices, whole_pyramid
+from player.asset.pyramid import NO_BRICKS, Bricks, Pyramid, Vertices, whole_pyramid
 
 COARSEST_SHOWN = 3
 """The coarsest level that may show a place. One of its cells is as large as a brick of the finest level, so
@@ -37,8 +37,6 @@ AROUND = np.array(list(np.ndindex(3, 3, 3)), np.int32) - 1
 """Offsets to a vertex and its neighbours."""
 HALF = AROUND[13:]
 """The middle offset, and one offset of each opposite pair."""
-
-_NONE = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
 
 
 def mean_values(pyramid: Pyramid, finest: np.ndarray, heavy: np.ndarray) -> list[np.ndarray]:
@@ -154,7 +152,7 @@ class Choice:
     def shown(self, dropped: Sequence[np.ndarray]) -> Pyramid:
         """Return the pyramid without the `dropped` bricks."""
         levels = self.pyramid.levels
-        leaves = [levels[0], *(_NONE,) * (len(levels) - 1)]
+        leaves = [levels[0], *(NO_BRICKS,) * (len(levels) - 1)]
         for level, of_level in enumerate(dropped):
             kept = leaves[level].find(levels[level].coords) >= 0
             kept &= ~of_level
