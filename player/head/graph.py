@@ -154,6 +154,23 @@ def monomials(order: int) -> tuple[list[tuple[int, int, int]], list[int], list[i
     return current, parents, axes
 
 
+def monomial_products(sh_degree: int) -> list[tuple[int, int]]:
+    """Return, for each monomial of the orders 1 to `sh_degree` - 1, its two factors: the index of its parent
+    in this list (-1 for 1) and an axis, 0 to 2.
+
+    >>> monomial_products(3)[:5]
+    [(-1, 0), (-1, 1), (-1, 2), (0, 0), (1, 0)]
+    """
+    found: list[tuple[int, int]] = []
+    below = -1  # where the monomials of the order below begin
+    for order in range(1, sh_degree):
+        _, parents, axes = monomials(order)
+        begin = len(found)
+        found += [(below + parent, axis) for parent, axis in zip(parents, axes, strict=True)]
+        below = begin
+    return found
+
+
 def head_nodes(form: HeadForm) -> list[Node]:
     """Return the nodes of a head, in the file's order."""
     nodes: list[Node] = []

@@ -18,7 +18,7 @@ import numpy as np
 
 from player.head.activations import GELU, HARD_SWISH, LINEAR
 from player.head.dense_tiles import ADDS_PAIRS, LANES, MOST_BYTES, MULTIPLIES_BYTES, QUAD, ROWS, UNSCALED
-from player.head.graph import PAIR_LIMIT, HeadArrays, Layer, Rounding, monomials, pair_sums
+from player.head.graph import PAIR_LIMIT, HeadArrays, Layer, Rounding, monomial_products, pair_sums
 
 BLOCK = 4 * ROWS
 """Pixels that are processed at a time: all the numbers of a head of width 64 then take 150 kB."""
@@ -140,7 +140,7 @@ class _Compiler:
         for layer, rounding in zip(head.directional, roundings, strict=True):
             z = self._dense_rounded(self._rounded(z, rounding), layer, rounding, self._activation)
         rgb = self._dense(z, head.output)
-        pairs = [pair for order in range(1, head.form.sh_degree) for pair in _pairs(order)]
+        pairs = monomial_products(head.form.sh_degree)
         return Program(
             np.array(self._steps, STEP), self._weights.joined(), self._packed.joined(),
             self._starts.joined(), np.array(pairs, np.int64).reshape(-1, 2), self._n_floats, self._n_bytes,
@@ -261,14 +261,6 @@ def _orders(harmonics: Layer) -> Iterator[tuple[np.ndarray, Layer, int]]:
             yield by_harmonic.reshape(n, -1).T.reshape(-1), once, 1
         yield by_harmonic, once, n_all // n
     yield np.arange(n_all), harmonics, 1
-
-
-def _pairs(order: int) -> list[tuple[int, int]]:
-    """Return, for each monomial of an order, its two factors: an earlier monomial, as its index among all
-    from order 1 on (-1 for 1), and an axis."""
-    _, parents, axes = monomials(order)
-    below = sum(k * (k + 1) // 2 for k in range(2, order))  # monomials of the orders before the one below
-    return [(below + parent if order > 1 else -1, axis) for parent, axis in zip(parents, axes, strict=True)]
 
 
 class _Constants:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from player.head.graph import HeadArrays, Layer, Rounding, monomials
+from player.head.graph import HeadArrays, Layer, Rounding, monomial_products
 
 _TYPES = {"float32": "<f4", "int8": "<i1", "int32": "<i4"}
 
@@ -70,20 +70,3 @@ def head_data(head: HeadArrays) -> HeadData:
 
 def _rounding(rounding: Rounding) -> dict[str, float | int]:
     return {"scale": float(rounding.scale), "zero": int(rounding.zero)}
-
-
-def monomial_products(sh_degree: int) -> list[tuple[int, int]]:
-    """Return, for each monomial of the orders 1 to `sh_degree` - 1, its two factors: the index of its parent
-    in this list (-1 for 1) and an axis, 0 to 2.
-
-    >>> monomial_products(3)[:5]
-    [(-1, 0), (-1, 1), (-1, 2), (0, 0), (1, 0)]
-    """
-    found: list[tuple[int, int]] = []
-    below = -1  # where the monomials of the order below begin
-    for order in range(1, sh_degree):
-        _, parents, axes = monomials(order)
-        begin = len(found)
-        found += [(below + parent, axis) for parent, axis in zip(parents, axes, strict=True)]
-        below = begin
-    return found
