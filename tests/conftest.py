@@ -1,4 +1,4 @@
-"""What all tests share: where the real pictures are, and what the numbers of a run were."""
+"""What all tests share: hypothesis' profile, the real data sets, and the record of a run's numeric errors."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import vfr_bake  # noqa: F401  (before torch and numba: it tells OpenMP how to w
 from tests.cores import keep_to_a_share
 from tests.numerics import bounds
 
-# Before torch and numba as well, which ask once how many cores there are.
+# This, too, has to run before torch and numba are imported: each asks only once how many cores there are.
 keep_to_a_share()
 
-# A deadline measures the machine, not the code.
+# Hypothesis' deadline for an example is off, because it would measure the machine and not the code.
 settings.register_profile("any_machine", deadline=None)
 settings.load_profile("any_machine")
 
-# A job in the background of a shell ignores Ctrl-C, and so would the programs that the tests interrupt.
+# A background job of a shell ignores Ctrl-C (SIGINT), and so would the programs that the tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -34,7 +34,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """A worker of pytest-xdist hands over what its tests have met; who started it, or runs alone, writes."""
+    """Hand over or write the worst numeric errors that the tests have met. A worker of pytest-xdist hands its
+    own over to the process that started it; that process, or the only one, writes the file."""
     path, handed_over = session.config.getoption("--numerics"), getattr(session.config, "workeroutput", None)
     if handed_over is not None:
         handed_over["numerics"] = bounds.MET
@@ -44,12 +45,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
-    """What a worker has met; nothing of one that was killed."""
+    """Add the worst errors that a worker has met. A worker that was killed adds nothing."""
     bounds.MET.update(bounds.merged(bounds.MET, getattr(node, "workeroutput", {}).get("numerics", {})))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """A test that takes a `device` runs on every device that is there: none is skipped for want of a GPU."""
+    """Run a test that takes a `device` on every device of this machine. Without a GPU, no test is skipped."""
     if "device" in metafunc.fixturenames:
         import torch
 
@@ -58,7 +59,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def _real_data(name: str, holds: str) -> Path:
-    """A data set in `$VFR_DATA` (default `../shared/data`); missing, the test fails."""
+    """Return a data set's folder in `$VFR_DATA` (default `../shared/data`); without it, fail the test."""
     data = os.environ.get("VFR_DATA")
     root = Path(data) if data else REPOSITORY.parent / "shared" / "data"
     folder = root / name
@@ -69,19 +70,20 @@ def _real_data(name: str, holds: str) -> Path:
 
 @pytest.fixture(scope="session")
 def lego_400() -> Path:
-    """The NeRF-synthetic lego at 400x400."""
+    """The data set lego of NeRF-synthetic at 400x400."""
     return _real_data("lego_400", "transforms_train.json")
 
 
 @pytest.fixture(scope="session")
 def can() -> Path:
-    """71 phone pictures with a COLMAP model."""
+    """The data set can: 71 phone pictures with a COLMAP model."""
     return _real_data("can", "sparse/0/images.bin")
 
 
 @pytest.fixture(scope="session")
 def fox() -> Path:
-    """50 phone pictures with a transforms.json, lens distortion and surroundings without end."""
+    """The data set fox: 50 phone pictures with a transforms.json, lens distortion and unbounded
+    surroundings."""
     return _real_data("fox", "transforms.json")
 
 

@@ -1,8 +1,8 @@
-"""A process that runs tests beside others of its kind keeps to its share of the processor's cores.
+"""Share out the processor's cores among the processes that run tests side by side.
 
-Threads that wait for each other, a bake's and a training's, take up to half as long again where others of
-their kind run on the same cores: each wait lasts until those have had their turn. Browsers mostly wait for
-something else, and may use every core.
+The threads of a bake or a training often wait for each other. If other processes with such threads run on the
+same cores, a bake or a training takes up to half as long again, because each wait lasts until those threads
+have had their turn. Browsers mostly wait for something else, and may use every core.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from contextlib import contextmanager
 
 CAN_CHOOSE = hasattr(os, "sched_setaffinity")
 EVERY = sorted(os.sched_getaffinity(0)) if CAN_CHOOSE else []
-"""The cores that this process found."""
+"""The cores that this process may use when it starts; empty if the system offers no choice of cores."""
 
 
 def keep_to_a_share() -> None:
-    """Every n-th core, where there are n processes and as many cores."""
+    """Keep this process to every n-th core if n test processes run and there are at least n cores."""
     worker, n_workers = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
     if worker and n_workers and len(EVERY) >= int(n_workers):
         os.sched_setaffinity(0, EVERY[int(worker.removeprefix("gw")) % int(n_workers) :: int(n_workers)])
@@ -25,7 +25,7 @@ def keep_to_a_share() -> None:
 
 @contextmanager
 def every_core() -> Iterator[None]:
-    """Programs that are started meanwhile may use every core."""
+    """Let programs that are started within the `with` block use every core."""
     if not CAN_CHOOSE:
         yield
         return

@@ -1,6 +1,6 @@
-"""Oracles in float64: slow, readable, written from the formulas and not from the code that they check.
+"""Oracles in float64: slow and readable, written from the formulas and not from the code that they check.
 
-Row vectors, y = x @ W + b. Letters as in the docstrings of the modules that they check. Real spherical
+Vectors are rows: y = x @ W + b. Letters are those in the docstrings of the modules under test. Real spherical
 harmonics carry the Condon-Shortley phase (-1)^m and are ordered l^2 + l + m, as in instant-ngp.
 """
 
@@ -13,8 +13,8 @@ from scipy import special
 
 
 def spherical_harmonics(dirs: np.ndarray, degree: int) -> np.ndarray:
-    """Y [n, degree^2] at unit `dirs` [n, 3], bands 0 .. degree - 1, by angles and associated Legendre
-    functions.
+    """Return Y [n, degree^2] at unit `dirs` [n, 3], bands 0 .. degree - 1, from angles and associated
+    Legendre functions.
 
     scipy's `lpmv` has the phase (-1)^m; for m < 0 the sine takes the place of the cosine, with the same
     phase.
@@ -35,7 +35,8 @@ def spherical_harmonics(dirs: np.ndarray, degree: int) -> np.ndarray:
 
 
 def gelu(x: np.ndarray) -> np.ndarray:
-    """x Phi(x), with Phi the normal distribution function (the exact form, not the tanh one)."""
+    """Return x Phi(x), with Phi the distribution function of the normal distribution (the exact form, not the
+    approximation with tanh)."""
     return x * special.ndtr(x)
 
 
@@ -47,9 +48,8 @@ ACTIVATIONS = {"gelu": gelu, "hard_swish": hard_swish}
 
 
 def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    """rgb [n, 3] of a head (`exporters.head.onnx_head.HeadWeights`) at `features` [n, n_channels], `dirs` [n,
-    3].
-    """
+    """Return the rgb [n, 3] of a head (`exporters.head.onnx_head.HeadWeights`) at `features` [n, n_channels]
+    and `dirs` [n, 3]."""
     activation = ACTIVATIONS[weights.activation]
     h = np.asarray(features, np.float64)
     for weight, bias in weights.spatial:
@@ -69,10 +69,10 @@ def evaluate_head(weights: Any, features: np.ndarray, dirs: np.ndarray) -> np.nd
 def hash_grid_feature(
     point: np.ndarray, table: np.ndarray, resolutions: list[int], offsets: np.ndarray, size: int
 ) -> np.ndarray:
-    """Features of one point [3] of the unit cube, level by level and corner by corner (Mueller et al. 2022,
-    eq. 4).
+    """Return the features of one point [3] of the unit cube, computed level by level and corner by corner
+    (Mueller et al. 2022, eq. 4).
 
-    `table` [n_entries, 2] float64; a level of more than `size` vertices is hashed into `size` entries.
+    `table` [n_entries, 2] float64; a level with more than `size` vertices is hashed into `size` entries.
     """
     out = []
     for resolution, offset in zip(resolutions, offsets, strict=False):
@@ -96,7 +96,7 @@ def hash_grid_feature(
 
 
 def composite_ray(sigmas: np.ndarray, features: np.ndarray, step: float) -> tuple[np.ndarray, float]:
-    """Equation 3 of the paper for one ray in float64: (sum w_i F_i, 1 - exp(-tau))."""
+    """Evaluate equation 3 of the paper for one ray in float64: return (sum w_i F_i, 1 - exp(-tau))."""
     tau, total = 0.0, np.zeros(features.shape[1])
     for sigma, feature in zip(sigmas.astype(np.float64), features.astype(np.float64), strict=True):
         delta = sigma * step

@@ -1,4 +1,4 @@
-"""Which package may import what: held by the source, and by a process in which torch cannot be imported."""
+"""Which package may import what, checked in the source and in a process in which torch cannot be imported."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("player", "exporters", "vfr_bake")
 MAX_LINES = 500
 
-# Anywhere in the package, even inside a function.
+# Packages that may be imported nowhere in these packages, not even inside a function.
 FORBIDDEN = {
     "player": {
         *("exporters", "vfr_bake", "torch", "triton", "scipy", "cv2", "skimage", "onnx", "tqdm", "tyro"),
-        *("dask", "trimesh", "imageio"),  # what viser and distributed bring
+        *("dask", "trimesh", "imageio"),  # dependencies of viser and distributed
     },
     "exporters": {"vfr_bake", "torch", "triton", "cv2", "tqdm", "tyro", "trimesh", "OpenImageIO"},
     "vfr_bake": {"trimesh", "open3d", "lpips", "torchvision"},
 }
-# At the top level, where importing the package alone would need them.
+# Packages that may be imported only inside functions, so that none is needed to import one of our packages.
 LAZY = {
     "player": {"numba", "PIL", "onnxruntime", "viser", "websockets", "msgspec", "av", "distributed"},
     "exporters": {
@@ -44,7 +44,8 @@ LAZY = {
         "pillow_heif",
     },
 }
-# Modules that are nothing without it; whoever imports them does so inside a function.
+# Modules that are of no use without the package beside them and import it at the top level. Other modules
+# import these modules inside functions.
 TOP_LEVEL_EXCEPTIONS = {
     *(
         (f"player/compiled/{name}.py", "numba")
@@ -69,7 +70,8 @@ IDS = [path.relative_to(REPOSITORY).as_posix() for path in MODULES]
 
 
 def imported(tree: ast.AST, top_level: bool) -> Iterator[str]:
-    """The first part of every imported name; with `top_level`, of what runs when the module is imported."""
+    """Yield the first part of every imported name; with `top_level` only of those imports that run when the
+    module is imported."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.split(".")[0] for alias in node.names)
@@ -109,13 +111,14 @@ def module_name(path: Path) -> str:
 
 
 def room_name(module: str) -> str:
-    """The folder of a package that a module is in; a module of the package's root stands for itself."""
+    """Return the package's folder that a module is in, or the module itself if it is in the root folder."""
     package, *rest = module.split(".")
     return f"{package}/{rest[0]}" if (REPOSITORY / package).joinpath(*rest[:1]).is_dir() and rest else module
 
 
 def arrows() -> dict[str, set[str]]:
-    """The modules that each module imports anywhere, also inside functions and for annotations alone."""
+    """Return, for each module, the modules that it imports anywhere, including imports inside functions and
+    for annotations alone."""
     modules = {module_name(path): path for path in MODULES}
     graph = {}
     for name, path in modules.items():
@@ -136,11 +139,11 @@ def test_imports_have_no_circle(node: Callable[[str], str]) -> None:
     for module, wanted in arrows().items():
         graph.setdefault(node(module), set()).update({node(other) for other in wanted} - {node(module)})
     assert sum(map(len, graph.values())) > 80
-    TopologicalSorter(graph).prepare()  # CycleError names a circle
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_a_folder_can_be_looked_through() -> None:
-    """At most 15 modules, or 9 folders, beside an `__init__`."""
+    """A folder has at most 15 modules, not counting `__init__.py`, and at most 9 subfolders with modules."""
     for folder in {
         path.parent for package in (*PACKAGES, "tests") for path in (REPOSITORY / package).rglob("*.py")
     }:
@@ -153,7 +156,7 @@ STARTERS = re.compile(
     r"sys\.(executable|path)\b|\bmultiprocessing\b|ProcessPoolExecutor|DataLoader|LocalCluster|\bdistributed\.Nanny"
     r"|os\.(system|popen|exec\w+|spawn\w+|posix_spawn\w*)\b|mp\.spawn"
 )
-"""What starts an interpreter, or decides where one looks for modules."""
+"""Pattern of code that starts an interpreter or decides in which folders it looks for modules."""
 SUBPROCESSES = {
     "player/proof.py",
     "exporters/mesh/unwrap.py",
@@ -164,10 +167,10 @@ SUBPROCESSES = {
 
 @pytest.mark.parametrize("path", [*MODULES, *sorted((REPOSITORY / "examples").glob("*.py"))], ids=str)
 def test_interpreters_are_started_by_one_function(path: Path) -> None:
-    """Another way would look for modules in the current folder."""
+    """Only `player/child.py` starts interpreters; others would look for modules in the current folder."""
     name = path.relative_to(REPOSITORY).as_posix()
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):  # docstrings may name what code may not
+    for node in ast.walk(tree):  # docstrings may name what the code must not use
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and ast.get_docstring(node):
             node.body[0] = ast.Pass()
     found = {match[0] for match in STARTERS.finditer(ast.unparse(tree))}
@@ -207,7 +210,8 @@ def test_player_and_exporters_start_without(missing: list[str]) -> None:
 
 
 def test_pyproject_lists_every_package() -> None:
-    """Read as text: Python 3.10 has no TOML parser."""
+    """The packages in pyproject.toml are all the folders with modules. The file is read as text, because
+    Python 3.10 has no TOML parser."""
     text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
     block = re.search(r"^packages = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
     assert block, "[tool.setuptools] packages is expected"
@@ -234,8 +238,8 @@ def test_constraints_pin_exactly_and_cover_every_dependency() -> None:
 
 
 def test_one_file_alone_names_instructions_of_one_processor() -> None:
-    """Everything else that is written down for LLVM is for any processor, kernels for training included: LLVM
-    ends no process for it."""
+    """Only one file uses instructions of one kind of processor. All other code that is written for LLVM,
+    kernels for training included, compiles for any processor, so that LLVM never ends the process over it."""
     named = [
         path.relative_to(REPOSITORY).as_posix()
         for package in ("player", "exporters", "vfr_bake")

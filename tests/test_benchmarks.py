@@ -1,4 +1,4 @@
-"""The benchmarks' machinery, and that the documents' figures are those of the file of results."""
+"""The benchmarks' machinery, and a check that the documents show the figures in the file of results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from vfr_bake.data.scene import build_scene
 REPOSITORY = Path(__file__).resolve().parent.parent
 MACHINE = {"processor": "one", "features": ["avx2"], "cores": 2, "memory_gb": 24}
 MEASURED = re.compile(r"\d\s?(?:dB\b|[MG]B\b|ms\b|s\b|min\b|%|frames|fps|seconds|minutes|times)")
-"""A number with the unit of something that was measured."""
+"""Pattern of a number with a unit in which something is measured."""
 
 
 # Documents ----------------------------------------------------------------------------------------
@@ -60,7 +60,7 @@ def test_every_block_is_shown_once_and_known() -> None:
 
 
 def measured_figures(text: str) -> list[str]:
-    """Figures that stand outside of the blocks, but for commands and what others have published."""
+    """Return the figures outside the blocks, except those in commands and those published by others."""
     outside = re.sub(r"### Published figures of other systems\n.*?\n## ", "", prose(text), flags=re.DOTALL)
     outside = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", outside, flags=re.DOTALL)
     return MEASURED.findall(outside)
@@ -95,7 +95,7 @@ def test_a_page_without_results_names_the_commands() -> None:
 
 
 def result(figures: dict[str, Any], *commands: str, **conditions: Any) -> dict[str, Any]:
-    """A part's result as it is recorded."""
+    """Return a part's result in the form in which it is recorded."""
     versions = dict.fromkeys(("python", "numpy", "numba", "onnxruntime", "torch"), "1.0")
     usual = {"commit": "0a1b2c3d4e", "machine": MACHINE, "others_before": 0.0, "others": 0.01}
     kept = dict.fromkeys(KEYS) | usual | {"date": "2026-11-24", "libraries": versions, "commands": commands}
@@ -103,7 +103,7 @@ def result(figures: dict[str, Any], *commands: str, **conditions: Any) -> dict[s
 
 
 def setting(asset: str, loss: float, ms: float, mb: float, quality: str = "exact") -> dict[str, Any]:
-    """A row of the trade."""
+    """Return one row of the table of the trade."""
     return {
         "asset": asset, "n_fetches": 5, "quality": quality, "what": {"n_fetches": 5}, "n_bytes": mb * 1e6,
         "on_front": True, "peak_mb": 400.0, "first_picture_ms": 1000.0,
@@ -123,7 +123,8 @@ TRADE = result({"settings": ROWS, "conditions": CONDITIONS, "size": "800x800"})
 
 
 def test_a_loss_on_test_views_is_that_of_the_same_asset() -> None:
-    """A bake that was measured again since the trade was is another asset."""
+    """A bake's row shows the loss on test views from the trade only if the asset has the same size in bytes:
+    a bake that was measured again since is another asset."""
     found = {
         "resolution": 594, "feature_resolution": 460, "n_channels": 16, "n_fetches": 5, "n_vertices": 6e6,
         "bytes": {"manifest.json": 12_000}, "seconds": 200.0, "peak_mb": 900.0, "samples_median": 7,
@@ -137,11 +138,11 @@ def test_a_loss_on_test_views_is_that_of_the_same_asset() -> None:
 def test_what_is_chosen_keeps_to_what_was_wanted() -> None:
     rows = [line.split(" | ") for line in BLOCKS["choose"]({"trade_lego": TRADE}) if "| lego" in line]
     assert [row[1:3] + row[4:5] for row in rows] == [
-        ["lego, fidelity; k = 5", "-0.02", "17.0"],  # finals
-        ["lego, balanced; k = 5, `fast`", "0.20", "5.0"],  # at most half a decibel, the fastest
-        ["lego, balanced; k = 5", "0.08", "5.0"],  # 5 frames a second, the best
-        ["lego, balanced; k = 5", "0.08", "5.0"],  # 10 frames a second
-        ["lego, fast; k = 5", "0.60", "2.4"],  # 3 MB
+        ["lego, fidelity; k = 5", "-0.02", "17.0"],  # finals: the best quality
+        ["lego, balanced; k = 5, `fast`", "0.20", "5.0"],  # fastest, losing at most half a decibel
+        ["lego, balanced; k = 5", "0.08", "5.0"],  # best at 5 frames a second
+        ["lego, balanced; k = 5", "0.08", "5.0"],  # best at 10 frames a second
+        ["lego, fast; k = 5", "0.60", "2.4"],  # best of at most 3 MB
         ["lego, fast; k = 5", "0.60", "2.4"],  # the fewest bytes
     ]
     assert rows[1][3] == "33.3 ± 1.1" and rows[1][5].endswith("--samples 5 --quality fast` |")
@@ -272,7 +273,7 @@ def test_parts_keep_to_their_time_and_need_what_there_is() -> None:
 
 
 class Bench:
-    """A runner of three parts that do next to nothing, and what it ran."""
+    """A runner of three parts that do next to nothing, with a list of the parts that it ran."""
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.ran: list[str] = []
@@ -383,7 +384,8 @@ def test_a_command_that_fails_is_a_failed_part(tmp_path: Path) -> None:
 
 
 def wait(shares: list[float], **settings: Any) -> tuple[float, list[str]]:
-    """Wait where looks, a minute apart, find these shares."""
+    """Wait until the machine is quiet, if looks a minute apart find these shares of it in use by other
+    programs. Return the last share and the lines that were printed."""
     said: list[str] = []
     minutes = iter(range(100))
     share = conditions.wait_until_quiet(

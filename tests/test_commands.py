@@ -1,4 +1,4 @@
-"""What the six commands have in common: wrong values, useless options, errors of the system, pipes."""
+"""What the six commands have in common: wrong values, useless options, system errors and closed pipes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def code_of(main: Callable[[list[str]], int], arguments: list[str]) -> int:
 
 
 def typed(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """The options that take anything but a name or a file."""
+    """Return the options that take a value other than a name or a file."""
     return [a for a in parser._actions if a.option_strings and (a.choices or a.type not in (None, Path))]
 
 
@@ -65,7 +65,8 @@ TYPED = [
 
 
 def test_every_option_with_a_value_is_here() -> None:
-    """A reader is one of `player.app.option_types`: none is Python's own."""
+    """Every option with a value is either a choice or read by `player.app.option_types`, never by a function
+    of Python itself."""
     assert len(TYPED) == 25
     for _, action in TYPED:
         assert action.choices or getattr(action.type, "__module__", "") == "player.app.option_types", action
@@ -84,11 +85,11 @@ def test_a_wrong_value_is_told_with_what_is_expected(
     if not action.choices:
         found = re.fullmatch(r".*: expected .+, such as (\S+), got 'wr\.ong'", told)
         assert found and callable(action.type), told
-        action.type(found[1])  # and the example is right
+        action.type(found[1])  # the example in the message is valid
 
 
 def numbers(options: Any) -> Iterator[str]:
-    """Names of the fields that are numbers, also those of settings inside."""
+    """Yield the names of the fields that are numbers, including those of nested settings."""
     for field in fields(options):
         nested = getattr(field, "default_factory", None)
         if is_dataclass(nested):
@@ -138,7 +139,7 @@ def _no_names_of_python(told: str) -> None:
 
 
 def given(name: str) -> list[str]:
-    """An option of `vfr-play` on a command line, with a value that it takes."""
+    """Return an option of `vfr-play` as on a command line, with a value that it takes."""
     values = {"cameras": "c.json", "orbit": "2", "view": "1", "output": "o", "format": "png", "frames": "1:2",
               "fps": "5", "json": "j.json", "dask": "tcp://127.0.0.1:1", "size": "8x8", "background": "white",
               "samples": "0", "quality": "fast", "threads": "1", "march": "auto", "host": "127.0.0.1",
@@ -161,7 +162,7 @@ ASKED = {
     "check": ["--check"],
 }
 ALONE = {"cameras", "orbit", "view", "info", "check"}
-"""Options of which argparse takes one at a time; one that chooses a mode is not taken in another mode."""
+"""Options that exclude each other in argparse, so that one that chooses a mode is refused in other modes."""
 
 PAIRS = [
     (name, mode)
@@ -175,7 +176,7 @@ PAIRS = [
 def test_an_option_does_something_or_is_refused(
     name: str, mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Past the options there is no asset, which is exit code 1."""
+    """An option is either used, so that only the missing asset is an error (exit code 1), or refused."""
     monkeypatch.chdir(tmp_path)
     asked = ["--view", "1", "--output", "o"] if name == "format" and mode == "files" else ASKED[mode]
     code = code_of(play_main, ["asset", *given(name), *asked])
@@ -184,7 +185,7 @@ def test_an_option_does_something_or_is_refused(
         assert code == 1 and "asset: expected the folder of an asset, got nothing" in told
     elif name == "others":
         assert code == 2 and "more: one asset at a time, but in the viewer" in told
-    elif mode == "viewer" and name in ("output", *ALONE):  # half of what asks for files
+    elif mode == "viewer" and name in ("output", *ALONE):  # one half of a request for files
         assert code == 2 and "--output: add" in told
     else:
         wanted = ", or for ".join(MODES[used] for used in USED_BY[name])
@@ -244,7 +245,7 @@ def test_ctrl_c_is_130(
 
 
 def _fail_with(command: str, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let what a command does first fail."""
+    """Let the first thing that a command does fail with `error`."""
     refuse = refuse_imports(error)
     if command == "vfr-play":
         monkeypatch.setattr("player.app.cli.parse", refuse)
@@ -298,7 +299,8 @@ def start(command: str, *arguments: str, before: str = "") -> list[str]:
 @pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize("command", ENTRIES)
 def test_a_reader_that_goes_ends_it_quietly(command: str, together: bool, tmp_path: Path) -> None:
-    """`--help | true`: nobody reads when it is written, at the latest when the interpreter ends."""
+    """A command whose reader is gone, as in `--help | true`, ends quietly when it writes, or at the latest
+    when the interpreter exits."""
     _closed_pipe(start(command, "--help"), together, tmp_path)
 
 
@@ -310,7 +312,8 @@ def test_a_reader_of_the_player_that_goes(options: list[str], shells_folder: Pat
 
 
 def environment(unbuffered: bool = False) -> dict[str, str]:
-    """Unbuffered, every word is written at once; otherwise much is when the command ends."""
+    """Return the environment for a command that writes every word at once (`unbuffered`), or much of its
+    output only when it ends."""
     plain = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     return plain | ({"PYTHONUNBUFFERED": "1"} if unbuffered else {})
 
@@ -330,7 +333,7 @@ def _closed_pipe(run: list[str], together: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("command", ENTRIES)
 def test_head_gets_its_line(command: str, unbuffered: bool, tmp_path: Path) -> None:
-    """More than a pipe holds, so that it is written while nobody reads any more."""
+    """A command that writes more than a pipe holds ends quietly after `head` has read its line."""
     module = ENTRIES[command].split(":")[0]
     chatty = f"""
 import {module} as module

@@ -46,8 +46,9 @@ BAKE = ["--resolution", "24", "--refine-steps", "1", "--mesh-resolution", "16", 
 
 
 def plant(folder: Path, marker: Path) -> None:
-    """Every module that an interpreter could look for, as a file; `encodings` as the folder that it is. The
-    settings would have numba keep compiled code, which it unpickles, in a folder of their choice."""
+    """Write a file for every module that an interpreter could look for, and `encodings` as the folder that it
+    is in Python, each of which appends its name to `marker` when it runs. Also write settings that would have
+    numba keep compiled code, which it unpickles, in a folder beside `marker`."""
     for name in sorted(set(sys.stdlib_module_names) - set(sys.builtin_module_names) | PACKAGES):
         path = folder / f"{name}.py"
         if name == "encodings":
@@ -68,7 +69,7 @@ def command(folder: Path, *words: object) -> None:
 def test_no_command_runs_what_is_in_the_current_folder(
     small_data: Path, shells_folder: Path, tmp_path: Path
 ) -> None:
-    """They run in the folder of the data or of the asset, as someone does who has just unpacked it."""
+    """Each command runs in the folder of the data or the asset, as for somebody who has just unpacked it."""
     marker, model, asset = tmp_path / "ran", tmp_path / "model.pt", tmp_path / "asset"
     data, shells = (
         Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in (small_data, shells_folder)
@@ -89,13 +90,13 @@ def test_no_command_runs_what_is_in_the_current_folder(
 
 
 def test_planted_files_run_where_a_process_looks_there(tmp_path: Path) -> None:
-    """What the test above rests on: the same files, and an interpreter that is started without care."""
+    """The planted files do run if an interpreter is started carelessly: the test above is able to fail."""
     marker = tmp_path / "ran"
     folder = tmp_path / "folder"
     folder.mkdir()
     plant(folder, marker)
     subprocess.run([sys.executable, "-c", "import json"], cwd=folder, capture_output=True, check=False)
-    # Python 3.13 imports linecache before the program's first line, and ends there because ours is empty.
+    # Python 3.13 imports linecache before the program's first line, and stops, as the planted one is empty.
     assert set(marker.read_text().split()) & {"json", "linecache"}
 
 
@@ -103,7 +104,8 @@ def test_planted_files_run_where_a_process_looks_there(tmp_path: Path) -> None:
 def test_a_child_has_the_parents_modules_and_none_of_the_current_folder(
     variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the environment names that folder, which reaches a child before any line of its program."""
+    """A child finds the parent's modules and none of the current folder, even if PYTHONPATH, which a child
+    reads before any line of its program, names that folder."""
     marker, folder, modules = tmp_path / "ran", tmp_path / "folder", tmp_path / "modules"
     folder.mkdir()
     modules.mkdir()
@@ -125,8 +127,9 @@ def test_a_child_has_the_parents_modules_and_none_of_the_current_folder(
 
 
 def test_a_bar_starts_no_process(tmp_path: Path) -> None:
-    """A bar that other processes share would start one, with the current folder on its path, where
-    multiprocessing does not fork: on macOS, which is played here."""
+    """A progress bar starts no process. A bar that other processes share would start one, with the current
+    folder on its path, wherever multiprocessing does not fork, as on macOS; the start method `spawn` stands
+    for that here."""
     program = (
         "import io, multiprocessing, sys; multiprocessing.set_start_method('spawn'); "
         "sys.stderr = io.StringIO(); sys.stderr.isatty = lambda: True; "

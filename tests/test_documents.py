@@ -1,4 +1,4 @@
-"""The manual and the other documents: links, commands, Python, messages and names in them hold."""
+"""Links, commands, Python code, quoted messages and names in the manual and other documents are right."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DOCS = REPOSITORY / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 DOCUMENTS = sorted([*(f"docs/{page}" for page in PAGES), "README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
 MANUAL = [document for document in DOCUMENTS if not document.startswith("docs/notes/")]
-"""What speaks of today. A note says how something was measured on its day, and stays as it is."""
+"""Documents that describe the present; a note describes one day's measurement and is not changed later."""
 USER_PAGES = (
     *("index", "install", "photographing", "train", "bake", "play", "page", "export", "python"),
     *("conventions", "format", "troubleshooting", "trade", "benchmarks"),
@@ -57,7 +57,7 @@ OF_ANOTHER_TIME = (
     ),
     *("(before)", "(now)", "mended", "used to ", "no longer", "the time before", "at the time of writing"),
 )
-"""Phrases of a diary: what was, and under which circumstances, is for the notes."""
+"""Phrases of a diary: earlier states, and the circumstances of a measurement, belong in the notes."""
 
 
 def read(document: str) -> str:
@@ -68,7 +68,7 @@ def read(document: str) -> str:
 
 
 class _Html(HTMLParser):
-    """The targets of links and pictures, the ids, and the texts of code outside and inside of blocks."""
+    """The targets of links and pictures, the ids, and the texts of code outside and inside blocks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class _Html(HTMLParser):
 
 @cache
 def parsed(document: str) -> _Html:
-    """A document as MkDocs sees it."""
+    """Return a document as MkDocs sees it."""
     html = _Html()
     html.feed(markdown.markdown(read(document), extensions=["toc", "tables", "fenced_code"]))
     return html
@@ -197,7 +197,7 @@ OTHER_COMMANDS = ("python3 -m venv", ". .venv/bin/activate")
 
 
 def check_line(line: str) -> None:
-    """Raise unless a line of a shell is a command that this repository understands."""
+    """Raise unless a shell line is a command that this repository understands."""
     words = shlex.split(line, comments=True)
     if words[0] in PARSERS:
         PARSERS[words[0]](words[1:])
@@ -224,7 +224,7 @@ def check_line(line: str) -> None:
 
 
 def shell_lines(document: str) -> list[str]:
-    """The commands of a document: lines of its shell blocks, and those of others that call one of ours."""
+    """Return a document's commands: lines of its shell blocks, and lines of others that call one of ours."""
     lines = []
     for language, text in parsed(document).blocks:
         for line in text.splitlines():
@@ -293,7 +293,7 @@ def _options_of(command: str) -> set[str]:
 
 @pytest.mark.parametrize("command", PARSERS)
 def test_the_help_has_examples_that_parse(command: str) -> None:
-    """Behind the command, two spaces or more apart, stands what it does."""
+    """The help shows at least two example commands, each followed by two spaces or the line's end."""
     found = re.findall(rf"^  ({command} .+?)(?:  |$)", _help_of(command), re.MULTILINE)
     assert len(found) >= 2
     for line in found:
@@ -309,7 +309,7 @@ def test_the_help_has_no_word_of_python(command: str) -> None:
 def test_options_in_sentences_exist() -> None:
     known = {command: _options_of(command) for command in PARSERS}
     every = set().union(*known.values())
-    others = {"--nproc-per-node", "--no-deps", "--index-url"}  # torchrun's, pip's
+    others = {"--nproc-per-node", "--no-deps", "--index-url"}  # options of torchrun and pip
     wrong = []
     for document in MANUAL:
         for text in parsed(document).code:
@@ -368,7 +368,7 @@ def test_python_runs(
 
 
 def _write_as_baked(shells_folder: Path) -> None:
-    """The small asset of the tests as "out", with the cameras and the provenance that a bake writes."""
+    """Write the small asset of the tests to "out", with the cameras and the provenance that a bake writes."""
     asset = Asset.open(shells_folder)
     manifest = replace(asset.manifest, provenance={"bake": {"preset": "balanced"}})
     size = (manifest.view_size[0], manifest.view_size[1])
@@ -378,13 +378,13 @@ def _write_as_baked(shells_folder: Path) -> None:
         with_coarser_levels(asset.arrays.densities, "densities"),
         with_coarser_levels(asset.arrays.features, "features"),
     )
-    steps = (1,) * len(arrays.densities.values)  # the features have as many
+    steps = (1,) * len(arrays.densities.values)  # the features have as many levels
     manifest = replace(manifest, parts=(), level_steps=steps, density_steps=steps, feature_steps=steps)
     write_asset(Path("out"), manifest, arrays, asset.read("head.onnx"), mesh, cameras)
 
 
 def _compare_pixels(names: dict[str, Any]) -> None:
-    """The page's own reader against the player, on pixels that show something and one that does not."""
+    """Compare the reader in docs/format.md with the player, on some pixels with matter and one without."""
     asset, camera = Asset.open("out"), read_views("out/cameras.json")[0]
     frame = render(asset, camera)
     for grid in ("densities", "features"):
@@ -399,7 +399,8 @@ def _compare_pixels(names: dict[str, Any]) -> None:
     for row, column in [*shown[:: max(len(shown) // 12, 1)], np.argwhere(frame.opacity == 0)[0]]:
         d = to_model[:3, :3] @ rays_d[row, column].astype(np.float64)
         rgb = names["pixel"]((to_model @ camera.c2w)[:3, 3], d / np.linalg.norm(d))
-        # float64 here, float32 there: a bin's edge, or a sample beside a face, may fall to the other side
+        # The reader computes in float64, the player in float32: a sample near a bin's edge or a cell's face
+        # may fall to the other side.
         assert np.abs(rgb - frame.rgb[row, column]).max() < 2e-3, (row, column)
 
 
@@ -424,7 +425,7 @@ def test_user_pages_speak_of_today(name: str) -> None:
 
 
 def _text(node: ast.expr) -> str:
-    """What an expression says, what is filled in as `...`."""
+    """Return the text of a string expression, with `...` for the parts that are filled in."""
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else "..."
     if isinstance(node, ast.JoinedStr):
@@ -439,7 +440,7 @@ def _plain(text: str) -> str:
 
 
 def _messages() -> str:
-    """Every text of the source, a line each."""
+    """Return every string in the source, one on each line."""
     found = []
     for package in ("player", "exporters", "vfr_bake"):
         for path in sorted((REPOSITORY / package).rglob("*.py")):
@@ -450,7 +451,7 @@ def _messages() -> str:
 
 
 def quoted_messages() -> list[str]:
-    """What the first cells of the tables of troubleshooting quote, but for bare options and commands."""
+    """Return the messages quoted in the first cells of troubleshooting's tables, not options or commands."""
     cells = re.findall(r"^\| (.*?) \|", read("docs/troubleshooting.md"), re.MULTILINE)
     quoted = [text for cell in cells for text in re.findall(r"`([^`]+)`", cell)]
     return [
@@ -461,7 +462,7 @@ def quoted_messages() -> list[str]:
 def test_messages_of_troubleshooting_are_those_of_the_source() -> None:
     texts, quoted = _messages(), quoted_messages()
     assert len(quoted) > 40
-    others = {"no matches found", "No space left on device"}  # zsh's, the system's
+    others = {"no matches found", "No space left on device"}  # messages of zsh and of the system
     assert [text for text in quoted if _plain(text).strip(". ") not in texts and text not in others] == []
 
 

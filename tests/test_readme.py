@@ -1,4 +1,4 @@
-"""What the README says to type works, in its order; its picture is there and its figures are filled in."""
+"""The commands in the README work, in their order; its picture is there, and its figures are filled in."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vfr_bake.cli import bake_main, bench_main, eval_main, train_main
 REPOSITORY = Path(__file__).resolve().parent.parent
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 
-# The commands of the README at a size that a test can wait for.
+# Main functions of the README's commands, each with options that make it small enough for a test.
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], list[str]]] = {
     "vfr-train": (
         train_main,

@@ -1,4 +1,4 @@
-"""No test is skipped in silence: a run with a skip that the platform does not explain fails."""
+"""No test is skipped silently: a run fails on any skip that is not explained by what the platform lacks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SKIPS = {
 
 
 def run(folder: Path, test: str, more: str = "", *options: str) -> subprocess.CompletedProcess[str]:
-    """pytest over one test, under the repository's conftest.py with `more` behind it."""
+    """Run pytest on one test, under the repository's conftest.py with the code `more` appended."""
     shared = (REPOSITORY / "conftest.py").read_text(encoding="utf-8")
     (folder / "conftest.py").write_text(f"{shared}\n{more}\n", encoding="utf-8")
     (folder / "test_it.py").write_text(f"import pytest\n{test}\n")

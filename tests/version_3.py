@@ -1,4 +1,5 @@
-"""Assets of version 3.1 of the format, which is read and no longer written: as its writer wrote them."""
+"""Writer of assets in version 3.1 of the format, which is still read but no longer written; it writes the
+same bytes as the writer of that time."""
 
 from __future__ import annotations
 
@@ -19,12 +20,13 @@ from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
 
 KEYS_OF_4 = ("level_steps", "density_steps", "feature_steps", "parts")
 STRATEGIES = (zlib.Z_HUFFMAN_ONLY, zlib.Z_DEFAULT_STRATEGY)
-"""The smaller is kept: differences of codes are noise, in which the repetitions that zlib finds cost more
-than they save (lego: 11 % less without them), but for codes that hardly change."""
+"""Strategies of zlib, of which the one with the smaller result is kept. Differences of codes are noise, in
+which the repetitions that zlib finds cost more than they save (lego: 11 % less without them), except where
+codes hardly change."""
 
 
 def pack_codes(codes: np.ndarray) -> bytes:
-    """Codes [n] or [n, n_channels], int8 or uint8, as bytes that `unpack_codes` reads."""
+    """Return codes [n] or [n, n_channels], int8 or uint8, as bytes that `unpack_codes` reads."""
     planes = np.ascontiguousarray((codes if codes.ndim == 2 else codes[:, None]).T).view(np.uint8)
     steps = planes.copy()
     steps[:, 1:] -= planes[:, :-1]
@@ -37,15 +39,15 @@ def _compressed(data: bytes, strategy: int) -> bytes:
 
 
 def pack_masks(masks: np.ndarray) -> bytes:
-    """Masks of bricks [n_bricks, 8] uint64 as bytes that `unpack_masks` reads."""
+    """Return the masks of bricks [n_bricks, 8] uint64 as bytes that `unpack_masks` reads."""
     return zlib.compress(np.ascontiguousarray(masks, "<u8").tobytes())
 
 
 def to_vertices(grid: PyramidValues) -> VertexBricks:
     """Undo `from_vertices`, for a grid of one level; values are [n_vertices, n_channels].
 
-    Every cell with eight corners stored is live in what `from_vertices` makes: a pyramid with a cell that is
-    not live among eight vertices of others is another one when it is read again.
+    In a grid of `from_vertices` every cell whose eight corners are stored is live. So a pyramid in which such
+    a cell is not live, because its corners belong to other cells, is not the same when it is read again.
     """
     (vertices,), (values,) = grid.pyramid.vertices, grid.values
     return VertexBricks(vertices.bricks.coords, vertices.bricks.masks, values)
@@ -54,7 +56,7 @@ def to_vertices(grid: PyramidValues) -> VertexBricks:
 def write_version_3(
     folder: Path, manifest: Manifest, densities: VertexBricks, features: VertexBricks, files: dict[str, bytes]
 ) -> Path:
-    """Write an asset; `files` are head, mesh, cameras and reports by their names. Returns its folder."""
+    """Write an asset and return its folder; `files` has head, mesh, cameras and reports by their names."""
     folder.mkdir(parents=True)
     for names, stored in ((DENSITIES, densities), (FEATURES, features)):
         coords = io.BytesIO()
@@ -68,7 +70,7 @@ def write_version_3(
 
 
 def as_version_3(folder: Path) -> Path:
-    """Make the asset in a folder, of one level, one of version 3.1."""
+    """Rewrite the asset in `folder`, which has one level, in version 3.1."""
     asset = Asset.open(folder)
     names = (name for name in asset.manifest.files if not name.startswith("part_"))
     files = {name: asset.read(name) for name in names}
@@ -78,7 +80,7 @@ def as_version_3(folder: Path) -> Path:
 
 
 def manifest_3(manifest: Manifest, files: dict[str, bytes]) -> bytes:
-    """The manifest as version 3.1 has it."""
+    """Return the manifest as version 3.1 writes it."""
     document = json.loads(manifest_bytes(manifest))
     for key in KEYS_OF_4:
         del document[key]

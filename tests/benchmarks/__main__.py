@@ -1,14 +1,14 @@
-"""Every figure of the README and of docs/benchmarks.md, measured anew, and the pages rendered from them.
+"""Measure every figure of the README and of docs/benchmarks.md anew, and render the pages with them.
 
     python -m tests.benchmarks                        # the core set: what this commit and machine lack of it
     python -m tests.benchmarks --only bake_lego_fast  # some parts, and before them what they need
     python -m tests.benchmarks --list                 # all parts, and which of them are there
     python -m tests.benchmarks render                 # the pages alone
 
-Each part is recorded in docs/benchmarks.json when it has ended, or in docs/benchmarks_avx512.json where
-the processor has AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
-build/benchmarks. Before each part the machine has to be quiet: a part waits for that. Data sets lie in the
-folder that VFR_DATA names. Linux alone.
+When a part ends, its result is recorded in docs/benchmarks.json, or in docs/benchmarks_avx512.json if the
+processor has AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
+build/benchmarks. Each part waits until the machine is quiet. Data sets lie in the folder that VFR_DATA names.
+Linux alone.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Frames of another version of the player beside this one's, each version with an asset of its own baking.
+"""Compare frames of another version of the player with this one's; each version may play an asset of its own.
 
-A process for each version and quality; they take turns frame by frame, so that whatever else the machine
-does falls on all of them. The views are a walk through some training views and a slow turn around the scene.
-Ratios are medians over the frames of the wall's clock and of processor time: on a machine that does other
-things the second is the one to trust. Compared with exact's of the same asset: the error of pictures, and of
-the difference between each picture and the one before it, which is what flickers.
+The other version and each quality of this one run in processes of their own. They take turns frame by frame,
+so that other work of the machine affects all of them alike. The views are a walk through some training views
+and a slow turn around the scene. Ratios are medians over the frames, of elapsed time and of processor time;
+on a machine that does other work, trust the second. Pictures are compared with the exact ones of the same
+asset: the error of pictures, and the error of the difference between each picture and the one before it,
+which measures flicker.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from player.cameras.views import asset_cameras
 
 QUALITIES = ("exact", "high", "fast")
 TURN = 240
-"""Views of a whole turn, of which a slow one shows the first."""
+"""Number of views in a whole turn; a slow turn shows only the first of them."""
 
 _WORKER = """
 import json, resource, sys, time
@@ -84,7 +85,7 @@ class Player:
         )
 
     def frame(self, camera: Camera) -> tuple[list[float], np.ndarray]:
-        """Seconds, seconds of processor time and peak megabytes; and the picture, [h, w, 3] 0..1."""
+        """Return (seconds, seconds of processor time, peak megabytes), and the picture [h, w, 3] in 0..1."""
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -100,7 +101,7 @@ class Player:
 
 
 def views(asset: Asset, size: tuple[int, int], n_frames: int) -> list[Camera]:
-    """Half of them a walk between training views, half a slow turn."""
+    """Return views, half of them on a walk between training views, and half on a slow turn."""
     trained = [camera.resized(*size) for camera in asset_cameras(asset)]
     chosen = [trained[i] for i in np.linspace(0, len(trained) - 1, 4).round().astype(int)]
     walk = smooth_path(chosen, max(n_frames // 6, 1))[: n_frames - n_frames // 2]
@@ -116,9 +117,10 @@ def compare(
     march: str,
     scratch: Path,
 ) -> list[dict[str, Any]]:
-    """A row for the other version (`other`: its checkout and its asset) and for each quality of this one.
+    """Return a row for the other version (`other`: its checkout and its asset), and for each quality of this
+    one.
 
-    Pictures lie in the folder `scratch` meanwhile.
+    Pictures are written to the folder `scratch` meanwhile.
     """  # fmt: skip
     here = Path(__file__).parents[2]
     kinds = [(other[0], other[1], "exact"), *((here, folder, quality) for quality in QUALITIES)]
@@ -151,7 +153,7 @@ def compare(
 
 
 def lines(rows: list[dict[str, Any]]) -> list[str]:
-    """A table, for people."""
+    """Return a table in Markdown."""
     said = [
         "| | ms a frame | times as fast | by processor time | peak MB | to exact, dB | of differences, dB |"
     ]

@@ -2,9 +2,9 @@
 
     python tests/benchmarks/bench_ablation.py ../shared/data/lego_400 --downscale 2 --output lego.json
 
-Every row sees the same number of samples; rows take turns, so that a machine that slows down slows all. A
-run that is in the output file already is not done again. Prints a table of means and standard deviations over
-the seeds.
+Every row trains on the same number of samples. Rows take turns, so that a machine that slows down slows all
+of them. A run that is already in the output file is not done again. Prints a table of means and standard
+deviations over the seeds.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROWS: dict[str, dict[str, Any]] = {
 
 
 def train(scene: Scene, row: str, seed: int, options: argparse.Namespace) -> dict[str, float]:
-    """One run's PSNR and SSIM on held-out views, and its seconds."""
+    """Return the PSNR and SSIM of one run on held-out views, and its seconds."""
     config = TrainConfig(
         steps=options.steps, minutes=1e6, seed=seed, batch_samples=options.batch_samples,
         batch_rays=options.batch_rays, field=FieldOptions(**ROWS[row]),

@@ -1,14 +1,14 @@
-"""Cameras that are estimated from pictures alone, held against those that are known.
+"""Compare cameras that are estimated from pictures alone with known ones.
 
     python -m tests.benchmarks.bench_cameras ring RING --views 300 --size 4000 3000
     python -m tests.benchmarks.bench_cameras compare DATA
 
 `ring` renders the built-in scene in a textured room: `--views` pictures in three turns at heights of 12, 30
 and 50 degrees, with their cameras in `transforms.json`. `compare` estimates the cameras of DATA's pictures
-(with a transforms.json; the train split where there are two) without looking at the given ones, and prints
-seconds of every stage, processor time, peak memory, how many pictures were placed, by how many degrees their
-turns are off, and by how many per cent of the spread of all places their places are. Before they are
-compared the estimated cameras are moved by the similarity that brings their places nearest to the given ones.
+(of the train split if there are two) without using those in the transforms.json. It prints seconds of every
+stage, processor time, peak memory, the number of pictures that were placed, the error of rotations in
+degrees, and the error of positions in per cent of the spread of all positions. Before that, the estimated
+cameras are moved by the similarity that brings their positions nearest to the known ones.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from vfr_bake.data.threads import in_threads
 HEIGHTS = (12.0, 30.0, 50.0)
 DISTANCE = 3.0
 ROOM = np.array([[-7.0, -7.0, -1.2], [7.0, 7.0, 4.0]])
-"""Two corners of the room, in the scene's own frame, where its box is about [-1, 1]³."""
+"""Two corners of the room in the scene's own frame, in which the scene's box is about [-1, 1]³."""
 TEXTURE_SIDE = 4096
 ENLARGED = 2.5
-"""Pictures are traced at so many times fewer pixels a side: a phone's 12 megapixels show no more either."""
+"""Factor by which traced pictures are enlarged on each side: a phone's 12 megapixels show no more."""
 
 
 def ring_cameras(n_views: int, width: int, height: int) -> list[Camera]:
-    """Cameras around the scene in three turns, upper ones looking down more; the world's frame."""
+    """Return cameras in three turns around the scene, in the world's frame; upper ones look down more."""
     cameras = []
     for number in range(n_views):
         turn, part = divmod(number * len(HEIGHTS) / n_views, 1.0)
@@ -63,7 +63,7 @@ def ring_cameras(n_views: int, width: int, height: int) -> list[Camera]:
 
 
 def wall_texture(seed: int) -> np.ndarray:
-    """Blotches of all sizes with rectangles upon them, [side, side, 3] uint8: nothing repeats."""
+    """Return blotches of all sizes with rectangles upon them, [side, side, 3] uint8, without repetition."""
     rng = np.random.default_rng(seed)
     texture = np.zeros((TEXTURE_SIDE, TEXTURE_SIDE, 3), np.float32)
     for level in range(3, 12):
@@ -78,7 +78,7 @@ def wall_texture(seed: int) -> np.ndarray:
 
 
 def room_picture(camera: Camera, walls: np.ndarray) -> np.ndarray:
-    """The room alone, [height, width, 3] uint8; `walls`: [6, side, side, 3]."""
+    """Return a picture of the room alone, [height, width, 3] uint8; `walls`: [6, side, side, 3]."""
     rays_o, rays_d = camera.rays()
     origin, d = ((rays_o[:1] - CENTRE) / SCALE).astype(np.float32).T, rays_d.T
     corner = np.where(d < 0, ROOM[0][:, None], ROOM[1][:, None]).astype(np.float32)
@@ -115,8 +115,7 @@ def render_ring(folder: Path, n_views: int, width: int, height: int) -> None:
 
 
 class Stages:
-    """What every stage of an estimation took, in seconds of the wall's clock and of processor time, printed
-    as each ends."""
+    """Elapsed and processor seconds of every stage of an estimation, each printed when its stage ends."""
 
     def __init__(self) -> None:
         self._stage, self._start = "", (time.perf_counter(), time.process_time())
@@ -138,9 +137,11 @@ class Stages:
 
 
 def errors(estimated: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Degrees by which turns, and shares of the spread by which places are off, after the best similarity.
+    """Return the errors of rotations in degrees, and of positions as shares of their spread, after the best
+    similarity.
 
-    Both sets of cameras [n, 4, 4], camera to world, n at least 3, places not all on one line.
+    Both sets of cameras are [n, 4, 4], camera to world, n at least 3, with positions that are not all on one
+    line.
 
     >>> rng = np.random.default_rng(0)
     >>> known = np.tile(np.eye(4), (5, 1, 1))
@@ -155,7 +156,7 @@ def errors(estimated: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
     a, b = (cameras[:, :3, 3] - cameras[:, :3, 3].mean(axis=0) for cameras in (estimated, known))
     scale, turn = similarity(a, b)
     shares = np.linalg.norm(scale * a @ turn.T - b, axis=1) / np.sqrt((b**2).sum(axis=1).mean())
-    # The mean turn between the two sets, which a similarity of places alone leaves less exact.
+    # The mean rotation between the two sets is more exact than that of a similarity of positions alone.
     u, _, vt = np.linalg.svd((known[:, :3, :3] @ estimated[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     common = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     between = known[:, :3, :3].transpose(0, 2, 1) @ common @ estimated[:, :3, :3]
@@ -164,13 +165,13 @@ def errors(estimated: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def compare(data: Path) -> dict[str, Any]:
-    """Print what the estimation of the cameras of a data set took, and how far off they are; returns it."""
+    """Print and return what the estimation of a data set's cameras took, and the cameras' errors."""
     files = [data / name for name in ("transforms_train.json", "transforms.json") if (data / name).is_file()]
     cameras = {}
     with tempfile.TemporaryDirectory() as name:
         photos = Path(name)
         (photos / "images").mkdir()
-        # Places and turns are all that is compared; NeRF-synthetic does not tell the size of its pictures.
+        # Only positions and rotations are compared; NeRF-synthetic does not state the size of its pictures.
         for number, camera in enumerate(read_cameras(files[0], (1, 1))):
             names = (camera.name, f"{camera.name}.png")
             picture = next(path for name in names if (path := data / name).is_file())

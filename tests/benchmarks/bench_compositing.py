@@ -1,10 +1,10 @@
-"""Volume feature rendering against standard volume rendering: same data, the paper's head (6x256), same
+"""Compare volume feature rendering with standard volume rendering: same data, the paper's head (6x256), same
 batch, the same minutes, in one run.
 
     python tests/benchmarks/bench_compositing.py ../shared/data/lego_400 --minutes 4
 
-Both trainings advance by turns of a few seconds, so that both meet the same machine. Prints steps per second
-and PSNR on held-out views.
+The two trainings take turns of a few seconds, so that both run on the same machine under the same load.
+Prints steps per second and PSNR on held-out views.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KINDS: tuple[Compositing, ...] = ("features", "colour")
 
 
 class Turns:
-    """A training that is given the machine for some seconds at a time."""
+    """A training that runs for some seconds at a time."""
 
     def __init__(self, scene: Scene, compositing: Compositing, options: argparse.Namespace) -> None:
         field = FieldOptions(compositing=compositing, head_width=256)
@@ -37,7 +37,7 @@ class Turns:
         self.seconds, self.done = 0.0, False
 
     def advance(self, seconds: float) -> None:
-        # A fresh iterator goes on from the seconds trained so far: waiting does not count.
+        # A fresh iterator continues at the seconds trained so far, so that waiting does not count.
         reports: Iterator = self.trainer.run()
         until = self.trainer.seconds + seconds
         for report in reports:

@@ -1,8 +1,8 @@
-"""Training on a GPU as the paper has it: minutes, samples a second, PSNR, and where the time goes.
+"""Training on a GPU with the paper's settings: minutes, samples a second, PSNR, and where the time goes.
 
     python tests/benchmarks/bench_gpu.py nerf_synthetic/lego --json lego_gpu.json
 
-The first steps, in which code is generated, are in the minutes; the profile is of steps at the end.
+The minutes include the first steps, in which code is generated; the profile is of steps at the end.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ PARTS = {
     "_error": "field, compositing and head",
     "_backward": "gradients",
 }
-"""What a step calls, and what it is in the table; the rest of a step is its optimisers."""
+"""Methods that a step calls, and their names in the table. The rest of a step is its optimisers."""
 
 
 @contextmanager
 def named_parts(trainer: Trainer) -> Iterator[None]:
-    """Each part of a step shows in the profile under its name."""
+    """Show each part of a step in the profile under its name."""
     owners = {name: trainer._guide if name == "sample" else trainer for name in PARTS}
 
     def named(method: Any, title: str) -> Any:
         def call(*args: Any, **keywords: Any) -> Any:
             with record_function(title):
                 result = method(*args, **keywords)
-                torch.cuda.synchronize()  # else a part would pay for what the one before it has asked for
+                torch.cuda.synchronize()  # else this part's work would count for the next one
                 return result
 
         return call
@@ -56,7 +56,7 @@ def named_parts(trainer: Trainer) -> Iterator[None]:
 
 
 def profile_steps(trainer: Trainer, reports: Iterator[StepReport], n_steps: int) -> list[tuple[str, float]]:
-    """(part, milliseconds a step) and the dearest GPU kernels, of `n_steps` further steps."""
+    """Return (part, milliseconds a step), with the dearest GPU kernels, over `n_steps` more steps."""
     activities = [ProfilerActivity.CPU, ProfilerActivity.CUDA]
     n_done = 0
     with named_parts(trainer), profile(activities=activities) as recorded:

@@ -1,10 +1,10 @@
-"""Ten thousand small frames, and clients of the viewer that come and go: memory must stay flat.
+"""Ten thousand small frames, and clients of the viewer that come and go: memory must not grow.
 
     python tests/benchmarks/bench_long_run.py out/ --frames 10000
     python tests/benchmarks/bench_long_run.py out/ --clients 20 --rounds 3
 
-Clients are WebSocket connections as a browser opens them, which read what the server sends and then vanish,
-half of them without a word.
+Clients are WebSocket connections such as a browser opens. They read what the server sends and then
+disconnect, half of them without closing the connection properly.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from player.viewer.server import free_port
 
 
 def resident_mb(process: str = "self") -> float:
-    """Memory that a process holds now (Linux)."""
+    """Return the MB of memory that a process holds now (Linux)."""
     pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return pages * 4096 / 1e6
 
 
 def frames(folder: Path, n_frames: int) -> dict[str, object]:
-    """Render, and look at the memory after every twentieth part."""
+    """Render frames, and note the memory after every twentieth part of them."""
     asset = Asset.open(folder)
     cameras = orbit(read_cameras(asset.path("cameras.json")), 100, (48, 40))
     held, begin = [], time.perf_counter()
@@ -45,7 +45,7 @@ def frames(folder: Path, n_frames: int) -> dict[str, object]:
 
 
 def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
-    """Connect, read, vanish; the server's memory and whether it still answers."""
+    """Connect, read and disconnect; return the server's memory, and whether it is still running."""
     import viser
     from websockets.sync.client import connect
     from websockets.typing import Origin, Subprotocol
@@ -90,7 +90,7 @@ def clients(folder: Path, n_clients: int, n_rounds: int) -> dict[str, object]:
 
 
 def _patiently(what):
-    """The server takes a while to start, and to notice who is gone without a word."""
+    """Try until the server has started, and has noticed which clients are gone without a word."""
     from websockets.exceptions import InvalidStatus
 
     until = time.monotonic() + 120

@@ -1,9 +1,10 @@
-"""What few feature lookups a ray lose, view by view.
+"""Loss by the number of feature lookups for each ray, view by view.
 
     python -m tests.benchmarks.bench_lookups every/ k5/ --data lego_400 --views 50 --json found.json
 
-plays each asset on the same test views with each number of lookups, 0 for every sample, and compares the
-pictures, in 8 bits, with the photographs. Prints the mean PSNR; the file has that of every view.
+Plays each asset on the same test views with each number of lookups, where 0 stands for every sample, and
+compares the pictures, in 8 bits, with the photographs. Prints the mean PSNR; the file holds that of every
+view.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from vfr_bake.training.scores.metrics import psnr
 
 
 def view_scores(folder: Path, data: Path, n_views: int, samples: list[int]) -> dict[str, list[float]]:
-    """PSNR in dB of every view, by the number of lookups; views are spread evenly."""
+    """Return the PSNR in dB of every view, by the number of lookups; views are spread evenly."""
     asset = Asset.open(folder)
     cameras, photographs = test_views(asset, data)
     chosen = np.linspace(0, len(cameras) - 1, min(n_views, len(cameras))).round().astype(int)

@@ -1,13 +1,13 @@
-"""What a picture of an asset's page costs: texture fetches, multiply-adds, and time on a processor.
+"""The cost of a picture of an asset's page: texture fetches, multiply-adds, and time on a processor.
 
     python -m tests.benchmarks.bench_page out/ --size 400 --views 3
 
 The page is opened from a disk in Chromium, whose WebGL runs on the processor (SwiftShader). Fetches are
-counted by a variant of the shader that adds one for each; the head fetches each of its weights, four a texel,
-once for four pixels. Times are beside those of `vfr-play`'s march for the same cameras, alternately:
-processor time of all of the browser's processes, and the wall's clock. The time to the first picture is from
-the page's opening to the first whole one, exact and 400 pixels wide, with everything decoded and compiled.
-Linux alone.
+counted by a variant of the shader that adds one for each. The head fetches each of its weights, four a texel,
+once for four pixels. Times are compared with those of `vfr-play`'s march for the same cameras, alternately:
+processor time of all of the browser's processes, and elapsed time. The time to the first picture is from the
+opening of the page to the first whole picture, exact and 400 pixels wide, with everything decoded and
+compiled. Linux alone.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from tests.player.page.viewer_page import chromium
 QUALITIES = ("exact", "high", "fast")
 
 OTHERS = {"MERF": (13, 896), "SMERF": (13, 960)}
-"""For each of two other viewers what its shader does (google-research, `merf/webviewer` and
-`smerf/webviewer`): fetches of a visible sample and multiply-adds of its head, 16 wide. Of the fetches five
-find index and density, eight colours and features; each is filtered by the hardware, which reads four or
-eight texels for it, and those that skip empty space come on top."""
+"""For two other viewers, the work of their shaders (google-research, `merf/webviewer` and `smerf/webviewer`):
+fetches of a visible sample, and multiply-adds of the head, which is 16 wide. Five of the fetches find index
+and density, eight colours and features. Each is filtered by the hardware, which reads four or eight texels
+for it. Fetches that skip empty space are not counted."""
 
 
 class Cost(NamedTuple):
-    """Seconds that something took."""
+    """Seconds of elapsed time and of processor time."""
 
     wall: float
     processor: float
 
 
 def family(root: int) -> list[int]:
-    """The process ids of a process and of all below it."""
+    """Return the ids of a process and of all its descendants."""
     parents: dict[int, list[int]] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -65,7 +65,7 @@ def family(root: int) -> list[int]:
 
 
 def processor_seconds(processes: list[int]) -> float:
-    """What the processes have used of the processor so far."""
+    """Return the seconds of processor time that the processes have used so far."""
     total = 0.0
     for process in processes:
         try:
@@ -122,7 +122,7 @@ def main() -> None:
 
 
 def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict[str, Any]:
-    """Print what the page holds and does for a pixel; returns it."""
+    """Print and return what the page holds, and its work for a pixel."""
     info = page.page.evaluate("() => vfr.info")
     share = 0.0
     print(f"  {info['gpuBytes'] / 1e6:.0f} MB of graphics memory, {info['renderer']}")
@@ -136,7 +136,7 @@ def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict
             found = page.page.evaluate("view => counts(view)", view_of(camera) | {"quality": quality})
             fetches = np.frombuffer(base64.b64decode(found["fetches"]), np.uint32)
             hit = found["nHits"] / len(fetches)
-            weights = hit * info["multiplyAdds"] / 16  # four a texel, for four pixels
+            weights = hit * info["multiplyAdds"] / 16  # four weights a texel, for four pixels
             rows.append((fetches.mean(), fetches.mean() / max(hit, 1e-9), hit, weights))
         marched, per_hit, hit, weights = np.mean(rows, axis=0)
         print(
@@ -157,7 +157,7 @@ def report_counts(asset: Asset, page: RenderPage, cameras: list[Camera]) -> dict
 def report_times(
     asset: Asset, page: RenderPage, cameras: list[Camera], n_rounds: int
 ) -> dict[str, dict[str, float]]:
-    """Print what a picture of each quality takes, beside `vfr-play`; returns it in milliseconds."""
+    """Print and return the milliseconds of a picture in each quality, beside those of `vfr-play`."""
     processes = family(os.getpid())
     processes.remove(os.getpid())
 

@@ -5,15 +5,16 @@
     python -m tests.benchmarks.bench_play lego/ fox/ --against CHECKOUT --march numba numpy --frames 60
     python -m tests.benchmarks.bench_play out/ --against CHECKOUT ITS_ASSET
 
-Parts are processor time of all threads, divided by their number: what they take of a frame when all are busy.
-What is left of the wall's clock is waiting, for another program or for the last task. Lookups cannot be
-timed apart: they are k / (k - 1) of what k fetches a ray take longer than one. Medians over the frames. The
-two marches must give the same picture within one level of eight bits; a head in 8 bits takes a last bit for
-another level now and then, which moves one pixel in ten thousand by two levels or more.
+Times of the parts are processor time of all threads, divided by their number: their share of a frame if all
+threads are busy. The rest of the elapsed time is waiting, for another program or for the last task. Lookups
+cannot be timed by themselves: they are k / (k - 1) of the time that k fetches a ray take longer than one.
+Figures are medians over the frames. The two marches must give the same picture within one level of eight
+bits; a head in 8 bits sometimes rounds to another level, which moves one pixel in ten thousand by two levels
+or more.
 
-With `--against`, every quality beside another version of the player, which plays the same asset or one of its
-own baking (`tests/benchmarks/against.py`). With `--curves`, tables of time against pixels, threads and
-assets, numba alone.
+With `--against`, every quality is compared with another version of the player, which plays the same asset or
+one of its own baking (`tests/benchmarks/against.py`). With `--curves`, tables of time by pixels, threads and
+assets are printed, for numba alone.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ from tests.benchmarks import against
 from vfr_bake.bench.process import Clock
 
 SIZES = (200, 400, 566, 800, 1131)
-"""Edges of the square pictures of the curve: pixels double, but for the first step."""
+"""Edges of the square pictures of the curve. The number of pixels doubles, but for the first step."""
 
 
 class Parts(NamedTuple):
-    """Milliseconds a frame."""
+    """Milliseconds a frame, and numbers of a frame."""
 
     wall: float
     march: float
@@ -72,7 +73,7 @@ class Parts(NamedTuple):
 def measure(
     asset: Asset, cameras: list[Camera], name: Any, n_threads: int | None, k: int | None
 ) -> tuple[Parts, Frame]:
-    """Medians over the cameras, and the last frame."""
+    """Return medians over the cameras, and the last frame."""
     k = asset.manifest.n_fetches if k is None else k
     rows = []
     with Renderer(asset, n_threads, name) as renderer:
@@ -97,7 +98,7 @@ def measure(
 
 
 def on_threads(n_threads: int, work: Callable[[], object]) -> float:
-    """Least processor time, in seconds, that one of the threads needs for `work` while all of them do it."""
+    """Return the least processor time in seconds that a thread needs for `work` while all threads do it."""
 
     def timed() -> float:
         start = time.thread_time()
@@ -110,7 +111,7 @@ def on_threads(n_threads: int, work: Callable[[], object]) -> float:
 
 
 def machine(n_threads: int) -> tuple[float, float]:
-    """GFLOP/s of a matrix product in float32, and GB/s that a copy reads and writes, of all threads."""
+    """Return GFLOP/s of a float32 matrix product, and GB/s that a copy reads and writes, by all threads."""
     rng = np.random.default_rng(0)
     a, b = (rng.random((768, 768), np.float32) for _ in range(2))
     rate = n_threads * 2 * 768**3 / on_threads(n_threads, lambda: a @ b)
@@ -122,10 +123,11 @@ def machine(n_threads: int) -> tuple[float, float]:
 
 
 def bounds(asset: Asset, parts: Parts, rates: tuple[float, float]) -> str:
-    """How long the machine would take for the operations and bytes of a frame at its full rates.
+    """Return in words how long a frame's operations and bytes would take at the machine's full rates.
 
     A density sample reads eight codes, an entry of the table and a byte of live cells, and costs some 60
-    operations; a fetch reads eight rows with their ranks; the head multiplies and adds once a parameter.
+    operations. A fetch reads eight rows with their ranks. The head multiplies and adds once for each
+    parameter.
     """
     flops, speed = rates
     width = asset.manifest.n_channels
@@ -155,7 +157,7 @@ def line(parts: Parts) -> str:
 
 
 def picture_size(asset: Asset, arguments: argparse.Namespace) -> tuple[int, int]:
-    """What was asked for; else 800x800 of an object, and the size of the training pictures of a capture."""
+    """Return the size asked for; else 800x800 for objects, and the training pictures' size for captures."""
     if arguments.size is None:
         width, height = asset.manifest.view_size if asset.manifest.contracted else (800, 800)
         return width, height
@@ -171,7 +173,7 @@ def views(asset: Asset, path: Path | None, size: tuple[int, int], n_frames: int)
 
 
 def compare(asset: Asset, cameras: list[Camera], n_threads: int, k: int | None) -> int:
-    """Both marches on the same views; the greatest difference of their last pictures, in levels."""
+    """Measure both marches on the same views; return the last pictures' largest difference, in levels."""
     rates = machine(n_threads)
     pictures = []
     for name in ("numba", "numpy"):
@@ -214,7 +216,7 @@ def curves(assets: list[Asset], arguments: argparse.Namespace, n_threads: int) -
 
 
 def against_another(arguments: argparse.Namespace) -> int:
-    """Every asset of this version against the one of the other, or the same one, with each march."""
+    """Compare each asset, with each march, with the other version's asset, or with itself played by that."""
     checkout, *own = arguments.against
     for folder, march in itertools.product(arguments.assets, arguments.march):
         size = picture_size(Asset.open(folder), arguments)

@@ -1,11 +1,11 @@
-"""Frames of both marches with every quality, in turns, and what each quality loses.
+"""Frame times of both marches with every quality, taken in turns, and the loss of each quality.
 
     python -m tests.benchmarks.bench_qualities out/ --data lego_400 --size 800x800 --json found.json
 
-A process for each march and quality. They take turns frame by frame, so that whatever else the machine does
-falls on all of them; the views are a walk through some training views and a slow turn around the scene.
-Times are medians, give or take the notch of `vfr_bake.bench.timing`. Losses are against exact pictures on
-test views of DATA: the mean and the worst view, in dB of PSNR against the photographs.
+There is a process for each march and quality. They take turns frame by frame, so that other work of the
+machine affects all of them alike. The views are a walk through some training views and a slow turn around the
+scene. Times are medians, with the uncertainty of `vfr_bake.bench.timing`. Losses are relative to exact
+pictures on test views of DATA: the mean and the worst view, in dB of PSNR compared with the photographs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ HERE = Path(__file__).parents[2]
 def frame_times(
     folder: Path, frame_size: tuple[int, int], n_frames: dict[str, int], threads: int, scratch: Path
 ) -> list[dict[str, Any]]:
-    """A row for each march, of which so many frames are timed, and each quality."""
+    """Return a row for each march, of which so many frames are timed, and each quality."""
     rows = []
     with ExitStack() as stack:
         players = {}
@@ -68,7 +68,7 @@ def frame_times(
 def losses(
     folder: Path, data: Path, n_views: int, threads: int, scratch: Path
 ) -> dict[str, dict[str, float]]:
-    """What each quality but exact loses against photographs, and exact's PSNR."""
+    """Return the loss of each quality but exact, compared with photographs, and exact's PSNR."""
     asset = Asset.open(folder)
     cameras, photographs = test_views(asset, data)
     chosen = np.linspace(0, len(cameras) - 1, min(n_views, len(cameras))).round().astype(int)

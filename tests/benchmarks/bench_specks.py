@@ -1,13 +1,13 @@
-"""How many specks an asset's pictures have that the model's, or the photographs, have not, and what makes
-them.
+"""Count specks in an asset's pictures that the model's or the photographs do not have, and find their cause.
 
     python tests/benchmarks/bench_specks.py ASSET --model model.pt [--data DIR] [--views 10] [--pictures DIR]
     python tests/benchmarks/bench_specks.py ASSET --data DIR          # against the photographs
 
-Specks are those of `vfr_bake.bench.specks`, in a million pixels, on test views of DIR or on training cameras
-of the asset. With a model also: with all fetches (k = 0), with the head's activations in float32, and with
-the model's own opacity or its own colours in place of the asset's; what remains then is made by the other
-one. `--pictures` writes the worst places eight times as large: played, model, specks.
+Specks are those of `vfr_bake.bench.specks`, in a million pixels, on test views of DIR or from training
+cameras of the asset. With a model, they are also counted with all fetches (k = 0), with the head's
+activations in float32, and with the model's own opacity or its own colours in place of the asset's; specks
+that remain are then caused by the other of the two. `--pictures` writes the worst places eight times as
+large: played, model, specks.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from vfr_bake.training.scores.metrics import over_background, to_8_bit
 
 THRESHOLDS = (0.05, 0.1, 0.2)
 AROUND, TIMES = 12, 8
-"""Pixels around a worst place that are written, and how many times as large."""
+"""Number of pixels written around a worst place on each side, and the factor of their enlargement."""
 
 
 def test_views(asset: Asset, data: Path) -> tuple[list[Camera], list[np.ndarray]]:
-    """Test cameras of a data set, world frame, and their photographs in 8 bits over the asset's
-    background."""
+    """Return the test cameras of a data set, in the world's frame, and their photographs in 8 bits over the
+    asset's background."""
     reader = reader_as(asset.manifest.provenance.get("train", {}))
     scene = load_scene(str(data), reader=reader)
     cameras = [camera.transformed(scene.world_from_model) for camera in scene.test.cameras]
@@ -51,8 +51,8 @@ def test_views(asset: Asset, data: Path) -> tuple[list[Camera], list[np.ndarray]
 
 
 def models_own(model: Model, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Colours [h, w, 3] before they are mixed with the background, and opacity [h, w, 1], of a camera in the
-    world frame."""
+    """Return colours [h, w, 3] before they are mixed with the background, and opacity [h, w, 1], of a camera
+    in the world's frame."""
     rays_o, rays_d = camera.transformed(np.linalg.inv(model.world_from_model)).rays()
     features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
     hit = np.flatnonzero(opacity > 0)
@@ -62,7 +62,7 @@ def models_own(model: Model, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def float_head(asset: Asset) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The asset's head without the rounding of its activations; its weights stay as they are stored."""
+    """Return the asset's head without the rounding of its activations; its weights stay as stored."""
     graph = onnx.load(str(asset.path("head.onnx")))
     rounded = {node.output[0]: node.input[0] for node in graph.graph.node if node.op_type == "QuantizeLinear"}
     instead = {
@@ -80,7 +80,7 @@ def float_head(asset: Asset) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
 def variants(
     renderer: Renderer, camera: Camera, model: Model | None, own: tuple[np.ndarray, np.ndarray] | None
 ) -> dict[str, np.ndarray]:
-    """The asset's picture, and with a model those with one thing switched off."""
+    """Return the asset's picture, and with a model also those with one thing switched off."""
     pictures = {"as played": renderer.render(camera).rgb}
     if model is None or own is None:
         return pictures
@@ -100,7 +100,7 @@ def variants(
 
 
 def write_worst(folder: Path, name: str, played: np.ndarray, wanted: np.ndarray, mask: np.ndarray) -> None:
-    """The place with the most specks of a view, enlarged: played, wanted, specks."""
+    """Write the place of a view with the most specks, enlarged: played, wanted, specks."""
     count = np.pad(mask, AROUND).cumsum(0).cumsum(1)
     size = 2 * AROUND
     totals = count[size:, size:] - count[:-size, size:] - count[size:, :-size] + count[:-size, :-size]

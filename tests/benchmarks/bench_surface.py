@@ -1,14 +1,14 @@
-"""How good exported surfaces are: against known geometry, against the volume and against photographs.
+"""Quality of exported surfaces: compared with known geometry, with the volume and with photographs.
 
     python tests/benchmarks/bench_surface.py demo ASSET                    # an asset of the built-in scene
     python tests/benchmarks/bench_surface.py views ASSET transforms_test.json [--pictures DIR] [--views 10]
 
-`demo`: mean and 95th percentile of the distance to the true surface, both ways (the true one is sampled where
-rays of training cameras end), in the asset's voxels, and the mean angle between normals; before, where along
-the true normals the asset's density reaches some levels: what no mesh of it can better.
-`views`: silhouette IoU with the volume, PSNR of the mesh's picture (2 x 2 rays a pixel) and of the volume's,
-both against the photographs. `colours`: which direction, or mean of directions, gives a place the nearest
-colour.
+`demo`: mean and 95th percentile of the distance to the true surface, both ways, in the asset's voxels, and
+the mean angle between normals. The true surface is sampled where rays of training cameras end. Before that:
+where the asset's density reaches some levels along the true normals, which no mesh of it can improve on.
+`views`: silhouette IoU with the volume, and PSNR against the photographs, of the mesh's picture (2 x 2 rays a
+pixel) and of the volume's. `colours`: the direction, or the mean of directions, that gives a place the
+nearest colour.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ import open3d
 from PIL import Image
 
 from exporters.formats.ply import read_ply
-from exporters.progress import silent
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface import shaded_colours as surface_colour
 from exporters.surface.asset_surface import AssetSurface, Removed
@@ -33,15 +32,16 @@ from exporters.surface.marching_cubes import code_and_slope, voxel_size
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
+from player.progress import silent
 from player.render import Renderer
 
 SHARP = 2
-"""Rays a pixel along each side, in pictures of a mesh: photographs have no jagged edges either."""
+"""Rays of a pixel along each side in pictures of a mesh, because photographs have no jagged edges either."""
 LEVELS = (10.0, 20.0, 30.0, 40.0, 60.0, 100.0)
 
 
 def meshes(asset: Asset, methods: list[str]) -> Iterator[tuple[str, TriangleMesh, float]]:
-    """Name, mesh, seconds of the processor."""
+    """Yield the name and the mesh of each method, and its seconds of processor time."""
     surface = AssetSurface(asset, silent)
     for method in methods:
         start = time.process_time()
@@ -55,18 +55,18 @@ def meshes(asset: Asset, methods: list[str]) -> Iterator[tuple[str, TriangleMesh
 
 
 def made_again(surface: AssetSurface, method: str) -> tuple[TriangleMesh, Removed]:
-    """The surface by the method of this name, as `vfr-export --method` knows it."""
+    """Return the surface by the method that `vfr-export --method` calls so."""
     return surface.from_depth() if method == "tsdf" else surface.from_density()
 
 
 def cameras_of(asset: Asset, path: Path | None) -> list[Camera]:
-    """Those of a file, or the training cameras."""
+    """Return the cameras of a file, or the training cameras."""
     width, height = asset.manifest.view_size
     return read_cameras(path or asset.path("cameras.json"), (width, height))
 
 
 def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which pixels hit [n] bool, and of those place, normal and sRGB colour (0..1) on the mesh."""
+    """Return which pixels are hit, [n] bool, and their place, normal and sRGB colour (0..1) on the mesh."""
     rays_o, rays_d = camera.rays()
     rays = np.concatenate([rays_o, rays_d], axis=1).astype(np.float32)
     answer = caster(mesh).cast_rays(TENSOR(rays))
@@ -81,7 +81,7 @@ def cast(mesh: TriangleMesh, camera: Camera) -> tuple[np.ndarray, np.ndarray, np
     return hit, places, normals / np.linalg.norm(normals, axis=-1, keepdims=True), colours
 
 
-TENSOR: Any = open3d.core.Tensor  # Open3D's stubs know less than its code
+TENSOR: Any = open3d.core.Tensor  # Open3D's stubs lack some of its code
 _CASTERS: dict[int, Any] = {}
 
 
@@ -103,7 +103,7 @@ def true_normals(points: np.ndarray) -> np.ndarray:
 
 
 def true_surface(camera: Camera) -> np.ndarray:
-    """[n, 3] where a camera's rays end, world frame."""
+    """Return the points [n, 3] where a camera's rays end, in the world's frame."""
     from vfr_bake.data.demo import trace
 
     _, distance = trace(camera)
@@ -113,7 +113,7 @@ def true_surface(camera: Camera) -> np.ndarray:
 
 
 def bench_levels(asset: Asset, points: np.ndarray) -> None:
-    """How far before the true surface the density reaches a level, coming from outside."""
+    """Print how far in front of the true surface the density reaches each level, coming from outside."""
     grid, voxel = asset.grid, voxel_size(asset.grid) * asset.scale
     normals, inverse = true_normals(points), np.linalg.inv(asset.world_from_model)
     along = np.arange(8, -8.01, -0.1)
@@ -183,7 +183,7 @@ def bench_views(asset: Asset, methods: list[str], cameras: list[Camera], photogr
 
 
 def pictured(mesh: TriangleMesh, camera: Camera, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels the mesh covers by half or more [n] bool, and the picture [n, 3], 0..1."""
+    """Return which pixels the mesh covers by half or more, [n] bool, and the picture [n, 3] in 0..1."""
     hit, _, _, colours = cast(mesh, camera.resized(camera.width * SHARP, camera.height * SHARP))
     picture = np.tile(background, (len(hit), 1))
     picture[hit] = colours
@@ -193,7 +193,7 @@ def pictured(mesh: TriangleMesh, camera: Camera, background: np.ndarray) -> tupl
 
 
 def bench_colours(asset: Asset, method: str, cameras: list[Camera]) -> None:
-    """Colours at what test cameras see, by how many directions are averaged, against the volume's picture."""
+    """Print how near colours are to the volume's pictures, by the number of directions averaged."""
     surface = AssetSurface(asset, silent)
     mesh, _ = made_again(surface, method)
     places, normals, truth = [], [], []

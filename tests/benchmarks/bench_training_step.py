@@ -1,13 +1,13 @@
-"""Where the time of a training step goes, and how many times as fast as another version's it is.
+"""Where the time of a training step goes, and how much faster it is than in another version.
 
     python tests/benchmarks/bench_training_step.py lego/ --begin 1200 --threads 1
     python tests/benchmarks/bench_training_step.py lego/ --against ../before
 
-A process for each version trains with default settings up to step `--begin`; then they take turns, a few
-steps each, so that whatever else the machine does falls on all of them. Figures are medians over the turns.
-Parts are timed by the thread that calls them, and the sums include what is compiled in the first steps of
-neither. On two threads (`--threads 2`) the next step is drawn and sampled beside the loss, so that parts add
-up to more than the step.
+A process for each version trains with default settings up to step `--begin`. Then they take turns of a few
+steps, so that other work of the machine affects all of them alike. Figures are medians over the turns. Parts
+are timed by the thread that calls them. Compiling in the first steps is in no figure. On two threads
+(`--threads 2`) the next step is drawn and sampled beside the loss, so that the parts add up to more than the
+step.
 """
 
 from __future__ import annotations
@@ -100,11 +100,11 @@ class Training:
         )
 
     def ready(self) -> None:
-        """Wait until it is trained so far."""
+        """Wait until the training has come to step `--begin`."""
         self._answer()
 
     def steps(self, n: int) -> dict[str, float]:
-        """Means over `n` steps, times in milliseconds."""
+        """Train `n` steps and return their mean figures, times in milliseconds."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{n}\n")
         self._process.stdin.flush()
@@ -120,7 +120,7 @@ class Training:
 
 
 def measure(options: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Medians of each version's figures."""
+    """Return the medians of each version's figures."""
     here = Path(__file__).parents[2]
     checkouts = {"this version": here} | {str(path): path for path in options.against}
     trainings = {name: Training(checkout, options) for name, checkout in checkouts.items()}

@@ -1,4 +1,4 @@
-"""An asset that can be exported whole: the shells of the player's tests, with a box for a mesh."""
+"""Assets to export: the shells of the player's tests with a box for a mesh, a ball and a box."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ BOX = ((1.25, 2.25, 3.0), (1.75, 2.5, 4.0))
 
 BALL_CENTRE, BALL_RADIUS = (0.05, -0.03, 0.02), 0.6
 CUBE_LOW, CUBE_HIGH = (-0.5, -0.4, -0.6), (0.5, 0.3, 0.2)
-"""Model frame."""
+"""Solids of the assets of a ball and a box, model frame."""
 
 
 @pytest.fixture(scope="session")
 def shells_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Do not change it. World from model is a quarter turn, a scale of 2 and a translation."""
+    """Write the asset of the shells, which tests must not change.
+
+    World from model is a quarter turn, a scale of 2 and a translation.
+    """
     folder = tmp_path_factory.mktemp("exports") / "asset"
     vertices, codes, features = shells.shells()
     coords, masks, _ = pack_vertices(vertices)
@@ -54,11 +57,11 @@ def opened(shells_asset: Path) -> Asset:
 
 @pytest.fixture(scope="session")
 def ball_asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    """A ball in two blocks along each axis. Do not change it."""
+    """Write a ball that spans two blocks of marching cubes along each axis. Tests must not change it."""
     return write_solid(tmp_path_factory.mktemp("ball") / "asset", ball(BALL_CENTRE, BALL_RADIUS), 72)
 
 
 @pytest.fixture(scope="session")
 def cube_asset(tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    """A box of three different edges. Do not change it."""
+    """Write a box with edges of three different lengths. Tests must not change it."""
     return write_solid(tmp_path_factory.mktemp("cube") / "asset", cube(CUBE_LOW, CUBE_HIGH), 48)

@@ -8,8 +8,9 @@ from exporters.shapes.mesh import TriangleMesh
 
 
 def tetrahedron() -> TriangleMesh:
-    """Corners at the origin and on the axes at 1, 2 and 3; outward faces; grey 128, red, green,
-    half-transparent blue.
+    """Return a tetrahedron with outward faces.
+
+    Its corners are the origin (grey 128) and 1, 2 and 3 on the axes (red, green, half-transparent blue).
     """
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -20,21 +21,21 @@ def tetrahedron() -> TriangleMesh:
 
 
 def random_mesh(n_vertices: int, n_faces: int, seed: int = 0) -> TriangleMesh:
-    """Every vertex is used if `n_vertices` is a multiple of 3 and at most 3 `n_faces`."""
+    """Return a random mesh. Every vertex is used if `n_vertices` is a multiple of 3 and <= 3 * `n_faces`."""
     random = np.random.default_rng(seed)
     vertices = random.normal(scale=4, size=(n_vertices, 3))
     normals = random.normal(size=(n_vertices, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     faces = np.argsort(random.random((n_faces, n_vertices)), axis=1)[:, :3].astype(
         np.int32
-    )  # three different
+    )  # three different vertices
     n_whole = min(n_vertices // 3, n_faces)
     faces[:n_whole] = random.permutation(n_vertices)[: 3 * n_whole].reshape(-1, 3)
     return TriangleMesh(vertices, faces, normals, random.integers(0, 256, (n_vertices, 4)).astype(np.uint8))
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> TriangleMesh:
-    """An axis-aligned box: 8 corners, 12 outward faces, a colour a corner."""
+    """Return an axis-aligned box: 8 corners, each of its own colour, and 12 outward faces."""
     corners = np.array(list(np.ndindex(2, 2, 2)), np.float64)
     faces = []
     for axis in range(3):
@@ -54,7 +55,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Tr
 
 
 def sphere(n: int = 40, radius: float = 1.0) -> TriangleMesh:
-    """Latitude and longitude, closed, about 2 n^2 faces; red grows with z, green with x."""
+    """Return a closed sphere (latitude and longitude, about 2 n^2 faces); red grows with z, green with x."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, n + 1)[1:-1], np.arange(n) * 2 * np.pi / n, indexing="ij")
     ring = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     unit = np.concatenate([[[0, 0, 1.0]], ring.reshape(-1, 3), [[0, 0, -1.0]]])

@@ -1,4 +1,4 @@
-"""Assets of solids whose surface is known: density falls by a fixed factor a voxel of distance from them."""
+"""Assets of solids with a known surface: density falls by a fixed factor per voxel of distance from it."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tests.vertex_grids import arrays_of
 
 DENSITY_RANGE = (-2.0, 6.0)
 AT_SURFACE = 4.0
-"""Logarithm of the density where the distance is 0."""
+"""Logarithm of the density at the surface, where the distance is 0."""
 SLOPE = 1.5
-"""By how much that falls in a voxel."""
+"""Decrease of the logarithm of the density per voxel of distance."""
 STORED = 3.0
-"""Voxels to both sides of the surface within which vertices are stored."""
+"""Distance to both sides of the surface, in voxels, within which vertices are stored."""
 WORLD_FROM_MODEL = [[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, 2.0], [0.0, 0.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
 Distance = Callable[[np.ndarray], np.ndarray]
-"""[n, 3] points, model frame -> [n] signed distance, model units."""
+"""Function from points [n, 3], model frame, to signed distances [n], model units."""
 
 
 def ball(centre: tuple[float, float, float], radius: float) -> Distance:
@@ -41,12 +41,12 @@ def cube(low: tuple[float, float, float], high: tuple[float, float, float]) -> D
 
 
 def offset_of(level: float, resolution: int) -> float:
-    """Distance at which the density is `level`, model units: positive outside."""
+    """Return the signed distance at which the density is `level`, in model units; positive outside."""
     return (AT_SURFACE - math.log(level)) / SLOPE * 2 / resolution
 
 
 def write_solid(folder: Path, distance: Distance, resolution: int, n_cameras: int = 12) -> Asset:
-    """An asset of the solid, seen from all around, above and below; its features are linear in the place."""
+    """Write an asset of the solid, with features linear in the place, and cameras all around it."""
     axis = np.arange(resolution + 1)
     vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     voxels = distance(vertices / resolution * 2 - 1) * resolution / 2
@@ -73,7 +73,7 @@ def write_solid(folder: Path, distance: Distance, resolution: int, n_cameras: in
 
 
 def cameras_bytes(n: int) -> bytes:
-    """Cameras on a spiral from above to below the middle of the world, 64 x 64."""
+    """Return a file of n cameras of 64 x 64 pixels, on a spiral from above to below the scene's middle."""
     frames = []
     for i in range(n):
         height, angle = 0.9 - 1.8 * (i + 0.5) / n, math.pi * (3 - math.sqrt(5)) * i

@@ -1,4 +1,4 @@
-"""`vfr-export` as a user calls it, on an asset whose mesh is known."""
+"""Tests of `vfr-export` as a user calls it, on an asset whose mesh is known."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from player.cameras.transforms import write_cameras
 from tests.exporters.meshes import tetrahedron
 from tests.vertex_grids import arrays_of
 
-# The asset's mesh is in the world already; an exporter that applies this again is far off.
+# The asset's mesh is in the world frame already; an exporter that applied this again would be far off.
 WORLD_FROM_MODEL = (
     (0.0, -2.0, 0.0, 10.0),
     (2.0, 0.0, 0.0, 20.0),
@@ -31,7 +31,7 @@ WORLD_FROM_MODEL = (
 
 
 def write_small_asset(folder: Path, mesh: bytes) -> Path:
-    """One stored cell, a head that nobody opens, and `mesh`: all that `vfr-export` looks at."""
+    """Write an asset of one stored cell, a head that is never opened, and `mesh`, as these tests need it."""
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     coords, masks, _ = pack_vertices(corners)
     codes, features = np.full(8, 200, np.uint8), np.zeros((8, 4), np.int8)
@@ -109,7 +109,7 @@ def test_unknown_suffix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_damaged_mesh_leaves_nothing_behind(
     damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whether the file no longer is what was baked, or what was baked is no mesh."""
+    """A mesh file that changed after the bake, or that never was a mesh, is refused and leaves no file."""
     data = ply_bytes(tetrahedron())
     asset = write_small_asset(tmp_path / "asset", data[:-1] if damage == "no mesh" else data)
     if damage == "cut short":
@@ -143,7 +143,7 @@ def test_usage() -> None:
 
 
 def test_help_needs_no_numpy() -> None:
-    """So it is quick: importing numpy is most of what a start costs."""
+    """`--help` does not import numpy, which would take most of the start-up time."""
     program = "import sys; sys.modules['numpy'] = None; from exporters.cli import main; main(['--help'])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert all(name in done.stdout for name in (*cli.FORMATS, *cli.FOLDERS))

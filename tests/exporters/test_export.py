@@ -1,4 +1,4 @@
-"""`vfr-export`: which settings go with which format, what it says, and what it refuses, in one line."""
+"""Tests of `vfr-export`: which settings go with which format, what it prints, and one-line refusals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Run; exit code 1, and one line on stderr, which is returned."""
+    """Run `vfr-export`, check for exit code 1 and one line on stderr, and return that line."""
     assert cli.main(arguments) == 1
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.startswith("vfr-export: error: ")
@@ -38,7 +38,7 @@ def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_crop_and_what_it_prints(
     shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A centre that begins with a minus too: argparse would take it for an option."""
+    """A crop is applied and reported, also if it begins with a minus, which argparse takes for an option."""
     target = tmp_path / "part.ply"
     arguments = [str(shells_asset), str(target), "--crop", "-8.5,2.375,3.5,20,4,4", "--method", "baked"]
     assert cli.main(arguments) == 0
@@ -121,7 +121,7 @@ def test_targets_that_cannot_be_written(
 def test_read_only_folder_and_file(
     shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the system answers to anyone but root, who may write everywhere."""
+    """Read-only targets are refused. `os.access` is replaced, because root may write everywhere."""
 
     def access(path: str | Path, mode: int) -> bool:
         return not mode & os.W_OK or bool(Path(path).stat().st_mode & stat.S_IWUSR)
@@ -234,7 +234,7 @@ def test_options_of_every_format_are_checked() -> None:
 def test_examples_run(
     source: str, shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every command of --help and of docs/export.md, with the names that they use."""
+    """Every command in --help and docs/export.md runs, with files of the names that it uses."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(shells_asset, "out")
     Path("transforms_test.json").write_bytes((shells_asset / "cameras.json").read_bytes())
@@ -245,9 +245,9 @@ def test_examples_run(
     lines = re.findall(r"^ *vfr-export (.*?)(?:   +.*|  # .*)?$", text, re.MULTILINE)
     assert len(lines) >= 10
     for line in lines:
-        # the boxes of the examples are those of a scene around the origin
+        # the examples' boxes are for a scene around the origin
         line = re.sub(r"--crop [-\d.,]+", "--crop 1.5,2.375,3.5,9,9,9,30", line)
-        # the asset's own mesh is a box that is nowhere near its shells: nothing there has a colour
+        # the asset's own mesh is a box far from its shells, where nothing has a colour
         line = line.replace("--texture 2048", "--texture 64 --method density --faces 2000")
         small = ["--size", "6x5", "--views", "0:2"] if "--format exr" in line else []
         assert cli.main([*shlex.split(line), *small, "--force"]) == 0, line

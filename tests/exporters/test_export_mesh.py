@@ -1,4 +1,4 @@
-"""`vfr-export` of surfaces made again, textures and levels of detail, as a user calls it."""
+"""Tests of `vfr-export` as a user calls it: surfaces of the field, textures and levels of detail."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.exporters.test_export import fails
 
 
 def world_box(level: float) -> np.ndarray:
-    """[2, 3] where the surface of the asset's box is, world frame."""
+    """Return the bounds [2, 3], world frame, of the surface of the asset's box at a level of density."""
     offset = offset_of(level, 48)
     corners = np.array([np.array(CUBE_LOW) - offset, np.array(CUBE_HIGH) + offset])
     matrix = np.array(WORLD_FROM_MODEL)
@@ -77,9 +77,9 @@ def test_levels_of_detail(cube_asset: Asset, tmp_path: Path, capsys: pytest.Capt
 def test_a_texture_has_the_vertex_colours_of_the_surface(
     suffix: str, cube_asset: Asset, tmp_path: Path
 ) -> None:
-    """The same surface twice, with colours at its corners and in a picture: at the corners they agree, but
-    for the directions: a corner fits what all cameras see, a texel is the mean of four, of a head whose
-    colours turn with them by up to 60 levels."""
+    """A texture has about the colours of the same surface's vertices. They differ by directions only: a
+    vertex fits what all cameras see, a texel is the mean of four cameras, and the head's colours change with
+    the direction by up to 60 levels."""
     target = tmp_path / f"a.{suffix}"
     asked = shlex.split("--level 20 --faces 1500 --texture 256")
     assert cli.main([str(cube_asset.folder), str(target), *asked]) == 0

@@ -1,7 +1,8 @@
-"""The rows of docs/numerics.md, each declared beside the test that checks it, and the worst cases met.
+"""Rows of docs/numerics.md, each declared beside the test that checks it, and the worst errors that tests
+have met.
 
-`pytest --numerics FILE` writes what the tests of a run have met, and
-`python -m tests.numerics.document` makes the tables of the page.
+`pytest --numerics FILE` writes what the tests of a run have met, and `python -m tests.numerics.document`
+makes the tables of the page.
 """
 
 from __future__ import annotations
@@ -15,23 +16,23 @@ from typing import Any
 import numpy as np
 
 Met = dict[str, dict[str, dict[str, dict[str, Any]]]]
-"""By section, quantity and test, as `tests/numerics/test_rays.py::test_name`: the worst error that was met,
-in the unit of the bound and None where it is no number, and the case: the parameters of the test."""
+"""Errors by section, quantity and test (such as `tests/numerics/test_rays.py::test_name`): the worst one in
+the unit of the bound, None if the promise is not about a number, and its case: the test's parameters."""
 MET: Met = {}
-"""What the tests of this process have met."""
+"""Errors that the tests of this process have met."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is promised of a quantity."""
+    """The promise for a quantity: one row of a table."""
 
     section: str
     quantity: str
     range: str = ""
     bound: float | None = None
-    """The largest error that is allowed, 0 for exact; None where what holds is no number."""
+    """Largest error that is allowed, 0 for exact; None if the promise is not about a number."""
     unit: str = ""
-    """What the bound is a number of; where there is no bound, what is so: "the same bytes", "refused"."""
+    """Unit of the bound; without a bound, what is promised: "the same bytes", "refused"."""
     at_ends: str = ""
     """What happens at the ends of the range."""
 
@@ -39,10 +40,9 @@ class Row:
         """Assert that `found` is within the bound, and keep the largest error.
 
         Args:
-            found: [any shape] numbers; or errors, where nothing is wanted.
-            wanted: the numbers that they should be, of the same shape. Equal infinities have no error; NaN is
-                never right.
-            of: the unit of the bound, of a shape that fits, not negative.
+            found: [any shape] numbers; or errors, if `wanted` is not given.
+            wanted: the right numbers, of the same shape. Equal infinities have no error; NaN is never right.
+            of: the unit of the bound, of a shape that broadcasts, not negative.
         """
         assert self.bound is not None, "a row without a bound holds, or does not"
         found, wanted, of = (np.asarray(array, np.float64) for array in (found, wanted, of))
@@ -59,7 +59,7 @@ class Row:
         self._keep(worst)
 
     def holds(self, condition: Any = True) -> None:
-        """Assert that this is true, everywhere if it is an array."""
+        """Assert that the condition is true, in every element if it is an array."""
         assert np.all(np.asarray(condition)), f"{self.quantity}: expected {self.unit}"
         self._keep(None)
 
@@ -73,7 +73,7 @@ class Row:
 
 
 def merged(met: Met, more: Met) -> Met:
-    """What both have met; `more` counts for a test that is in both.
+    """Return what either has met; for a test that is in both, `more` counts.
 
     >>> merged({"Rays": {"entry": {"a": {}, "b": {}}}}, {"Rays": {"entry": {"b": {"worst": 1}}}})
     {'Rays': {'entry': {'a': {}, 'b': {'worst': 1}}}}
@@ -88,7 +88,7 @@ def merged(met: Met, more: Met) -> Met:
 
 
 def write(path: Path, met: Met) -> None:
-    """Put what was met into the file; what other tests have met stays in it."""
+    """Write what was met to the file, in which the entries of other tests stay."""
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     text = json.dumps(merged(before, met), indent=1, sort_keys=True, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""docs/numerics.md from the rows that the tests declare and the worst cases that they have met.
+"""Writes docs/numerics.md from the rows that tests declare and the worst errors that they have met.
 
 <!-- numerics: SECTION -->
 the table of the rows of this section
@@ -26,14 +26,14 @@ HEADER = (
 
 
 def modules() -> list[str]:
-    """The test modules that declare rows."""
+    """Return the names of the test modules that declare rows."""
     paths = sorted((REPOSITORY / "tests").rglob("test_*.py"))
     found = [path for path in paths if DECLARES.search(path.read_text(encoding="utf-8"))]
     return [".".join(path.relative_to(REPOSITORY).with_suffix("").parts) for path in found]
 
 
 def declared() -> dict[str, list[tuple[str, Row]]]:
-    """The name and the row of all that a module declares, in its order."""
+    """Return, for each module, the names and rows that it declares, in its order."""
     return {
         module: [
             (name, row) for name, row in vars(importlib.import_module(module)).items() if isinstance(row, Row)
@@ -43,7 +43,7 @@ def declared() -> dict[str, list[tuple[str, Row]]]:
 
 
 def line(row: Row, tests: dict[str, dict]) -> str:
-    """The row of the table.
+    """Return a row as a line of the table.
 
     >>> entry = {"tests/numerics/test_rays.py::test_entry": {"worst": 2.512, "case": "along x"}}
     >>> line(Row("Rays", "entry", "any", 8, "u", "exact"), entry)
@@ -64,7 +64,7 @@ def line(row: Row, tests: dict[str, dict]) -> str:
 
 
 def rendered(text: str, rows: list[Row], met: Met) -> str:
-    """The page with its tables made anew."""
+    """Return the page with its tables made anew."""
 
     def block(found: re.Match[str]) -> str:
         lines = [

@@ -1,4 +1,4 @@
-"""A box full of one density and one feature, 16 cells across, in steps of an eighth of a cell."""
+"""Box filled with one density and one feature, 16 cells across, marched in steps of an eighth of a cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FEATURE = 100
 
 
 def fog(optical: float, resolution: int = RESOLUTION, step: float = 2 / 128) -> SparseGrid:
-    """`optical` is the optical depth of one step; 0 is the least that a manifest can say."""
+    """Return a fog. `optical` is the optical depth of a step; 0 stands for the least that is allowed."""
     vertices = np.argwhere(np.ones((resolution + 1,) * 3))
     coords, masks, _ = pack_vertices(vertices)
     low = -80.0 if optical == 0 else float(np.clip(np.log(optical / step), -80, 79))

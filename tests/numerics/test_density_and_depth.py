@@ -1,5 +1,5 @@
-"""Density and optical depth at their ends: the kernel, its twin, the GPU's torch and the player, against
-mpmath with 50 digits."""
+"""Density and optical depth at the ends of their ranges: the kernel, its twin, torch's version for GPUs and
+the player, compared with mpmath with 50 digits."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ DEPTHS: dict[str, list[float]] = {
 
 @cache
 def exact(depths: tuple[float, ...]) -> tuple[list[mpmath.mpf], mpmath.mpf]:
-    """Weights and opacity."""
+    """Return weights and opacity."""
     tau, weights = mpmath.mpf(0), []
     for depth in depths:
         weights.append(mpmath.exp(-tau) * -mpmath.expm1(-mpmath.mpf(depth)))
@@ -121,8 +121,9 @@ def one_ray(function: Composite, depths: torch.Tensor, features: torch.Tensor) -
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", DEPTHS)
 def test_weights_are_those_of_50_digits(function: Composite, dtype: torch.dtype, name: str) -> None:
-    """Relative error of a weight: a rounding in each sum of depths before it, times the depth, and four of
-    its own; below the least normal number nothing is promised, and less than it is lost."""
+    """Weights are those of 50 digits. The relative error has a rounding for each sum of depths before the
+    sample, times the depth, and four of its own. Below the least normal number nothing is promised, and
+    smaller amounts may be lost."""
     depths = torch.tensor(DEPTHS[name], dtype=dtype)
     _, opacity, weights = one_ray(function, depths, torch.ones(len(depths), 1, dtype=dtype))
     expected, alpha = exact(tuple(depths.tolist()))
@@ -141,8 +142,8 @@ def test_weights_are_those_of_50_digits(function: Composite, dtype: torch.dtype,
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", [name for name in DEPTHS if len(DEPTHS[name]) < 100])
 def test_gradients_are_those_of_50_digits(function: Composite, dtype: torch.dtype, name: str) -> None:
-    """Of L = sum_c g_c F_c + a A + sum_i v_i w_i: dL/d d_i = T_{i+1} u_i - sum_{j>i} w_j u_j + a exp(-tau),
-    with u_i = v_i + g.F_i."""
+    """Gradients are those of L = sum_c g_c F_c + a A + sum_i v_i w_i, in 50 digits: dL/d d_i = T_{i+1} u_i -
+    sum_{j>i} w_j u_j + a exp(-tau), with u_i = v_i + g.F_i."""
     torch.manual_seed(0)
     depths = torch.tensor(DEPTHS[name], dtype=dtype, requires_grad=True)
     features = torch.randn(len(depths), 3, dtype=dtype, requires_grad=True)
@@ -183,7 +184,7 @@ def test_two_half_steps_are_one_step(function: Composite, dtype: torch.dtype) ->
 
 @pytest.mark.parametrize("function", COMPOSITES)
 def test_a_nan_stays_in_its_ray(function: Composite) -> None:
-    """One bad cell spoils the rays that meet it, which the optimiser then skips, and no other."""
+    """A NaN in one cell spoils only the rays that meet the cell, and the optimiser then skips these."""
     sigmas = torch.tensor([1.0, 2.0, math.nan, 1.0, 3.0, 0.5], requires_grad=True)
     features = torch.ones(6, 2, requires_grad=True)
     starts, counts = torch.tensor([0, 2, 4]), torch.tensor([2, 2, 2])
@@ -199,7 +200,7 @@ def test_a_nan_stays_in_its_ray(function: Composite) -> None:
 @pytest.mark.parametrize("logit", [math.inf, -math.inf, 1e30, -1e30, 15.0, np.nextafter(15.0, 16.0), -15.0])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_an_infinite_pre_activation_is_clamped(logit: float, dtype: torch.dtype) -> None:
-    """The densest is opaque in one step, the gradient is that of the clamped value: it can come back."""
+    """An infinite pre-activation is clamped, with the gradient of the clamped value: it can come back."""
     x = torch.tensor([logit], dtype=dtype, requires_grad=True)
     y = TruncatedExp.apply(x)
     y.sum().backward()
@@ -209,7 +210,7 @@ def test_an_infinite_pre_activation_is_clamped(logit: float, dtype: torch.dtype)
 
 
 def test_a_nan_pre_activation_stays_one() -> None:
-    """It is not hidden: the loss becomes NaN, and the step is skipped and counted."""
+    """A NaN stays NaN, so that the loss becomes NaN, and the step is skipped and counted."""
     NAN_PRE_ACTIVATION.holds(math.isnan(TruncatedExp.apply(torch.tensor([math.nan])).item()))
 
 
@@ -229,8 +230,8 @@ def test_the_players_opacity_is_that_of_50_digits(tau: float) -> None:
     "optical", [0.0, 1e-38, 1e-8, 1e-4, 0.09, 0.0999, 0.1001, 0.5, 6.0, 7.0, 1e3, 1e6], ids=str
 )
 def test_a_fog_of_one_density(module: object, optical: float) -> None:
-    """A box of one density along x: tau is samples times optical, the march stops behind MAX_TAU, and the
-    weights are those of 50 digits."""
+    """In a fog along x, tau is `optical` times the samples, the march stops behind MAX_TAU, and the opacity
+    is that of 50 digits."""
     from tests.numerics.fog import fog
 
     grid = fog(optical)
@@ -243,7 +244,7 @@ def test_a_fog_of_one_density(module: object, optical: float) -> None:
     FOG_SAMPLES.check(result.n_density_samples[0], taken)
     wanted = -mpmath.expm1(-mpmath.mpf(step_tau) * int(result.n_density_samples[0]))
     FOG.check(abs(mpmath.mpf(float(result.opacity[0])) - wanted), of=float(wanted) + 1e-39)
-    if len(result.hits):  # one constant feature: the weights' sum
+    if len(result.hits):  # the feature is constant: the weights' sum
         total = float(result.features[0, 0]) / 100
         assert total == pytest.approx(float(result.opacity[0]), rel=2 * 2**-23 * taken + 1e-6)
 
@@ -252,7 +253,7 @@ def test_a_fog_of_one_density(module: object, optical: float) -> None:
     "weights", [[1e-38, 1.0, 1e-38], [1.0, 1e-45, 1.0], [1.0] * 7, [2.0**-i for i in range(60)]]
 )
 def test_bins_of_ties_and_of_weights_below_resolution(weights: list[float]) -> None:
-    """Equal masses keep the mean to float64, however small the parts."""
+    """Equal masses keep the mean place to float64's precision, however small the parts are."""
     s = np.arange(1, len(weights) + 1, dtype=np.float32)
     w = np.float32(weights)
     samples = Samples(np.zeros(len(s), np.int64), s, w)

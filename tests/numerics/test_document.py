@@ -1,4 +1,4 @@
-"""docs/numerics.md promises what the tests declare, no more, and has the worst cases that they have met."""
+"""docs/numerics.md promises what the tests declare and no more, and shows the worst errors they have met."""
 
 from __future__ import annotations
 

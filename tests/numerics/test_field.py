@@ -1,4 +1,4 @@
-"""Contraction, spherical harmonics and hash grid at their ends, against mpmath and float64 loops."""
+"""Contraction, spherical harmonics and hash grid at their ends, compared with mpmath and float64 loops."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ HASH = Row(
 
 
 def exact_contraction(point: tuple[float, ...]) -> list[float]:
-    """u = (c(x) + 2) / 4 with 50 digits."""
+    """Return u = (c(x) + 2) / 4 with 50 digits."""
     x = [mpmath.mpf(c) for c in point]
     norm = mpmath.sqrt(mpmath.fsum(c * c for c in x))
     scale = mpmath.mpf(1) if norm <= 1 else (2 - 1 / norm) / norm
@@ -88,7 +88,7 @@ def test_contraction_is_equation_10_with_50_digits(size: float, direction: tuple
 
 @given(st.tuples(*[st.floats(-2, 2, width=32)] * 3))
 def test_contraction_keeps_the_order_along_a_ray(point: tuple[float, ...]) -> None:
-    """Twice as far away is farther out, across the unit sphere too."""
+    """A point twice as far away is contracted farther out, also across the unit sphere."""
     assume(math.hypot(*point) >= 1e-3)
     once = contracted_unit(*np.float32(point), ONE)
     twice = contracted_unit(*np.float32([2 * c for c in point]), ONE)
@@ -102,8 +102,8 @@ NEAR_POLES = np.array([[1e-8, 0, 1], [0, -1e-20, -1], [1e-30, 1e-30, 1], [-0.0, 
 
 @pytest.mark.parametrize("degree", range(1, MAX_DEGREE + 1))
 def test_harmonics_at_the_poles(degree: int) -> None:
-    """At a pole only m = 0 is left; float32 by torch is within 2e-5 of float64, coefficients being up to 200
-    with powers up to 7."""
+    """At a pole only m = 0 is left. torch's float32 is within 2e-5 of float64, because coefficients are up to
+    200 and powers up to 7."""
     dirs = np.concatenate([POLES, NEAR_POLES])
     exponents, coefficients = sh_monomials(degree)
     ours = np.prod(dirs[:, None, :] ** exponents, axis=-1) @ coefficients
@@ -116,7 +116,7 @@ def test_harmonics_at_the_poles(degree: int) -> None:
 
 
 def test_harmonics_are_orthonormal_in_float32() -> None:
-    """By quadrature that is exact for the products; what training computes, summed in float64."""
+    """Harmonics as in training are orthonormal, by a quadrature in float64 that is exact for products."""
     z, weight_z = np.polynomial.legendre.leggauss(MAX_DEGREE)
     phi = np.arange(2 * MAX_DEGREE) * (np.pi / MAX_DEGREE)
     z, phi = (axis.ravel() for axis in np.meshgrid(z, phi, indexing="ij"))
@@ -136,7 +136,7 @@ def small_grid(dtype: torch.dtype, resolution: int) -> HashGrid:
 
 
 def hard_coordinates(resolution: int) -> list[float]:
-    """0, 1, cell borders and the numbers beside them."""
+    """Return 0, 1, cell borders, and the numbers next to these."""
     borders = [0.0, 1 / resolution, 0.25, 0.5, (resolution - 1) / resolution, 1.0]
     beside = [float(np.nextafter(np.float32(b), np.float32(to))) for b in borders for to in (0, 1)]
     return sorted({float(np.float32(c)) for c in [*borders, *beside, 1e-45, 1e-30]})
@@ -145,8 +145,7 @@ def hard_coordinates(resolution: int) -> list[float]:
 @pytest.mark.parametrize("resolution", [40, 512, 4096])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
-    """Features are exact for the position as the type holds it, which is off by N 2^-24 cells at a resolution
-    of N."""
+    """At borders, features are exact for the rounded position, which is off by N 2^-24 cells for N cells."""
     grid = small_grid(dtype, resolution)
     some = hard_coordinates(resolution)
     random = np.random.default_rng(0)
@@ -168,19 +167,19 @@ def test_hash_grid_at_borders(dtype: torch.dtype, resolution: int) -> None:
 
 
 def test_hash_grid_does_not_jump_at_a_cell_border() -> None:
-    """On both sides of every border of the finest level the features differ by the step times the slope."""
+    """Features on both sides of a border of the finest level differ by the step times the slope at most."""
     grid = small_grid(torch.float32, 4096)
     borders = np.arange(1, 4096, 7, dtype=np.float64) / 4096
     sides = []
     for to in (0, 1):
         x = np.nextafter(borders.astype(np.float32), np.float32(to))
         sides.append(grid(torch.from_numpy(np.stack([x, np.full_like(x, 0.3), np.full_like(x, 0.7)], 1))))
-    # two ulps apart, entries within 1, two axes' rounding
+    # two ulps apart, entries within 1, roundings of two axes
     JUMP.check((sides[0] - sides[1]).detach(), of=4096 * UNIT)
 
 
 def test_points_a_rounding_outside_the_cube_are_served_from_its_last_cell() -> None:
-    """What contraction makes of points very far away, 2^-24 outside; the features differ by no more."""
+    """Points 2^-24 outside, which contraction makes of very distant points, have the last cell's features."""
     grid = small_grid(torch.float32, 4096)
     inside = torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 0.0]])
     outside = torch.tensor([[-UNIT, 1 + 2 * UNIT, 0.5], [1 + 2 * UNIT, 1.0, -UNIT]])
@@ -206,7 +205,7 @@ def test_gradient_of_the_table_at_borders_is_autograds() -> None:
 
 
 def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
-    """x xor y 2654435761 xor z 805459861, in Python's integers, at vertices whose products need 53 bits."""
+    """Hashes are x xor y 2654435761 xor z 805459861 in Python's integers, even if products need 53 bits."""
     size = 2**12
     vertices = [(0, 0, 0), (1, 2**20, 2**20), (2**20, 2**20 - 1, 1), (2**21, 2**21, 2**21 - 1)]
     grid = small_grid(torch.float32, 4096)

@@ -1,7 +1,7 @@
-"""Compiled code on arrays of more than 2^31 numbers: marches, fetches and training's kernels against numpy.
+"""Compiled code on arrays of more than 2^31 numbers: marches, fetches and training's kernels, compared with
+numpy.
 
-The arrays are holes in files: only the pages that are touched cost memory, and none of them is on a disk for
-long.
+The arrays are files with holes: only pages that are touched take memory, and none stays on a disk for long.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from vfr_bake.kernels.stored_features import (
 F32 = np.float32
 N_CHANNELS = 10
 LAST_IN_32_BITS = 2**31 // 729 - 1
-"""The last slot whose densities have indices below 2^31."""
+"""The last slot whose densities all have indices below 2^31."""
 MOST_SLOTS = bricks_per_axis(MAX_RESOLUTION) ** 3
-"""The most slots that a grid of the format may have."""
+"""The largest number of slots that a grid of the format may have."""
 MOST_ROWS = 2**31 - 1
 LARGE = "257^3 bricks of 729 densities and 2^31 - 1 vertices"
 FAR_SAMPLES = Row(
@@ -65,7 +65,7 @@ TOO_MANY = Row(
 
 
 class Zeros(Protocol):
-    """`np.zeros`, of which only what is touched takes memory."""
+    """Function like `np.zeros`, whose arrays take memory only where they are touched."""
 
     def __call__(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray: ...
 
@@ -78,14 +78,14 @@ def zeros(tmp_path: Path) -> Zeros:
         nonlocal n
         n += 1
         mapped = np.memmap(tmp_path / str(n), dtype, "w+", shape=shape)
-        (tmp_path / str(n)).unlink()  # the pages go when the array does
+        (tmp_path / str(n)).unlink()  # the pages are freed with the array
         return np.asarray(mapped)
 
     return make
 
 
 def grid_behind(zeros: Zeros, n_slots: int, n_rows: int, contracted: bool) -> SparseGrid:
-    """A grid of eight bricks, all cells live: the last of `n_slots`, with the last of `n_rows` features."""
+    """Return a grid of eight bricks, all cells live: the last of `n_slots`, and the last of `n_rows`."""
     rng = np.random.default_rng(0)
     resolution = 15
     slots = np.arange(n_slots - 8, n_slots, dtype=np.int32)
@@ -123,7 +123,7 @@ SIZES = pytest.mark.parametrize(
     [
         (LAST_IN_32_BITS + 1, 2**31 // N_CHANNELS),
         (LAST_IN_32_BITS + 9, 2**31 // N_CHANNELS + 5000),
-        (LAST_IN_32_BITS * 3, 2**30),  # where 32 bits wrap around to what is there, and elsewhere
+        (LAST_IN_32_BITS * 3, 2**30),  # 32 bits wrap around to stored slots, and to others
         (MOST_SLOTS, MOST_ROWS),
     ],
 )
@@ -150,7 +150,7 @@ def test_the_compiled_march_reaches_the_last_slot(
 @pytest.mark.parametrize("n_fetches", [2**31, 10**30])
 @pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
 def test_no_number_of_fetches_is_too_large(contracted: bool, n_fetches: int, zeros: Zeros) -> None:
-    """Nothing is allocated or addressed by it beyond the samples that a ray can have."""
+    """A number of fetches beyond the samples that a ray can have allocates and addresses nothing more."""
     grid = grid_behind(zeros, 8, 5000, contracted)
     rays = some_rays(40) if grid.contracted else random_rays(40)
     np.testing.assert_array_equal(
@@ -171,7 +171,7 @@ def test_fetches_of_the_bake_reach_the_last_brick(n_slots: int, n_rows: int, zer
 
 
 def test_stored_features_beyond_32_bits(zeros: Zeros) -> None:
-    """Composites of and steps on the last rows, as on the same rows alone."""
+    """Composites of the last rows, and steps on them, are those on the same rows alone."""
     n_rows = 2**31 // N_CHANNELS + 1000
     rng = np.random.default_rng(2)
     near = rng.integers(0, 1000, (50, 8)).astype(np.int32)
@@ -209,12 +209,12 @@ SCALES = np.array([7, 12, 30], F32)
 HASHED = np.array([False, False, True])
 MASK = 2**12 - 1
 NEAR = np.array([0, 1000, 4000])
-FAR = NEAR + np.array([2**30 - 500, 2**31 - 500, 2**32 + 77])  # rows; two channels or one in each
+FAR = NEAR + np.array([2**30 - 500, 2**31 - 500, 2**32 + 77])  # first rows of levels
 
 
 @pytest.mark.parametrize("n_channels", [1, 2])
 def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
-    """Looked up, scattered to and stepped far behind, as in a table of the same rows alone."""
+    """Lookups, scatters and steps far behind in a table are those in a table of the same rows alone."""
     rng = np.random.default_rng(3)
     points = rng.uniform(0, 1, (60, 3)).astype(F32)
     sizes = [9**3, 14**3, MASK + 1]
@@ -255,7 +255,7 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
 
 
 def test_what_is_counted_in_32_bits_fits() -> None:
-    """Numbers of bricks and the words of live cells; everything else that grows with a grid has 64."""
+    """Numbers of bricks and of words of live cells fit into 32 bits; all else that grows has 64."""
     assert MOST_SLOTS * 16 < 2**31
 
 

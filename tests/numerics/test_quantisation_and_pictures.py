@@ -1,4 +1,4 @@
-"""Codes, heads and pictures at their ends, and what must not change a picture."""
+"""Codes, heads and pictures at the ends of their ranges, and changes that must not change a picture."""
 
 from __future__ import annotations
 
@@ -93,11 +93,11 @@ TURNED_DEPTH = Row("Pictures", "depth of a grid turned by a quarter with its ray
 
 @given(st.floats(-80, 79), st.floats(1e-2, 160))
 def test_every_density_code_comes_back(low: float, width: float) -> None:
-    """From the float32 densities that a player computes, in any range that a manifest can say."""
+    """Each code is found from the float32 density that a player computes, in any range of a manifest."""
     high = min(low + width, 80.0)
     codes = np.arange(256)
     sigmas = decode_density(codes, (low, high)).astype(np.float64)
-    # float32 rounds the exponent to 80 * 2^-24, which is less than a step of the code in the narrowest range
+    # float32 rounds the exponent by up to 80 * 2^-24, less than a step of the code in the narrowest range
     DENSITY_CODES.check(encode_density(np.log(sigmas), (low, high)), codes)
 
 
@@ -116,7 +116,7 @@ def test_a_constant_channel_keeps_its_value(value: float) -> None:
     values = np.full((9, 1), value)
     step = code_step(values, 127)
     kept = whole_codes(latent(values / step)) * step
-    if 0 < abs(value) < 1e-300:  # a step of 1e-320 / 127 has seven bits left
+    if 0 < abs(value) < 1e-300:  # a step of 1e-320 / 127 has only seven bits
         np.testing.assert_allclose(kept, values, rtol=1e-2)
     else:
         CONSTANT.check(kept, values, of=np.abs(values))
@@ -136,7 +136,7 @@ def test_packed_codes_come_back(values: list[int], n_channels: int) -> None:
 
 
 def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
-    """Density code and features that grow by one a vertex along an axis: linear across every brick border."""
+    """Return a grid with density code and features that grow by one a vertex along an axis."""
     vertices = np.argwhere(np.ones((resolution + 1,) * 3))
     coords, masks, order = pack_vertices(vertices)
     values = vertices[order][:, axis] + shift
@@ -148,8 +148,8 @@ def ramp(resolution: int, axis: int, shift: int = 0) -> SparseGrid:
 @pytest.mark.parametrize("module", MARCHES)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
-    """Density is found from the opacity of rays one sample long, features by one fetch, at places all over
-    the bricks' borders; a shift by half a voxel would be half a code off."""
+    """Brick borders are seamless: density is found from the opacity of rays one sample long, features by one
+    fetch, at places all over the borders. A shift by half a voxel would be half a code off."""
     resolution = 24
     grid = ramp(resolution, axis)
     random = np.random.default_rng(0)
@@ -165,7 +165,7 @@ def test_brick_borders_are_seamless(module: ModuleType, axis: int) -> None:
     sigma = -np.log1p(-result.opacity.astype(np.float64)) / step
     code = (np.log(sigma) + 4) * 255 / 9
     at = rays_o[:, axis].astype(np.float64) * resolution / 2 + resolution / 2
-    # float32 opacities, relative 1e-6, a code being 9 / 255 of a logarithm
+    # float32 opacities are right to 1e-6 of themselves, and a code is 9 / 255 of a logarithm
     SEAM_DENSITY.check(code, at + 100)
     hits = result.hits
     assert len(hits) > 20
@@ -196,7 +196,7 @@ def test_k_changes_no_bit_of_the_opacity(module: ModuleType, optical: float) -> 
 
 
 def test_8_bit_rounding_at_every_joint() -> None:
-    """A level begins half a level below it, in float32."""
+    """A level of 8 bits begins half a level below its value, in float32."""
     joints = (np.arange(255) + 0.5) / 255
     below, above = (joints - 1e-6).astype(np.float32), (joints + 1e-6).astype(np.float32)
     for values, levels in ((below, np.arange(255)), (above, np.arange(1, 256))):
@@ -219,7 +219,7 @@ def test_srgb_at_its_joint() -> None:
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(colour=st.tuples(*[st.floats(0, 1, width=32)] * 3))
 def test_background_and_opacity_compose(colour: tuple[float, ...], shells_asset: Asset) -> None:
-    """Over any background the picture is the one over black plus what shows through."""
+    """Over any background the picture is the one over black plus the background that shows through."""
     camera = read_cameras(shells_asset.path("cameras.json"))[0].resized(40, 30)
     black = render(shells_asset, camera, background=(0.0, 0.0, 0.0), march="numba")
     over = render(shells_asset, camera, background=colour, march="numba")
@@ -241,7 +241,7 @@ def shells_asset(shells_folder) -> Asset:
 def test_scene_and_cameras_moved_together_look_the_same(
     move: tuple[float, ...], scale: float, quarter: int, shells_asset: Asset
 ) -> None:
-    """The asset is placed elsewhere in the world, turned by quarters and scaled; the camera goes with it."""
+    """A scene that is moved, turned by quarters and scaled together with its camera looks the same."""
     turn = np.eye(4)
     c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter]
     turn[:2, :2] = [[c, -s], [s, c]]
@@ -253,7 +253,7 @@ def test_scene_and_cameras_moved_together_look_the_same(
     camera = read_cameras(shells_asset.path("cameras.json"))[1].resized(40, 30)
     with Renderer(shells_asset, 1, "numba") as a, Renderer(moved, 1, "numba") as b:
         one, other = a.render(camera), b.render(camera.transformed(turn))
-    # rays in the model frame are the same up to float64 rounding of 50 units, seen as 1e-5 of a colour
+    # rays in the model frame are the same up to float64 rounding at 50 units, which is 1e-5 of a colour
     assert np.abs(one.rgb - other.rgb).max() < 0.02
     MOVED_COLOUR.check(np.abs(one.rgb - other.rgb).mean())
     MOVED_OPACITY.check(np.abs(one.opacity - other.opacity).mean())
@@ -262,7 +262,7 @@ def test_scene_and_cameras_moved_together_look_the_same(
 
 @pytest.mark.parametrize("module", MARCHES)
 def test_a_grid_turned_by_a_quarter_and_its_rays_give_the_same(module: ModuleType) -> None:
-    """x -> y, y -> -x: vertices and rays turn, bricks and skips are others, the pictures are not."""
+    """A grid and rays turned by x -> y, y -> -x give the same pictures, with other bricks and other jumps."""
     vertices, codes, features = shells()
     turned = np.stack([RESOLUTION - vertices[:, 1], vertices[:, 0], vertices[:, 2]], axis=1)
     _, _, order = pack_vertices(turned)

@@ -1,5 +1,5 @@
-"""Rays at their ends: where they enter the box against exact fractions, and that every march ends within a
-bound that is computed and counted."""
+"""Rays at their ends: they enter the box where exact fractions say, and every march ends within a bound that
+is computed and counted."""
 
 from __future__ import annotations
 
@@ -76,13 +76,12 @@ DIRECTIONS = Row(
 
 
 def most_samples(step: float) -> int:
-    """The bound: lattice places on the box's diagonal, and three for rounding."""
+    """Return the bound: the number of lattice places on the box's diagonal, and three for rounding."""
     return int(DIAGONAL / step) + 3
 
 
 def exact_slabs(o: np.ndarray, d: np.ndarray) -> tuple[Fraction, Fraction] | None:
-    """Entry (at least 0) and exit of a ray in [-1, 1]^3, of the float32 numbers as they are; None where it
-    misses."""
+    """Return entry (at least 0) and exit of a ray in [-1, 1]^3, exact for its float32 numbers, or None."""
     low, high = Fraction(0), None
     for a, b in zip(o.tolist(), d.tolist(), strict=True):
         if b == 0:
@@ -121,7 +120,7 @@ def test_entry_and_exit_are_the_fractions(name: str, module: ModuleType) -> None
     entries = enter_box(THIN, o, d)
     wanted = exact_slabs(o[0], d[0])
     scale = max(1.0, float(np.abs(o).max()))
-    rounding = 8 * 2**-24 * scale  # the origin in cells, its difference to the face, the quotient
+    rounding = 8 * 2**-24 * scale  # of the origin in cells, the difference to the face, the quotient
     length = 0.0 if wanted is None else float(wanted[1] - wanted[0])
     LENGTH.check(max(float(entries.length[0]), 0.0), length, of=rounding / 8)
     if length > 2 * rounding:
@@ -131,7 +130,7 @@ def test_entry_and_exit_are_the_fractions(name: str, module: ModuleType) -> None
         PLACE.check(entries.point[:, 0], (place + 1) * 8, of=rounding / 8)
     assert ((entries.point >= 0) & (entries.point <= 16)).all()
     taken = int(module.march(THIN, o, d, 5).n_density_samples[0])
-    # where the lattice ends within rounding of the exit one sample more or less is met
+    # where the lattice ends within rounding of the exit, there may be one sample more or fewer
     assert abs(taken - length / float(THIN.step)) <= 1 + 2 * rounding / float(THIN.step)
     MOST.check(taken, of=most_samples(float(THIN.step)))
 
@@ -141,7 +140,7 @@ component = st.one_of(st.floats(-1, 1, width=32), st.sampled_from([0.0, -0.0, 1e
 
 
 @given(st.tuples(coordinate, coordinate, coordinate), st.tuples(component, component, component))
-@example((3.0, -3.0, 0.0), (-1e-38, -1e-38, 1.0))  # from one face beyond float32 to another
+@example((3.0, -3.0, 0.0), (-1e-38, -1e-38, 1.0))  # from one face to another, beyond float32
 def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tuple[float, ...]) -> None:
     norm = math.sqrt(math.fsum(x * x for x in d))
     assume(norm >= 1e-3)
@@ -150,7 +149,7 @@ def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tupl
     length = 0.0 if wanted is None else float(wanted[1] - wanted[0])
     for module in (march, march_compiled):
         result = module.march(THIN, rays_o, rays_d, 1)
-        # a direction of 1e-30 along an axis meets its faces within rounding of 1e-6 / 1e-30: all or nothing
+        # a direction of 1e-30 along an axis meets faces within rounding of 1e-6 / 1e-30: all or nothing
         clear = all(abs(abs(x) - 1) > 1e-5 for x in o)
         if clear:
             SAMPLES.check(result.n_density_samples[0], length / float(THIN.step))
@@ -161,7 +160,7 @@ def test_both_marches_meet_what_the_fractions_meet(o: tuple[float, ...], d: tupl
 @pytest.mark.parametrize("module", MARCHES)
 @pytest.mark.parametrize("size", [1e-45, 1e-30, 1e-20, 1e-6, 1e3, 1e20, 1e38])
 def test_directions_that_are_not_unit_end_all_the_same(module: ModuleType, size: float) -> None:
-    """They are outside the contract: nothing is promised but an end, and finite numbers."""
+    """Directions that are not unit vectors break the contract, but marches end, with finite numbers."""
     rays_o = np.float32([[0.1, 0.2, 0.3], [-3, 0.1, 0.2], [0.1, -1, 0.2]])
     rays_d = (np.float32([[1, 0, 0], [1, 0, 0], [0.6, 0.8, 0]]) * np.float64(size)).astype(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -187,8 +186,9 @@ def test_rays_that_are_no_numbers_end_and_spoil_no_other(module: ModuleType, bad
 @pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
 @pytest.mark.parametrize("module", MARCHES)
 def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: ModuleType, far: float) -> None:
-    """In float32 the box's length along the ray is off by a sixteenth at 1e6 units and by everything at 1e8:
-    the renderer moves origins nearer (FAR_AWAY); here they are taken as they are, along the diagonal."""
+    """Origins far away take no more samples than the diagonal has. In float32 the length in the box is off by
+    a sixteenth at 1e6 units and by all of it at 1e8. The renderer moves origins nearer (FAR_AWAY); here they
+    stay as they are."""
     unit = 3**-0.5
     offsets = np.random.default_rng(0).uniform(-0.02, 0.02, (200, 3))
     rays_o = (np.full((200, 3), -far * unit) + offsets).astype(np.float32)
@@ -199,7 +199,7 @@ def test_origins_far_away_take_no_more_samples_than_the_diagonal_has(module: Mod
 
 
 def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Counted: each round moves every ray on by one place at least."""
+    """Each round moves every ray on by at least one place, so that rounds are at most the lattice places."""
     rounds = 0
 
     def counted(function: Callable[..., object]) -> Callable[..., object]:
@@ -210,7 +210,7 @@ def test_the_numpy_march_has_no_more_rounds_than_lattice_places(monkeypatch: pyt
 
         return counting
 
-    # in a round the only ray either jumps or takes a chunk
+    # in a round, the only ray either jumps or takes a chunk
     monkeypatch.setattr(BoxPath, "jump", counted(BoxPath.jump))
     monkeypatch.setattr(march, "_take", counted(march._take))
     rays = [np.float32([row]) for row in NAMED["from a corner, inwards"]]
@@ -238,7 +238,7 @@ def test_boxes_without_thickness_are_refused(aabb: tuple) -> None:
 @pytest.mark.parametrize("focal", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("place", [4.0, 1e4, 1e9])
 def test_rays_of_a_camera_are_unit(focal: float, place: float) -> None:
-    """The contract that marches rely on, from the widest lens to the longest."""
+    """Rays of a camera are unit vectors, from the widest lens to the longest, as marches require."""
     camera = Camera("c", look_at((place, 2, 5), (1, 2, 3)), 9, 7, focal, focal, 4.5, 3.5)
     _, rays_d = camera.rays()
     lengths = np.linalg.norm(rays_d.astype(np.float64), axis=1)

@@ -26,14 +26,14 @@ WORLD_FROM_MODEL = [[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, 2.0], [0.0, 0.0, 2.0,
 
 
 def head_arrays(n_channels: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """W [n_channels, 3] and V [3, 3] of `head_bytes`."""
+    """Return W [n_channels, 3] and V [3, 3] of `head_bytes`."""
     random = np.random.default_rng(0)
     w, v = random.normal(0, 0.02, (n_channels, 3)), random.normal(0, 0.5, (3, 3))
     return w.astype(np.float32), v.astype(np.float32)
 
 
 def linear_head(w: np.ndarray, v: np.ndarray, b: np.ndarray) -> HeadWeights:
-    """rgb = sigmoid(features W + dirs V + b) as a head: gelu(x) - gelu(-x) = x.
+    """Return a head of rgb = sigmoid(features W + dirs V + b), by gelu(x) - gelu(-x) = x.
 
     W [n_channels, 3], V [3, 3], b [3].
     """
@@ -52,7 +52,7 @@ def linear_head(w: np.ndarray, v: np.ndarray, b: np.ndarray) -> HeadWeights:
 
 
 def head_bytes(n_channels: int = 4) -> bytes:
-    """rgb = sigmoid(features W + dirs V), with `head_arrays`."""
+    """Return the file of a head of rgb = sigmoid(features W + dirs V), with W and V of `head_arrays`."""
     return head_onnx(linear_head(*head_arrays(n_channels), np.zeros(3)))
 
 
@@ -75,14 +75,14 @@ def cameras_bytes(n: int = 5) -> bytes:
 
 
 def shells() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stored vertices in the order on disk, their density codes and features."""
+    """Return the stored vertices in the order on disk, their density codes and features."""
     axis = np.arange(RESOLUTION + 1)
     vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     radius = np.linalg.norm(vertices / RESOLUTION * 2 - 1, axis=-1)
     inner, outer = np.abs(radius - 0.5) * RESOLUTION / 2, np.abs(radius - 0.99) * RESOLUTION / 2
     near = np.minimum(inner, outer)
     dense = (near < 2.7).reshape((RESOLUTION + 1,) * 3)
-    stored = ndimage.binary_opening(dense, np.ones((2, 2, 2))).reshape(-1)  # corners of cells with all eight
+    stored = ndimage.binary_opening(dense, np.ones((2, 2, 2))).reshape(-1)  # corners of whole cells
     vertices, near = vertices[stored], near[stored]
     _, _, order = pack_vertices(vertices)
     vertices, near = vertices[order], near[order]
@@ -101,7 +101,7 @@ def scene() -> Scene:
 
 
 def write_shells(folder: Path, sign: int = 1) -> Path:
-    """Write the asset, its features times `sign`; returns its folder."""
+    """Write the asset, with its features times `sign`; return its folder."""
     vertices, codes, features = shells()
     features = (sign * features).astype(np.int8)
     coords, masks, _ = pack_vertices(vertices)
@@ -128,5 +128,5 @@ def asset(shells_folder: Path) -> Asset:
 
 @pytest.fixture
 def broken_folder(shells_folder: Path, tmp_path: Path) -> Path:
-    """A copy of the asset, to be broken by the test."""
+    """Return a copy of the asset that the test may break."""
     return Path(shutil.copytree(shells_folder, tmp_path / "broken"))

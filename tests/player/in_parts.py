@@ -18,7 +18,7 @@ RESOLUTION = 45
 
 
 def cells(levels: int, thickness: float) -> list[Bricks]:
-    """A hollow ball, finer towards +x."""
+    """Return the cells of a hollow ball on each level; finer levels are towards +x."""
     centre = np.indices((RESOLUTION + 3,) * 3).reshape(3, -1).T
     found = []
     for level in range(levels):
@@ -33,7 +33,7 @@ def cells(levels: int, thickness: float) -> list[Bricks]:
 
 
 def stored(grid: Grid, leaves: list[Bricks], n_channels: int, steps: tuple[int, ...]) -> PyramidValues:
-    """Values that vary slowly, with noise, as close as the steps allow."""
+    """Return values that vary slowly, with noise, as closely as the steps allow."""
     random = np.random.default_rng(len(leaves) + n_channels)
     pyramid, (low, high) = whole_pyramid(RESOLUTION, leaves), LIMITS[grid]
     wanted = [
@@ -56,7 +56,7 @@ MANIFEST = Manifest(
 
 
 def write_in_parts(folder: Path) -> Path:
-    """Write the asset; returns its folder."""
+    """Write the asset; return its folder."""
     arrays = GridArrays(
         stored("densities", cells(4, 0.06), 1, STEPS),
         stored("features", cells(3, 0.09), 9, (2, 2, 1)),

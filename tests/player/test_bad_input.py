@@ -1,4 +1,4 @@
-"""What people give `vfr-play` by mistake or by malice: a clear message or the right picture."""
+"""Tests of bad input to `vfr-play`, by mistake or malice: it gives a clear message or the right picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def frame(c2w: np.ndarray, **more: Any) -> dict[str, Any]:
 
 
 def refused(capsys: pytest.CaptureFixture[str], out: Path, *fragments: str) -> None:
-    """One line on stderr that says it all, and nothing written."""
+    """Check that stderr has one line with all fragments, and that nothing was written."""
     error = capsys.readouterr().err
     assert error.startswith("vfr-play: error: ") and error.count("\n") == 1, error
     for fragment in fragments:
@@ -88,7 +88,7 @@ def test_impossible_cameras_are_refused_before_anything_is_rendered(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Also as the fourth frame of a file whose others are in order."""
+    """An impossible camera is refused, also as the fourth frame of a file whose others are in order."""
     out = tmp_path / "o"
     assert play(shells_folder, views, out) == 1
     refused(capsys, out, message)
@@ -117,7 +117,7 @@ def test_a_size_of_nothing_and_one_for_a_warehouse(
     assert "--size: expected WIDTHxHEIGHT, from 1x1 on, such as 800x600, got '0x0'" in capsys.readouterr().err
     assert cli.main([*views, "--size", "20000x20000"]) == 1
     refused(capsys, tmp_path / "o", "expected at most 67108864 pixels (8192x8192)", "12.0 GB of memory")
-    # what is large but allowed is said before it starts: here it never does
+    # a large size that is allowed is reported before rendering starts, which is prevented here
     monkeypatch.setattr("player.app.play.Renderer", _NoRenderer)
     with pytest.raises(_StartError):
         cli.main([*views, "--size", "8000x8000"])
@@ -125,7 +125,7 @@ def test_a_size_of_nothing_and_one_for_a_warehouse(
 
 
 class _StartError(Exception):
-    """Rendering would begin now."""
+    """Raised where rendering would begin."""
 
 
 class _NoRenderer:
@@ -152,7 +152,7 @@ def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def replace_head(folder: Path, data: bytes) -> None:
-    """With its size and checksum in the manifest in order."""
+    """Replace the head, and its size and checksum in the manifest."""
     (folder / "head.onnx").write_bytes(data)
     entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     rewrite(folder, lambda document: document["files"].update({"head.onnx": entry}))
@@ -207,8 +207,8 @@ def test_heads_that_are_not_ours(
     data: bytes, message: str, command: list[str], broken_folder: Path, tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """`capfd`: onnxruntime would print past Python. What else is refused:
-    tests/player/head/test_head_graph.py."""
+    """Heads that are not ours are refused in one line. (`capfd`: onnxruntime would print past Python.) What
+    else is refused: tests/player/head/test_head_graph.py."""
     replace_head(broken_folder, data)
     out = tmp_path / "o"
     assert cli.main([str(broken_folder), *(str(out) if word == "O" else word for word in command)]) == 1

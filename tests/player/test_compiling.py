@@ -1,4 +1,4 @@
-"""What is kept of compiled code, where, and when it is run again."""
+"""Tests of which compiled code is kept, where, and when it is used again."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ POSIX = os.name == "posix"
 
 
 class Installation:
-    """Two files, one of which takes a function from the other, and what runs them."""
+    """Two source files, one of which uses a function of the other, and a way to run them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.environment = folder, dict(os.environ)
@@ -56,7 +56,7 @@ class Installation:
         (self.folder / "other.py").write_text(PART.format(number))
 
     def run(self) -> str:
-        """What the function gives, and how often it was found."""
+        """Run the files; return what the function gives, and how often its kept code was found."""
         command = [sys.executable, "-B", str(self.folder / "user.py")]
         done = subprocess.run(command, env=self.environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -72,7 +72,7 @@ def installation(tmp_path: Path) -> Installation:
 
 
 def test_a_change_in_another_file_is_compiled(installation: Installation) -> None:
-    """numba alone answers 2 the third time."""
+    """A change in another file is compiled. numba's own cache would still give 2 the third time."""
     assert installation.run() == "2 0"
     first = installation.kept()
     assert first and installation.run() == "2 1" and installation.kept() == first
@@ -93,7 +93,8 @@ def test_a_change_is_seen_in_a_folder_that_was_told(installation: Installation, 
 def test_a_change_is_seen_in_an_installation_that_nobody_may_write_to(
     installation: Installation, tmp_path: Path
 ) -> None:
-    """Its code is in the user's caches. A file stands where the folder would be: root may write anywhere."""
+    """In a read-only installation, code is kept in the user's caches, and a change is seen. A file in place
+    of the folder makes it read-only, since root may write anywhere."""
     (installation.folder / "__pycache__").touch()
     assert [installation.run(), installation.run()] == ["2 0", "2 1"]
     assert installation.kept(tmp_path)
@@ -144,7 +145,7 @@ def test_a_room_of_sources_counts_and_what_compiles_them(
 
 
 def test_every_kernel_and_march_has_all_its_sources() -> None:
-    """The digest of the kernels covers the player's files, from which they take functions."""
+    """The digest of the kernels covers the player's files too, since the kernels use their functions."""
     from vfr_bake.kernels import SOURCES, adam
 
     assert compiling.SOURCES in SOURCES and (SOURCES[0] / "adam.py").is_file()
@@ -155,7 +156,7 @@ def test_every_kernel_and_march_has_all_its_sources() -> None:
 
 @pytest.fixture
 def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of sources, looked at for the first time."""
+    """Return a folder of sources that is used for the first time."""
     (tmp_path / "package").mkdir()
     (tmp_path / "package" / "a.py").write_text("1")
     monkeypatch.setattr(kept_code.config, "CACHE_DIR", "")
@@ -182,7 +183,7 @@ def test_first_use_is_known_by_what_is_kept(fresh: Path) -> None:
 
 
 def test_code_for_one_processor_is_not_run_as_another_s() -> None:
-    """Its name and what it has are in the keys of the index, and with them how long vectors are."""
+    """Keys of kept code have the processor's name and features, and thereby the length of vectors."""
     from player.compiled.march import _march_rays
 
     codegen: Any = registry.cpu_target.target_context
@@ -191,7 +192,7 @@ def test_code_for_one_processor_is_not_run_as_another_s() -> None:
 
 
 def test_old_code_is_removed(fresh: Path) -> None:
-    """But for the folders that were used last, whichever were made last."""
+    """Old code is removed, but for the folders that were used last, whenever they were made."""
     folders = []
     for number in [*range(N_KEPT + 1), 0, N_KEPT + 1]:
         (fresh / "a.py").write_text(str(number))
@@ -238,7 +239,8 @@ if POSIX:
         assert place(fresh)[::2] == (None, told)
 
     def test_beside_the_sources_the_folder_itself_is_asked(fresh: Path, tmp_path: Path) -> None:
-        """Groups of one, as many systems make them, may write beside the sources, but not what is kept."""
+        """The user's group, which has one member on many systems, may write beside the sources. If it may
+        write in the folder of kept code itself, the user's caches are used instead."""
         (fresh / "__pycache__").mkdir()
         (fresh / "__pycache__").chmod(0o775)
         folder = place(fresh).folder

@@ -1,4 +1,4 @@
-"""Points of a COLMAP model, in its binary form."""
+"""Tests of points of a COLMAP model, in its binary form."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from player.errors import FormatError
 
 
 def points_file(points: list[tuple[float, float, float]]) -> bytes:
-    """Each with a colour, an error and a track of as many pictures as its number."""
+    """Return a file of points, each with a colour, an error and a track of as many pictures as its number."""
     data = struct.pack("<Q", len(points))
     for number, point in enumerate(points):
         track = struct.pack("<Q", number) + struct.pack("<ii", 7, 8) * number

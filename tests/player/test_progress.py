@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar on a terminal, a line now and then elsewhere."""
+"""Tests of progress on stderr: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_bar_is_drawn_over_itself_and_not_too_often(monkeypatch: pytest.Monkey
 
 
 def test_a_bar_fits_into_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A line that wraps could not be drawn over."""
+    """A bar is cut to the terminal's width, since a line that wraps could not be drawn over."""
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     monkeypatch.setenv("COLUMNS", "40")
     with Bar() as bar:

@@ -1,4 +1,4 @@
-"""Compiled code is proven before it is used, by a process of its own, and left where it is wrong."""
+"""Tests that compiled code is proven by a process of its own before it is used, and not used if wrong."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_this_machine_s_code_is_right_and_asked_once(monkeypatch: pytest.MonkeyP
     child_runs(monkeypatch, f"print({proof.RIGHT!r})")
     assert lines() == [] and not proof.refuted()
     child_runs(monkeypatch, DIES)
-    monkeypatch.setattr(proof, "_verdicts", {})  # another process
+    monkeypatch.setattr(proof, "_verdicts", {})  # as in another process
     assert lines() == [] and not proof.refuted()
 
 

@@ -1,4 +1,4 @@
-"""Pictures: frames, backgrounds, threads, and the block bounds."""
+"""Tests of pictures: frames, backgrounds, threads, and the bounds of blocks."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def inside_camera() -> Camera:
 
 @pytest.mark.parametrize("module", ["numpy", pytest.param("numba", marks=pytest.mark.extra)])
 def test_picture_is_the_naive_loop(module: str, asset: Asset, scene: Scene, camera: Camera) -> None:
-    """World camera, rotated and scaled model, head, background, depth: the whole chain for every 37th
-    pixel."""
+    """Every 37th pixel is that of a naive loop over the whole chain: world camera, rotated and scaled model,
+    head, background, depth."""
     frame = render(asset, camera, background=(0.25, 0.5, 1.0), march=module)
     model = camera.transformed(np.linalg.inv(asset.world_from_model))
     rays_o, rays_d = model.rays()
@@ -202,7 +202,7 @@ def test_png_wants_bytes() -> None:
 
 @pytest.mark.parametrize("distance", [1e4, 1e8])
 def test_a_camera_far_away_sees_what_a_parallel_one_sees(distance: float, asset: Asset) -> None:
-    """The focal length grows with the distance, so that the picture stays; at 1e8 float32 has steps of 8."""
+    """With a focal length that grows with the distance, the picture stays; at 1e8 float32 has steps of 8."""
     frames = []
     for d in (distance, 3e3):
         pose = look_at((1 + d, 2, 3), (1, 2, 3))
@@ -223,7 +223,8 @@ def test_a_camera_far_away_with_an_ordinary_lens_sees_background(asset: Asset, c
 @pytest.mark.parametrize("behind", [None, (0.25, 0.5, 1.0)])
 @pytest.mark.parametrize("hits", [[], [0, 3], [4], [0, 1, 2, 3, 4]])
 def test_compiled_pixels_are_numpys(behind: tuple[float, float, float] | None, hits: list[int]) -> None:
-    """Every field of the frame, pixels in any order, rays that were met but not shaded."""
+    """Compiled and numpy code write the same pixels: every field, in any order, also of rays that hit but are
+    not shaded."""
     rng = np.random.default_rng(1)
     depth = rng.uniform(1, 2, 5).astype(np.float32) * [1, 0, 1, 1, 1]
     opacity, rgb = rng.uniform(0, 1, 5).astype(np.float32), rng.uniform(0, 1, (len(hits), 3))

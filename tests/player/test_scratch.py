@@ -1,4 +1,4 @@
-"""What compiled code writes beside the arrays that it is given is seen."""
+"""Tests that writes of compiled code beside the arrays that it is given are noticed."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_march_looks_beside_every_array_that_it_writes(
     of_grid = {id(array) for array in vars(grid).values()} | {id(array) for array in vars(grid.rows).values()}
     given = [array for array in arrays if id(array) not in of_grid and not is_guarded(array)]
     guarded = [array for array in arrays if is_guarded(array)]
-    # What is not guarded is read alone: the rays, their bounds, a lattice.
+    # Arrays that are not guarded are only read: the rays, their bounds, a lattice.
     kept = [array.tobytes() for array in given]
     inner(*handed[0])
     assert kept == [array.tobytes() for array in given]

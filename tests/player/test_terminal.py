@@ -1,4 +1,4 @@
-"""The picture above the `--info` page, where a terminal can show it."""
+"""Tests of the picture above the `--info` page, where a terminal can show it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Terminal(io.StringIO):
 
 
 def colours(lines: list[str]) -> np.ndarray:
-    """What a terminal shows: the pixels above and below of each character."""
+    """Return the pixels that a terminal shows; each character has an upper and a lower one."""
     rows = []
     for line in lines:
         cells = re.findall(r"\x1b\[38;2;(\d+);(\d+);(\d+);48;2;(\d+);(\d+);(\d+)m▀", line)

@@ -1,12 +1,12 @@
-"""Commands that are killed before every system call that changes something under the folder of their output.
+"""Kill commands before every system call that changes something under the folder of their output.
 
     python -m tests.reliability.every_call            # a run for each call, which is then killed: minutes
     python -m tests.reliability.every_call --once     # one run a command: its folder is copied at each call
 
-Every command replaces an old result. What the folder holds at a call is what a kill there leaves: there has
-to be the old result, whole, or the new one, whole, under each name; and the same command has to end well, and
-to leave no file more than a run that nobody has killed. Files that belong together are compared after the
-look that every command takes before it writes.
+Every command replaces an old result. A kill leaves what the folder holds at that call: under each name there
+has to be the whole old result or the whole new one. The same command then has to succeed, and to leave no
+more files than a run that nobody kills. Files that belong together are compared after the check that every
+command makes before it writes.
 """
 
 from __future__ import annotations
@@ -44,18 +44,19 @@ TRAIN = [*SMALL, "--steps", "3", "--checkpoint-minutes", "0.0000001"]
 
 @dataclass(frozen=True)
 class Command:
-    """A command that replaces what is in a folder of its own."""
+    """A command that replaces the content of a folder of its own."""
 
     name: str
     main: Callable[[list[str]], int]
     arguments: list[str]
-    """OUT stands for the folder."""
+    """Arguments of every run, in which OUT stands for the folder."""
     old: list[str]
-    """More of them for the old result, so that it is another."""
+    """More arguments for the run that makes the old result, so that it differs from the new one."""
     names: dict[str, Check | None]
-    """What it writes, with what raises unless it is whole; None where two runs write the same bytes."""
+    """The names that the command writes, each with a function that raises unless the result is whole; None if
+    two runs write the same bytes."""
     together: bool = False
-    """Whether the names belong together."""
+    """True if the results under the names belong together."""
     again: tuple[str, ...] = ()
 
 
@@ -66,7 +67,7 @@ NAMES = [
 
 
 def commands(work: Path, names: list[str]) -> list[Command]:
-    """Those of `names`, on small scenes."""
+    """Return the commands of `names`, on small scenes."""
     asset, data, model = write_shells(work / "shells"), work / "data", work / "base.pt"
     baked = work / "baked"
     _write_data(data)
@@ -169,7 +170,7 @@ class Trial:
             raise SystemExit(f"{self.command.name} {more}: exit code {code} without a kill")
 
     def killed(self) -> Iterator[str]:
-        """Kill a run of its own at every call; its folder is as that left it."""
+        """Start a run for every call, kill it there, and yield the call with the folder as it is then."""
         for number in range(1, 10_000):
             self._start_from(self._old)
             calls: list[str] = []
@@ -186,7 +187,7 @@ class Trial:
             yield calls[-1]
 
     def copied(self) -> Iterator[str]:
-        """Copy the folder at every call of one run, and go through the copies."""
+        """Copy the folder at every call of one run, and yield each call with the folder as it was there."""
         self._start_from(self._old)
         calls: list[str] = []
 
@@ -203,7 +204,7 @@ class Trial:
         shutil.rmtree(self._copies, ignore_errors=True)
 
     def wrong(self, again: bool) -> str | None:
-        """What is wrong with the folder as it is, and after the command has run again; None for nothing."""
+        """Return what is wrong with the folder now or after another run; None if nothing is."""
         with tempfile.TemporaryFile() as said:
 
             def look() -> int:

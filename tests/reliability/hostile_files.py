@@ -1,9 +1,9 @@
-"""Assets that are made to hang, to fill the memory or to lead outside, and a process that opens one with
+"""Assets made to hang the reader, to fill the memory or to lead outside, and a process that opens one with
 every command.
 
     python -m tests.reliability.hostile_files ASSET OUTPUT
 
-runs the commands in this process, with a budget of BUDGET gigabytes, and writes what became of them as JSON.
+This runs the commands in one process, with a budget of BUDGET gigabytes, and writes their outcomes as JSON.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ import numpy as np
 from tests.version_3 import as_version_3, pack_codes, pack_masks
 
 BUDGET = 0.3
-"""Gigabytes that the commands may take for the asset."""
+"""Gigabytes of memory that the commands may take for the asset."""
 
 
 def vouch(folder: Path, change: Callable[[dict[str, Any]], object] | None = None) -> None:
-    """Give every file that can be read its right size and checksum in the manifest."""
+    """Put the right size and checksum of every readable file into the manifest."""
     path = folder / "manifest.json"
     document = json.loads(path.read_text())
     if change is not None:
@@ -43,7 +43,7 @@ def vouch(folder: Path, change: Callable[[dict[str, Any]], object] | None = None
 
 
 def sparse(name: str, vouched: bool = False) -> Callable[[Path], None]:
-    """A file of a terabyte that takes no room on the disk."""
+    """Return a function that makes a file of a terabyte, which takes no room on the disk."""
 
     def make(folder: Path) -> None:
         with (folder / name).open("r+b") as file:
@@ -55,7 +55,7 @@ def sparse(name: str, vouched: bool = False) -> Callable[[Path], None]:
 
 
 def device(name: str) -> Callable[[Path], None]:
-    """A link to what never ends."""
+    """Return a function that puts a link to a device without end in place of a file."""
 
     def make(folder: Path) -> None:
         (folder / name).unlink()
@@ -65,7 +65,7 @@ def device(name: str) -> Callable[[Path], None]:
 
 
 def pipe(name: str) -> Callable[[Path], None]:
-    """A pipe that nobody writes to."""
+    """Return a function that puts a pipe to which nobody writes in place of a file."""
 
     def make(folder: Path) -> None:
         (folder / name).unlink()
@@ -89,7 +89,7 @@ def unix_socket(name: str) -> Callable[[Path], None]:
 
 
 def elsewhere(name: str) -> Callable[[Path], None]:
-    """A link to the right content outside the folder."""
+    """Return a function that puts a link to the right content, outside the folder, in place of a file."""
 
     def make(folder: Path) -> None:
         away = folder.with_name(f"{folder.name}-away")
@@ -100,8 +100,8 @@ def elsewhere(name: str) -> Callable[[Path], None]:
 
 
 def bomb(resolution: int, n_channels: int) -> Callable[[Path], None]:
-    """Every brick full: what is packed is small, what it unpacks to is not, and every size and checksum is
-    right."""
+    """Return a function that fills every brick: packed it is small, unpacked it is not, and all sizes and
+    checksums are right."""
 
     def make(folder: Path) -> None:
         as_version_3(folder)
@@ -124,7 +124,7 @@ def bomb(resolution: int, n_channels: int) -> Callable[[Path], None]:
 
 
 def scattered(folder: Path) -> None:
-    """One vertex a brick of features: six bytes each on the disk, 23 kB each where a march looks them up."""
+    """Store one vertex in each brick of features: six bytes on the disk, 23 kB each in a march's lookup."""
     as_version_3(folder)
     resolution, n = 1023, 128
     axis = np.arange(0, n, 2)
@@ -139,7 +139,7 @@ def scattered(folder: Path) -> None:
 
 
 def stated(folder: Path) -> None:
-    """A manifest that states bricks and vertices which no section has, and that fill any memory."""
+    """State bricks and vertices in the manifest that no section has, and that would fill any memory."""
 
     def many(document: dict[str, Any]) -> None:
         document.update(resolution=2048)
@@ -150,23 +150,23 @@ def stated(folder: Path) -> None:
 
 
 def nested(folder: Path) -> None:
-    """A manifest of 15 MB that parses to fifty times as much."""
+    """Make a manifest of 15 MB that takes fifty times as much when it is parsed."""
     path = folder / "manifest.json"
     data = path.read_bytes()
     path.write_bytes(data.replace(b'"psnr": 30.5', b'"psnr": [' + b"{}," * (5 << 20) + b"{}]"))
 
 
 TEXT = "\x1b[2J\x1b]0;owned\x07\u202e\n"
-"""Clears a terminal, names its window, turns the direction of writing and breaks the line."""
+"""Text that clears a terminal, names its window, reverses the direction of writing and breaks the line."""
 
 
 def obeyed(folder: Path) -> None:
-    """TEXT in what `--info` shows."""
+    """Put TEXT into what `--info` shows."""
     vouch(folder, lambda document: document.update(generator=TEXT, provenance={TEXT: {TEXT: TEXT}}))
 
 
 def obeyed_in_errors(folder: Path) -> None:
-    """TEXT in what a message repeats."""
+    """Put TEXT into what an error message repeats."""
     document = json.loads((folder / "cameras.json").read_text())
     document["frames"][0]["camera_model"] = TEXT
     document["frames"][0]["file_path"] = "a\u202eb\u200b"
@@ -198,7 +198,7 @@ RECIPES: dict[str, Callable[[Path], None]] = {
 
 
 def run_all(asset: Path, output: Path) -> dict[str, Any]:
-    """Exit codes and what was printed, by command, and the most memory that was taken."""
+    """Return exit codes and output by command, and the largest amount of memory that was taken."""
     from exporters.cli import main as export
     from player.app.cli import main as play
 
@@ -221,7 +221,7 @@ def run_all(asset: Path, output: Path) -> dict[str, Any]:
 
 
 def _peak_mb() -> float:
-    """Most memory of this program; Linux counts that of the program which started it in `getrusage` too."""
+    """Return this program's peak memory in MB; Linux's `getrusage` also counts the program's parent."""
     status = Path("/proc/self/status")
     if status.exists():
         return int(status.read_text().partition("VmHWM:")[2].split()[0]) / 1000

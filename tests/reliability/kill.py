@@ -1,10 +1,10 @@
-"""Commands that are killed at a random moment, that share an output, whose disk is full or folder read-only.
+"""Kill commands at a random moment, let two share an output, and fill the disk.
 
     python -m tests.reliability.kill --runs 200 --seed 0
 
 Every run is a fork of this process, which has imported everything, so that a kill falls into the work and not
-into the imports. What the name held before is still there, whole, or the new result is, whole; the same
-command then ends well (train and play with --resume).
+into the imports. Afterwards the name has to hold its old content, whole, or the new result, whole. The same
+command then has to succeed (train and play with --resume).
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ class Command:
     arguments: list[str]
     target: Path
     again: list[str]
-    """What is added to go on after a kill."""
+    """Arguments that are added to go on after a kill."""
     check: Callable[[Path], object]
-    """Raises unless the output is whole."""
+    """Function that raises unless the output is whole."""
 
 
 def commands(work: Path, names: list[str]) -> list[Command]:
-    """Those of `names`, on small scenes; trains the model that is baked."""
+    """Return the commands of `names`, on small scenes. The model to bake is trained here."""
     asset = write_shells(work / "shells")
     data, model = work / "data", work / "base.pt"
     if {"train", "bake"} & set(names):
@@ -95,7 +95,7 @@ def _whole_pictures(folder: Path) -> None:
 
 
 def _write_data(folder: Path) -> None:
-    """The built-in scene, 16 pixels wide, as a NeRF-synthetic folder."""
+    """Write the built-in scene, 16 pixels wide, as a NeRF-synthetic folder."""
     from dataclasses import replace
 
     from PIL import Image
@@ -112,7 +112,7 @@ def _write_data(folder: Path) -> None:
 
 
 def start(work: Callable[[], int]) -> int:
-    """Run in a fork; its process id."""
+    """Run `work` in a fork, and return its process id."""
     child = os.fork()
     if child:
         return child
@@ -128,7 +128,7 @@ def start(work: Callable[[], int]) -> int:
 
 
 def end(child: int, kill_after: float | None = None) -> int:
-    """Wait for a fork, killing it after a time if it is still there: its exit code, or minus the signal."""
+    """Wait for a fork, killing it after a time if given. Return its exit code, or minus the signal."""
     begin = time.monotonic()
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -147,7 +147,7 @@ def forked(work: Callable[[], int]) -> int:
 
 
 def contents(path: Path) -> dict[str, str]:
-    """What is under a name: checksums by file."""
+    """Return the checksums of what is under a name, by file."""
     if path.is_file():
         return {"": hashlib.sha256(path.read_bytes()).hexdigest()}
     return {
@@ -158,7 +158,7 @@ def contents(path: Path) -> dict[str, str]:
 
 
 def kill_runs(every: list[Command], n_runs: int, seed: int) -> dict[str, Any]:
-    """Kill the commands in turn; the first and every third time over an old result, with --force."""
+    """Kill the commands in turn; the first round and every third one replace an old result, with --force."""
     random = np.random.default_rng(seed)
     tally = {c.name: {"runs": 0, "killed": 0, "old kept": 0, "new there": 0, "none yet": 0} for c in every}
     failures: list[str] = []
@@ -215,7 +215,7 @@ def _remove(path: Path) -> None:
 
 
 def both_at_once(every: list[Command], n_runs: int) -> list[str]:
-    """Two of the same command, one output: each ends well or says why not, and what is there is whole."""
+    """Run a command twice at once: each has to succeed or say why not, and the output has to be whole."""
     failures = []
     for index in range(n_runs):
         command = every[index % len(every)]
@@ -231,7 +231,7 @@ def both_at_once(every: list[Command], n_runs: int) -> list[str]:
 
 
 def full_disk(every: list[Command], limits: list[int]) -> list[str]:
-    """No file may be longer than the limit, as on a disk that is full: exit code 1, and the old result."""
+    """Limit the length of files, as on a full disk: exit code 1 is expected, and the old result."""
     failures = []
     for command in every:
         for limit in limits:
@@ -252,7 +252,7 @@ def full_disk(every: list[Command], limits: list[int]) -> list[str]:
 
 
 def small_disk(every: list[Command], work: Path, sizes: list[str]) -> list[str]:
-    """The outputs on a tmpfs that is too small; needs the right to mount one."""
+    """Write the outputs to a tmpfs that is too small. This needs the right to mount one."""
     failures = []
     place = work / "disk"
     place.mkdir()

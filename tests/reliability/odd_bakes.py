@@ -1,10 +1,10 @@
-"""Trains models of odd scenes for a short time, bakes each under several limits, and plays what comes out.
+"""Trains models of odd scenes for a short time, bakes each under several limits, and plays the assets.
 
     python -m tests.reliability.odd_bakes FOLDER [--scenes room fog] [--models model.pt ...] [--views 32]
 
-Every bake has to end with an asset that keeps to the memory and the bytes that were allowed, that opens with
-all checksums compared, and that plays. Each runs as `vfr-bake` in a process of its own, whose peak of memory
-is measured. One line is printed for each, and FOLDER/results.json holds them; the exit code is the number of
+Every bake has to give an asset that keeps to the memory and the bytes that were allowed, that opens with all
+checksums compared, and that plays. Each runs as `vfr-bake` in a process of its own, whose peak of memory is
+measured. One line is printed for each, and FOLDER/results.json holds them; the exit code is the number of
 bakes that failed. `--models` adds models that were trained before, for example by `vfr-train DATA model.pt
 --steps 500`.
 """
@@ -34,7 +34,7 @@ from vfr_bake.data.scene import build_scene
 from vfr_bake.training.model_file import save_model
 
 FOGS = {"fog of 30 steps": ("glass", 30), "two views of 10 steps": ("two views", 10)}
-"""Models that are hardly trained: their scene, and for how many steps."""
+"""Models that are hardly trained: their scene, and their number of steps."""
 LIMITS = (
     ("balanced",),
     ("fast",),
@@ -48,27 +48,27 @@ MEMORY_GB, MAX_MB = re.compile("--max-memory ([0-9.]+)"), re.compile("--max-mb (
 
 @dataclass(frozen=True)
 class OddBake:
-    """What became of a bake."""
+    """Result of a bake."""
 
     model: str
     options: str
     failed: list[str]
-    """What is wrong, in words; empty if nothing is."""
+    """Descriptions of what is wrong; empty if nothing is."""
     said: list[str]
-    """The last lines of stderr."""
+    """Last lines of stderr."""
     seconds: float
     expected_seconds: float | None
-    """What the bake said at its beginning."""
+    """Expected time that the bake printed at its beginning."""
     peak_gb: float
     megabytes: float
     loss_db: float | None
     psnr: float | None
-    """To the model's own pictures, dB."""
+    """PSNR in dB, compared with the model's own pictures."""
     left_out: dict[str, str]
 
 
 def train_odd(folder: Path, names: list[str], size: int, n_views: int, minutes: float) -> list[Path]:
-    """Models of the scenes, trained for so many minutes each, where they are not there yet."""
+    """Return models of the scenes. Those that do not exist yet are trained for so many minutes each."""
     models = []
     for name in names:
         scene_name, steps = FOGS.get(name, (name, None))
@@ -82,7 +82,7 @@ def train_odd(folder: Path, names: list[str], size: int, n_views: int, minutes: 
 
 
 def bake_odd(model: Path, options: tuple[str, ...], folder: Path, refine_steps: int) -> OddBake:
-    """Bake a model and look at the asset."""
+    """Bake a model, and check the asset."""
     name = re.sub("[^a-z0-9]+", "_", f"{model.stem}_{'_'.join(options)}".lower())
     asset, log, figures = folder / name, folder / f"{name}.log", folder / f"{name}.json"
     command = [sys.executable, "-c", "import sys; from vfr_bake.cli import bake_main; sys.exit(bake_main())"]
@@ -118,7 +118,7 @@ def bake_odd(model: Path, options: tuple[str, ...], folder: Path, refine_steps: 
 
 
 def what_does_not_play(folder: Path) -> list[str]:
-    """What is wrong with an asset: it does not open, or its pictures are not finite or show nothing."""
+    """Return what is wrong with an asset: it does not open, or pictures are not finite or show nothing."""
     asset = Asset.open(folder, verify=True)
     seen = 0.0
     for camera in asset_cameras(asset)[:: max(len(asset_cameras(asset)) // 3, 1)]:

@@ -1,7 +1,7 @@
 """Scenes that no preset was tuned for, traced from planes, boxes and balls.
 
 Letters: rays start at `o` [n, 3] with unit directions `d` [n, 3], and `t` [n] is the distance along them,
-infinite where nothing is met. A *tracer* takes o and d and returns premultiplied colour and opacity [n, 4]
+infinite if they meet nothing. A *tracer* takes o and d and returns premultiplied colour and opacity [n, 4]
 float64, 0 to 1.
 """
 
@@ -21,30 +21,30 @@ Tracer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 ROOM = np.array([[-3.0, -2.0, 0.0], [3.0, 2.0, 2.5]])
 """Lower and upper corner of the room."""
 WINDOW = (-1.2, 1.2, 0.9, 2.0)
-"""The opening in the wall at the largest x: least and greatest y, least and greatest z."""
+"""Opening in the wall at the largest x: least and greatest y, least and greatest z."""
 SUN = np.array([0.48, 0.36, 0.8])
 
 
 def sky(d: np.ndarray) -> np.ndarray:
-    """[n, 3]: blue above, hazy at the horizon."""
+    """Return the sky's colours [n, 3]: blue above, hazy at the horizon."""
     up = np.clip(d[:, 2:], 0, 1) ** 0.5
     return (1 - up) * np.array([0.85, 0.88, 0.9]) + up * np.array([0.25, 0.45, 0.8])
 
 
 def checker(a: np.ndarray, b: np.ndarray, tile: float) -> np.ndarray:
-    """[n] 0 or 1."""
+    """Return the pattern of a checkerboard, [n] with values 0 or 1."""
     return (np.floor(a / tile) + np.floor(b / tile)) % 2
 
 
 class Nearest:
-    """The nearest of the surfaces that rays have met so far, and its colour."""
+    """The nearest surface that each ray has met so far, and its colour."""
 
     def __init__(self, o: np.ndarray, d: np.ndarray) -> None:
         self.o, self.d = o, d
         self.t, self.rgb = np.full(len(d), np.inf), sky(d)
 
     def meet(self, t: np.ndarray, normal: np.ndarray, rgb: np.ndarray) -> None:
-        """Let rays meet a surface at t, with unit normals [n, 3] and colours [n, 3], if it is nearer."""
+        """Let rays meet a surface at t, with unit normals [n, 3] and colours [n, 3], where it is nearer."""
         near = (t > 1e-6) & (t < self.t)
         light = 0.55 + 0.45 * np.clip(normal @ SUN, 0, 1)
         self.rgb = np.where(near[:, None], rgb * light[:, None], self.rgb)
@@ -67,7 +67,7 @@ class Nearest:
 
 
 def room(o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """A white room: a checkered floor, brick lines on one wall, a window, a table, a ball and a railing."""
+    """Trace a white room: checkered floor, brick lines on one wall, window, table, ball and railing."""
     seen = Nearest(o, d)
     with np.errstate(divide="ignore"):
         walls = np.max([(side - o) / d for side in ROOM], axis=0)
@@ -91,7 +91,7 @@ def room(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def horizon(o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """A plain without end, with pillars at distances from 1 to 400."""
+    """Trace an endless plain with pillars at distances from 1 to 400."""
     seen = Nearest(o, d)
     with np.errstate(divide="ignore"):
         t = np.where(d[:, 2] < 0, -o[:, 2] / d[:, 2], np.inf)
@@ -108,8 +108,8 @@ def horizon(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def glass(o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """A ball of glass, clear in the middle and bright at its rim, before a checkered wall and with a dark
-    grid of wires beneath it; nothing around them."""
+    """Trace a ball of glass, clear in the middle and bright at its rim, in front of a checkered wall, with a
+    dark grid of wires beneath it and nothing around them."""
     seen = Nearest(o, d)
     seen.t, out = np.full(len(d), np.inf), np.zeros((len(d), 4))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -130,8 +130,8 @@ def glass(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def picture(tracer: Tracer, camera: Camera, centre: np.ndarray, scale: float) -> np.ndarray:
-    """[height, width, 4] uint8 with straight alpha, four rays a pixel; the tracer's frame has its origin at
-    `centre` in the world and the unit `scale`."""
+    """Return a picture [height, width, 4] uint8 with straight alpha, from four rays a pixel. The tracer's
+    frame has its origin at `centre` in the world, and the unit `scale`."""
     total = np.zeros((camera.height * camera.width, 4))
     for dx, dy in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         shifted = Camera(
@@ -145,7 +145,7 @@ def picture(tracer: Tracer, camera: Camera, centre: np.ndarray, scale: float) ->
 
 
 def looking(name: str, place: np.ndarray, at: np.ndarray, size: int, degrees: float) -> Camera:
-    """A camera at `place` that looks at `at`, z up."""
+    """Return a camera at `place` that looks at `at`, with z up."""
     back = (place - at) / np.linalg.norm(place - at)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -156,7 +156,7 @@ def looking(name: str, place: np.ndarray, at: np.ndarray, size: int, degrees: fl
 
 
 def inside_views(size: int, n_views: int) -> list[Camera]:
-    """A walk around the table of the room, looking past it at the wall on the other side."""
+    """Return cameras on a walk around the table of the room, which look past it at the opposite wall."""
     cameras = []
     for n in range(n_views):
         angle = 2 * np.pi * n / n_views
@@ -167,7 +167,7 @@ def inside_views(size: int, n_views: int) -> list[Camera]:
 
 
 def outside_views(size: int, n_views: int) -> list[Camera]:
-    """A ring of cameras that look a little above what is in their middle."""
+    """Return a ring of cameras that look a little above its centre."""
     angles = 2 * np.pi * np.arange(n_views) / n_views
     places = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0.9 + 0.3 * np.sin(3 * angles)], axis=-1)
     at = np.array([0.0, 0.0, 0.6])
@@ -175,7 +175,7 @@ def outside_views(size: int, n_views: int) -> list[Camera]:
 
 
 def odd_capture(name: str, size: int, n_views: int) -> Capture:
-    """One of ODD, in pictures of `size` x `size` pixels.
+    """Return one of the scenes ODD, in pictures of `size` x `size` pixels.
 
     >>> odd_capture("two views", 8, 40).train.cameras[0].width
     8

@@ -1,11 +1,11 @@
-"""The tests of compiled code once more, compiled for other processors than this machine's.
+"""Runs the tests of compiled code again, with the code compiled for other processors than this machine's.
 
     python -m tests.reliability.processors
 
-Code for a processor with less than this one has runs here, so that a new machine finds the faults of the
-others: x86-64-v2 has registers of four numbers and no fused multiply-add (Intel's of 2009), x86-64-v3 eight
-numbers and no products of bytes (of 2013). numba is told by NUMBA_CPU_NAME and NUMBA_CPU_FEATURES, and what
-it compiles is kept in a folder of its own.
+Code for a processor with fewer instructions runs here too, so that a new machine finds the faults of others:
+x86-64-v2 has registers of four numbers and no fused multiply-add (Intel's of 2009), x86-64-v3 has eight
+numbers and no products of bytes (of 2013). NUMBA_CPU_NAME and NUMBA_CPU_FEATURES tell numba the processor,
+and the code that it compiles is kept in a folder of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from llvmlite import binding
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 NEEDS = {"x86-64-v2": ("sse4.2", "popcnt", "ssse3"), "x86-64-v3": ("avx2", "fma", "bmi2")}
-"""What this machine must have to run code for a processor of that name."""
+"""Features that this machine must have to run code for each processor."""
 TESTS = (
     *(
         "tests/player/compiled/test_lanes.py",
@@ -37,25 +37,25 @@ TESTS = (
     *("tests/numerics", "tests/vfr_bake/field", "tests/vfr_bake/rendering"),
     "tests/vfr_bake/baking/test_stored_features.py",
 )
-"""Everything that calls compiled code."""
+"""All tests that call compiled code."""
 SHORT = TESTS[:5]
-"""What calls the vectors that are written down for a processor; half a minute."""
+"""Tests that call the vector functions written for particular processors; half a minute."""
 
 
 def processors() -> list[str]:
-    """The processors that this machine can stand for."""
+    """Return the processors whose code this machine can run."""
     here = binding.get_host_cpu_features()
     return [name for name, needs in NEEDS.items() if all(here.get(feature) for feature in needs)]
 
 
 def environment_of(name: str, cache: str) -> dict[str, str]:
-    """The environment in which numba compiles for the processor `name`, and keeps the code in `cache`."""
+    """Return the environment in which numba compiles for processor `name`, keeping code in `cache`."""
     settings = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": cache}
     return dict(os.environ) | settings
 
 
 def run(name: str, tests: tuple[str, ...], cache: str) -> subprocess.CompletedProcess[str]:
-    """Run tests with numba compiling for the processor `name`, what is not in `cache` yet."""
+    """Run tests, with code that is not in `cache` yet compiled for the processor `name`."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests]
     environment = environment_of(name, cache)
     return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)

@@ -1,7 +1,7 @@
-"""Stopping a process before every system call that changes something under a folder, by ptrace and seccomp.
+"""Stops a process before every system call that changes something under a folder, by ptrace and seccomp.
 
-The kernel stops the process, and whatever it starts, before such a call is carried out, whoever makes it:
-Python, a library in C, a thread. Nothing but the calls in `CALLS` is slowed down.
+The kernel stops the process, and every process that it starts, before it carries out such a call, no matter
+whether Python, a C library or a thread makes the call. Only the calls in `CALLS` are slowed down.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-# name: numbers on x86_64 and aarch64, and where its paths are: (argument of the folder's handle or None,
-# argument of the path or None for the handle's own file)
+# For each name, the call's numbers on x86_64 and aarch64, and where its paths are: (argument of the folder's
+# handle or None, argument of the path or None for the handle's own file)
 CALLS: dict[str, tuple[int | None, int | None, list[tuple[int | None, int | None]]]] = {
     "write": (1, 64, [(0, None)]),
     "pwrite64": (18, 68, [(0, None)]),
@@ -69,7 +69,7 @@ def _ptrace(request: int, pid: int = 0, address: int = 0, data: object = None) -
 
 
 def _ask_to_be_stopped() -> None:
-    """In the process itself: a filter that lets the tracer see the calls, and a first stop."""
+    """Install a filter, in the process itself, that shows the calls to the tracer; stop before that."""
     numbers = list(_NUMBERS)
     code = [(0x20, 0, 0, 0)]  # the number of the call
     code += [(0x15, len(numbers) - index, 0, number) for index, number in enumerate(numbers)]
@@ -83,10 +83,10 @@ def _ask_to_be_stopped() -> None:
 
 
 def run(work: Callable[[], int], folder: Path, stop: Callable[[str], bool]) -> int:
-    """Run `work` in a fork; its exit code, or minus the signal.
+    """Run `work` in a fork, and return its exit code, or minus the signal.
 
-    Before each call that changes what is under `folder`, `stop` is called with its name and paths; it answers
-    whether the process is killed there.
+    Before each call that changes something under `folder`, `stop` is called with the call's name and paths.
+    It returns whether the process is killed there.
     """
     child = os.fork()
     if not child:
@@ -121,7 +121,7 @@ def run(work: Callable[[], int], folder: Path, stop: Callable[[str], bool]) -> i
 
 
 def _changes(pid: int, folder: str) -> str | None:
-    """The call that a process is about to make, if it changes something under the folder."""
+    """Return the call that a process is about to make, if the call changes something under the folder."""
     buffer = ctypes.create_string_buffer(88)
     _ptrace(_SYSCALL_INFO, pid, len(buffer), buffer)
     number, *arguments = struct.unpack_from("7Q", buffer, 24)

@@ -1,4 +1,4 @@
-"""Kills before every call that changes the disk: the bounded part of `tests.reliability.every_call`."""
+"""Kills before every call that changes the disk: a short form of `tests.reliability.every_call`."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ import json; print(json.dumps({{"code": code, "calls": calls}}))
 
 
 def watched(folder: Path, work: str, kill_at: int = -1, fallback: bool = False) -> tuple[int, list[str]]:
-    """The exit code and the calls of `work`, in a process without threads of its own."""
+    """Return the exit code and the calls of `work`, run in a process without other threads."""
     result = run_program(PROGRAM.format(work=work, fallback=fallback), str(folder), str(kill_at))
     return result["code"], result["calls"]
 
 
 def test_calls_are_seen_whoever_makes_them(tmp_path: Path) -> None:
-    """A thread's and another program's as well; not what happens elsewhere, nor reading."""
+    """Calls of threads and other programs are seen too, but not calls elsewhere, nor reading."""
     work = (
         "import subprocess; (folder / 'a').write_bytes(b'1'); (folder / 'a').read_bytes(); "
         "thread = threading.Thread(target=(folder / 'a').rename, args=(folder / 'b',)); "
@@ -71,7 +71,7 @@ def test_a_kill_is_before_the_call(kill_at: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fallback", [False, True])
 def test_a_folder_is_old_or_new_at_every_call(fallback: bool, tmp_path: Path) -> None:
-    """Where names cannot be exchanged the old one may be away, until the next command looks."""
+    """A folder is old or new at every call; if names cannot be exchanged, it may be missing for a while."""
     work = (
         "context = files.new_folder(folder / 'scene', True); new = context.__enter__(); "
         "[(new / name).write_bytes(b'new') for name in 'xyz']; context.__exit__(None, None, None)"

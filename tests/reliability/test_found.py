@@ -1,4 +1,4 @@
-"""What broken inputs have brought to light, one by one."""
+"""Faults that broken inputs have shown, each with a test."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def broken(shells_folder: Path, tmp_path: Path) -> Path:
-    """A copy of the asset, to be broken by the test."""
+    """A copy of the asset that a test may break."""
     return Path(shutil.copytree(shells_folder, tmp_path / "broken"))
 
 
 def test_a_npy_header_that_never_ends() -> None:
-    """numpy tries it again as Python 2 wrote it, and its tokenizer gives up in its own way."""
+    """A header that never ends is refused, although numpy tries it as Python 2's and its tokenizer fails."""
     header = b"{'descr': '<u2', 'fortran_order': False, 'shape': (1, 3"
     data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
     with pytest.raises(FormatError, match="expected a numpy array of uint16"):
@@ -77,7 +77,7 @@ def test_tensors_where_a_model_has_plain_values(tmp_path: Path) -> None:
 
 
 def test_an_asset_without_a_feature(broken: Path) -> None:
-    """Rays that hit something found no row to take."""
+    """An asset without features is refused: rays that hit something found no row to take."""
     asset = Asset.open(as_version_3(broken))
     _, features = read_arrays(asset.folder, asset.manifest, 1 << 40)
     for name, data in (
@@ -132,7 +132,7 @@ def test_values_of_a_model_that_are_none_of_ours(
 
 
 def test_onnxruntime_calls_nobody(tmp_path: Path) -> None:
-    """From 1.31 on it had a thread that looked up its maker's server, and called it."""
+    """onnxruntime connects to nobody: from 1.31 on a thread of its own looked up its maker's server."""
     (tmp_path / "head.onnx").write_bytes(head_bytes(4))
     code = (
         "import os, sys, time; from pathlib import Path; from player.head.head import Head\n"
@@ -158,7 +158,7 @@ def test_a_name_of_thousands_of_letters_is_not_repeated_in_full() -> None:
 def test_a_picture_that_asks_for_more_memory_than_there_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A PNG of 324 bytes may say that 4 GB follow, which Pillow asks the system for at once."""
+    """A PNG of 324 bytes that claims 4 GB, for which Pillow asks the system at once, is refused."""
     path = tmp_path / "frame.png"
     path.write_bytes(png_bytes(np.zeros((9, 7, 3), np.uint8), "abc"))
     assert read_key(path) == "abc"

@@ -1,4 +1,4 @@
-"""Each hostile asset through the real commands: one line, exit code 1, within the budget, nothing written."""
+"""Every hostile asset, opened by the real commands, gives one line and exit code 1, within the budget."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.reliability.hostile_files import BUDGET, RECIPES
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 MESH = "export of the mesh"
-"""The mesh of the small asset is none: this command never ends well."""
+"""Command that never succeeds, because the small asset has no valid mesh."""
 READ = {
     "text that a terminal obeys": {"info", "check", "play", "export", "export of the mesh"},
     "text that a terminal obeys, in a message": {"check"},
 }
-"""What is read all the same."""
+"""Commands that read a hostile asset all the same."""
 
 
 def run(asset: Path, output: Path) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def run(asset: Path, output: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def usual(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> float:
-    """Most memory, MB, that the commands take for a whole asset."""
+    """Peak memory in MB of the commands for an intact asset."""
     results = run(shells_folder, tmp_path_factory.mktemp("usual"))
     peak = results.pop("peak_mb")
     assert [result["code"] for name, result in results.items() if name != MESH] == [0] * 4

@@ -1,4 +1,4 @@
-"""Models of odd scenes, hardly trained: each bakes and plays. `odd_bakes` has the long run."""
+"""Hardly trained models of odd scenes: each bakes and plays. `odd_bakes` is the long form."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A bounded part of the long scripts: broken inputs, broken messages to the viewer, killed commands, one
-output for two, full disks."""
+"""Short forms of the long scripts: broken inputs, broken messages to the viewer, killed commands, one output
+for two commands, full disks."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ REPOSITORY = Path(__file__).resolve().parent.parent.parent
 
 
 def run(module: str, *arguments: str) -> dict[str, Any]:
-    """In a process of its own: what is fuzzed may crash, and forks want a process without threads."""
+    """Run a module in its own process: fuzzed code may crash, and forks need a process without threads."""
     return _answer("-m", module, *arguments)
 
 
 def run_program(program: str, *arguments: str) -> dict[str, Any]:
-    """The same with the text of a program."""
+    """Run the text of a program in a process of its own."""
     return _answer("-c", program, *arguments)
 
 

@@ -1,4 +1,4 @@
-"""The training side's command lines: contract, exit codes, one-line errors, nothing half written."""
+"""The commands of training and baking: contract, exit codes, one-line errors, and no half-written files."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_train_reports_what_it_measured(
 def test_the_help_names_the_defaults_that_hold(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Compared without spaces: lines end within numbers, too."""
-    monkeypatch.setenv("COLUMNS", "80")  # more would show two columns
+    """The help states the defaults in use, compared without spaces, as lines break inside numbers too."""
+    monkeypatch.setenv("COLUMNS", "80")  # a wider help would have two columns
     with pytest.raises(SystemExit):
         train_main(["--help"])
     said = re.sub(r"[\s│]+", "", capsys.readouterr().out)
@@ -90,8 +90,9 @@ def test_the_help_names_the_defaults_that_hold(
 
 
 def test_trainings_own_score_is_that_of_vfr_eval(small_data: Path, tmp_path: Path) -> None:
-    """Where an unbounded model stores nothing it shows its background and not white: training has to score
-    over that background too, because the bake counts its losses by that score."""
+    """Training's own score is that of `vfr-eval`. Where an unbounded model stores nothing it shows its
+    background, not white. Training has to score over this background too, because the bake counts its losses
+    from this score."""
     data = tmp_path / "data"
     shutil.copytree(small_data, data)
     for path in data.rglob("*.png"):
@@ -148,7 +149,7 @@ def test_eval_measures_lpips(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """With a distance of our own, as the weights are large and not ours to keep."""
+    """`vfr-eval` reports LPIPS, here of a stand-in, as the real weights are large and not ours to keep."""
 
     class Distance:
         def __init__(self, network: str) -> None:
@@ -326,7 +327,7 @@ def test_ctrl_c_leaves_a_usable_model(small_data: Path, tmp_path: Path) -> None:
 
 
 def test_training_goes_on_after_kill_9(small_data: Path, tmp_path: Path) -> None:
-    """The interrupted run ends in the same field as one that was left alone, to the last bit."""
+    """A training that is resumed after kill -9 gives the same field, to the last bit, as one left alone."""
     settings = [*SMALL, "--steps", "400", "--minutes", "60", "--eval-views", "0"]
     settings += ["--checkpoint-minutes", "0.005"]
     alone, killed = tmp_path / "alone.pt", tmp_path / "killed.pt"
@@ -363,7 +364,7 @@ def test_an_unbounded_model_is_evaluated_and_always_culled(
 def test_photographs_without_cameras_have_them_estimated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the estimation itself does is tested where it is; here, that it is asked and told of."""
+    """Photographs without cameras have them estimated, and errors of that are shown."""
     photos = tmp_path / "photos"
     photos.mkdir()
     for index in range(3):
@@ -385,7 +386,7 @@ def test_photographs_without_cameras_have_them_estimated(
 def test_cameras_that_are_folded_are_told_of(
     small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Which are is tested where they are found."""
+    """Pictures whose cameras are folded are named. Finding them is tested elsewhere."""
     monkeypatch.setattr(
         "vfr_bake.data.models.folds.torn_views", lambda _: [("a.jpg", "b.jpg"), ("c.jpg", "d.jpg")]
     )

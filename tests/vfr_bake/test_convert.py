@@ -59,7 +59,7 @@ def test_the_finest_level_and_every_other_file_stay(
     with Renderer(one, 1, "numpy") as a, Renderer(other, 1, "numpy") as b:
         x, y = a.render(camera), b.render(camera)
     assert np.array_equal(x.opacity, y.opacity)
-    # a fetch between two surfaces, where no fine brick is, reads a coarser one that reaches so far
+    # where no fine brick is, a fetch between two surfaces reads a coarser brick that reaches that far
     assert np.square(x.rgb - y.rgb).mean() < 1e-5 and np.abs(x.rgb - y.rgb).max() < 0.1
 
 

@@ -1,4 +1,4 @@
-"""What importing `vfr_bake` asks of the libraries that multiply."""
+"""Settings that importing `vfr_bake` makes in the libraries that compute matrix products."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ print(len(os.listdir("/proc/self/task")))
 
 
 def test_numpy_multiplies_on_one_thread() -> None:
-    """Its own threads wait for one another in a busy loop, and for whatever else has the cores."""
+    """numpy multiplies on one thread: more would wait in busy loops for each other and other programs."""
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, env=environment)
     assert done.stdout == "1\n", done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""The table of presets in docs/bake.md is what the presets are."""
+"""The table of presets in docs/bake.md agrees with the presets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "bake.md"
 
 
 def rows() -> dict[str, list[str]]:
-    """The cells of each preset's row."""
+    """Return the cells of each preset's row."""
     text = DOCUMENT.read_text(encoding="utf-8").split("## What the presets decide\n\n")[1]
     table = text.split("\n\n")[0].splitlines()[2:]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
@@ -38,7 +38,7 @@ def test_a_row_says_what_the_preset_decides(name: str) -> None:
         assert head == "the model's own"
         return
     layers, width = map(int, re.findall(r"\d+", head)[:2])
-    # Two spatial layers and the first directional one come before the further directional ones.
+    # A head also has two spatial layers and a first directional one, before the further directional layers.
     assert (layers, width) == (3 + preset.head_layers, preset.head_width)
     harmonics = re.search(r"(\d+) spherical harmonics", head)
     assert (int(harmonics[1]) if harmonics else 16) == preset.head_bands**2

@@ -1,4 +1,4 @@
-"""A bake asks whether compiled code is right on this processor, and does without it where it is not."""
+"""A bake tests compiled code on this processor before it begins, and uses numpy if results are wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What compiles a bake's code ahead of it."""
+"""The rehearsal: the bake of a tiny model that compiles a bake's code ahead of time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_rehearsal_stores_and_refines_as_a_bake_does_and_leaves_nothing(
     baked: list[BakeResult] = []
     monkeypatch.setattr(rehearsal, "bake", lambda *arguments: baked.append(bake(*arguments)))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(os, "nice", lambda _: None)  # the next tests are not to come later
+    monkeypatch.setattr(os, "nice", lambda _: None)  # keeps the priority of the tests that follow
     rehearsal.main()
     (result,) = baked
     stages = {stage["name"] for stage in result.figures["stages"]}

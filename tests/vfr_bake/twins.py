@@ -1,6 +1,7 @@
-"""The hash grid, compositing and the march in plain torch: slow, readable, differentiable by autograd.
+"""Twins of the kernels in plain torch: the hash grid, compositing and the march, slow, readable and
+differentiable by autograd.
 
-The tests hold the kernels against them.
+The tests compare the kernels with them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from vfr_bake.kernels.hash_grid import N_CHANNELS, PRIME_Y, PRIME_Z
 
 
 def encode(grid: HashGrid, points: Tensor) -> Tensor:
-    """Features [n_points, n_channels] at `points` [n_points, 3] of the unit cube, level by level."""
+    """Return features [n_points, n_channels] at `points` [n_points, 3] of the unit cube, by levels."""
     outputs = []
     for level, n in enumerate(grid.layout.resolutions):
         position = points * n
@@ -32,7 +33,7 @@ def encode(grid: HashGrid, points: Tensor) -> Tensor:
 
 
 def rows_of(grid: HashGrid, vertices: Tensor, level: int) -> Tensor:
-    """Rows [n] of the table that belong to `vertices` [n, 3] of a level."""
+    """Return the rows [n] of the table that belong to `vertices` [n, 3] of a level."""
     x, y, z = vertices.unbind(-1)
     if grid.layout.hashed[level]:
         row = (x ^ (y * int(PRIME_Y)) ^ (z * int(PRIME_Z))) & grid.layout.mask
@@ -45,11 +46,11 @@ def rows_of(grid: HashGrid, vertices: Tensor, level: int) -> Tensor:
 def composite(
     sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, counts: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What `vfr_bake.rendering.compositing.composite` returns, ray by ray."""
+    """Return what `vfr_bake.rendering.compositing.composite` returns, computed ray by ray."""
     out, opacity, all_weights = [], [], []
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         depth = (sigmas * deltas)[start : start + count]
-        # The optical depth in front of each sample; a difference of sums would cancel behind a dense one.
+        # Optical depth in front of each sample. A difference of sums would cancel behind a dense sample.
         before = torch.cumsum(torch.cat([depth.new_zeros(1), depth]), dim=0)[:-1]
         weights = torch.exp(-before) * -torch.expm1(-depth)
         out.append((weights[:, None] * features[start : start + count]).sum(dim=0))
@@ -61,8 +62,8 @@ def composite(
 def march(
     field: VfrField, occupied: np.ndarray, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, step: float
 ) -> list[Tensor]:
-    """The t of every ray's visible samples, ray by ray and lattice point by lattice point: what
-    `vfr_bake.rendering.sampling.march` must find."""
+    """Return the t of every ray's visible samples, found ray by ray and lattice point by lattice point:
+    `vfr_bake.rendering.sampling.march` must find the same."""
     n = len(occupied)
     found = []
     for o, d, offset in zip(rays_o, rays_d, jitter, strict=True):

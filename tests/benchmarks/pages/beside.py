@@ -1,4 +1,4 @@
-"""What the parts found on two processors, side by side."""
+"""Results of two processors, side by side."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.benchmarks.suite.scenes import SCENES
 
 
 def _figures(results: Results) -> Iterator[tuple[str, str, str]]:
-    """What is told of the parts that are there, its figure, and the part that found it."""
+    """Yield the name of each figure of the recorded parts, the figure, and the part that found it."""
     for scene in SCENES:
         trained, scored = results.get(f"train_{scene}"), results.get(f"eval_{scene}")
         if trained and scored:
@@ -53,8 +53,8 @@ def _figures(results: Results) -> Iterator[tuple[str, str, str]]:
 
 
 def _column(results: Results, first: int) -> tuple[str, dict[str, str]]:
-    """The title of a file's column, and each figure by what it tells, with machine and commit where the file
-    has several machines, whose letters begin with that of the number `first`."""
+    """Return the title of a file's column, and each figure by its name. If the file has several machines,
+    figures have their machine and commit; the machines' letters begin with that of number `first`."""
     places = [f"{machine['processor']}, {machine['cores']} cores" for machine in machines(results)]
     figures = {what: (figure, name) for what, figure, name in _figures(results)}
     if len(places) > 1:
@@ -68,7 +68,7 @@ def _column(results: Results, first: int) -> tuple[str, dict[str, str]]:
 
 
 def beside(results: Results, second: Results) -> list[str]:
-    """The lines of a table with a column for each of the two files of results."""
+    """Return the lines of a table with a column for each of the two files of results."""
     titles, columns = zip(_column(results, 0), _column(second, len(machines(results))), strict=True)
     told = [name for name in columns[0] if name in columns[1]]
     told += [name for name in columns[1] if name not in columns[0]]

@@ -1,4 +1,4 @@
-"""Cells, rows and tables in Markdown, and what is told of figures that are not there."""
+"""Cells, rows and tables in Markdown, and lines in place of missing figures."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from tests.benchmarks.suite.parts import PARTS
 from tests.benchmarks.suite.results import Results
 
 Block = Callable[[Results], list[str]]
-"""Makes the lines of a block from the results."""
+"""Function that makes the lines of a block from the results."""
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """
+    """Return the lines of a table.
+
     >>> table(["a", "b"], [["1", "2"]])
     ['| a | b |', '|---|---|', '| 1 | 2 |']
     """
@@ -24,7 +25,8 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def number(value: float | None, digits: int, unit: str = "") -> str:
-    """
+    """Return a number with so many digits behind the point, or "" for None.
+
     >>> number(1234.56, 1), number(None, 1), number(0.004, 2, " dB")
     ('1,234.6', '', '0.00 dB')
     """
@@ -35,7 +37,8 @@ def number(value: float | None, digits: int, unit: str = "") -> str:
 
 
 def give_or_take(value: float | None, uncertainty: float | None, digits: int) -> str:
-    """
+    """Return a number with its uncertainty, if that is known.
+
     >>> give_or_take(12.34, 0.26, 1), give_or_take(12.34, None, 1)
     ('12.3 ± 0.3', '12.3')
     """
@@ -45,7 +48,7 @@ def give_or_take(value: float | None, uncertainty: float | None, digits: int) ->
 
 
 def rate(ms: float, uncertainty: float) -> str:
-    """Frames a second, from milliseconds a frame.
+    """Return the frames a second, from milliseconds a frame.
 
     >>> rate(80, 2), rate(700, 7)
     ('12.5 ± 0.3', '1.43 ± 0.01')
@@ -56,7 +59,8 @@ def rate(ms: float, uncertainty: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """
+    """Return a duration in seconds, or in minutes from 300 s on.
+
     >>> duration(59.6), duration(600), duration(0.04)
     ('60 s', '10.0 min', '0.04 s')
     """
@@ -68,7 +72,8 @@ def duration(seconds: float) -> str:
 
 
 def megabytes(n_bytes: float) -> str:
-    """
+    """Return megabytes, without digits behind the point from 100 MB on.
+
     >>> megabytes(4.94e6), megabytes(143.2e6)
     ('4.9', '143')
     """
@@ -80,7 +85,7 @@ def gigabytes(mb: float) -> str:
 
 
 def machines(results: Results) -> list[dict[str, Any]]:
-    """The machines of all parts, each once; A is the first."""
+    """Return the machines of all parts, each once, in the order of their letters from A on."""
     found: list[dict[str, Any]] = []
     for part in results.values():
         if part["machine"] not in found:
@@ -93,27 +98,27 @@ def letter(index: int) -> str:
 
 
 def where(results: Results, name: str, first: int = 0) -> str:
-    """Machine and commit of a part; * where other programs took more than counts as quiet. The machines'
-    letters begin with that of the number `first`."""
+    """Return machine and commit of a part, with * if other programs took more than counts as quiet. The
+    machines' letters begin with the letter of number `first`."""
     part = results[name]
     beside = "*" if max(part["others"], part["others_before"]) > QUIET else ""
     return f"{letter(first + machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
 
 
 def measured_on(results: Results, names: Sequence[str]) -> list[str]:
-    """A line for tables that have no column for it, behind a blank one."""
+    """Return a blank line and a line with machines and commits, for tables without a column for these."""
     places = list(dict.fromkeys(where(results, name) for name in names))
     return ["", f"Machine and commit: {'; '.join(places)}."] if places else []
 
 
 def present(results: Results, names: Iterable[str]) -> tuple[list[str], list[str]]:
-    """The parts that are there, and those that are not."""
+    """Return the parts that have results, and those that have none."""
     names = list(names)
     return [name for name in names if name in results], [name for name in names if name not in results]
 
 
 def missing(names: Sequence[str]) -> list[str]:
-    """The line that names the command for figures that are not there, behind a blank one."""
+    """Return a blank line and a line with the command for missing figures, or nothing if none is missing."""
     if not names:
         return []
     if all(PARTS[name].core for name in names):
@@ -122,13 +127,13 @@ def missing(names: Sequence[str]) -> list[str]:
 
 
 def titled(titles: Sequence[str], rows: Sequence[Sequence[str]], lacking: Sequence[str]) -> list[str]:
-    """A table if it has a row, and the line about parts that are not there."""
+    """Return a table, if it has rows, and the line about missing parts."""
     lines = [*(table(titles, rows) if rows else []), *missing(lacking)]
     return lines if rows else lines[1:]
 
 
 def command(results: Results, name: str, starts: str) -> str:
-    """The first command of a part that starts so, without what only says where its figures go."""
+    """Return the first command of a part that begins with `starts`, without the option `--json`."""
     words = shlex.split(next(line for line in results[name]["commands"] if line.startswith(starts)))
     if "--json" in words:
         at = words.index("--json")

@@ -1,4 +1,5 @@
-"""The documents that have figures of the benchmarks: each between two comments, and made from the results.
+"""Documents with figures of the benchmarks. Each block stands between two comments, and is made from the
+results.
 
 <!-- benchmarks: NAME -->
 what `BLOCKS[NAME]` makes of the results, or `BESIDE[NAME]` of those of two processors
@@ -24,7 +25,7 @@ BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)"
 
 
 def rendered(text: str, results: Results, second: Results) -> str:
-    """A document with its blocks made anew. Raises KeyError for a block that nobody knows.
+    """Return a document with its blocks made anew. Raises KeyError for an unknown block.
 
     `results`: of a processor without AVX-512; `second`: of one with it.
     """
@@ -38,12 +39,12 @@ def rendered(text: str, results: Results, second: Results) -> str:
 
 
 def prose(text: str) -> str:
-    """A document without its blocks."""
+    """Return a document without its blocks."""
     return BLOCK.sub("", text)
 
 
 def rendered_files(results: Results, second: Results) -> dict[Path, bytes]:
-    """What each file is, documents and plots."""
+    """Return the content of each file, documents and plots."""
     files = {}
     for name in DOCUMENTS:
         path = REPOSITORY / name
@@ -54,7 +55,7 @@ def rendered_files(results: Results, second: Results) -> dict[Path, bytes]:
 
 
 def render_all(results: Results, second: Results) -> list[Path]:
-    """Write what is not yet so; returns it."""
+    """Write the files whose content differs, and return their paths."""
     written = []
     for path, data in rendered_files(results, second).items():
         if not path.is_file() or path.read_bytes() != data:

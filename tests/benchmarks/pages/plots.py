@@ -7,22 +7,22 @@ from tests.benchmarks.suite.scenes import SCENES
 from vfr_bake.bench.plot import Mark, plot
 
 FILE = 'xmlns="http://www.w3.org/2000/svg" font-family="sans-serif" font-size="13" style="background:#fff"'
-"""What an SVG file has beside an SVG inside of a page."""
+"""Attributes that an SVG file has, and an SVG inside a page has not."""
 
 
 def plot_name(scene: str) -> str:
-    """The file in docs/."""
+    """Return the name of the plot's file in docs/."""
     return f"trade_{scene}.svg"
 
 
 def plots(results: Results) -> dict[str, str]:
-    """Those of the scenes that are there, by the name of the file."""
+    """Return the plots of the scenes that have results, by the names of their files."""
     names = {scene: f"trade_{scene}" for scene in (*SCENES, "dials")}
     return {plot_name(scene): _plot(results, scene) for scene, name in names.items() if name in results}
 
 
 def _plot(results: Results, scene: str) -> str:
-    """PSNR against frames a second; the area of a mark is the asset's share of the largest one's bytes."""
+    """Plot PSNR against frames a second; a mark's area is the asset's share of the largest one's bytes."""
     figures = results[f"trade_{scene}"]["figures"]
     size = figures["size"]
     rows = [row for row in figures["settings"] if row["asset"] is not None]

@@ -30,12 +30,13 @@ from tests.benchmarks.suite.scenes import SCENES
 
 BAKES = [f"bake_{scene}_{preset}" for scene, presets in PRESETS.items() for preset in presets]
 VERSIONS = ("python", "numpy", "numba", "onnxruntime", "torch")
-"""Libraries whose versions are shown, of those that the results have."""
+"""Libraries of the results whose versions are shown."""
 QUALITIES = ("exact", "high", "fast")
 
 
 def asset_name(part: str) -> str:
-    """
+    """Return the name of a part's asset in tables.
+
     >>> asset_name("bake_lego_balanced"), asset_name("dial_lego_head32")
     ('lego, balanced', 'lego, head32')
     """
@@ -44,7 +45,7 @@ def asset_name(part: str) -> str:
 
 
 def own_setting(results: Results, part: str, quality: str = "exact") -> dict[str, Any] | None:
-    """The row of the trade that plays a baked asset with its own number of lookups."""
+    """Return the row of the trade in which a baked asset is played with its own number of lookups."""
     for name, result in results.items():
         if name.startswith("trade_"):
             for row in result["figures"]["settings"]:
@@ -158,7 +159,7 @@ def baking(results: Results) -> list[str]:
         found, played = results[name]["figures"], own_setting(results, name)
         n_bytes = found["n_bytes"] - found["bytes"]["manifest.json"]
         if played is not None and played["n_bytes"] != n_bytes:
-            played = None  # of another asset
+            played = None  # another asset's
         row = [
             asset_name(name),
             where(results, name),
@@ -175,7 +176,7 @@ def baking(results: Results) -> list[str]:
 
 
 def presets(results: Results) -> list[str]:
-    """What each preset takes, loses and plays, for those who choose one."""
+    """Return the table of the presets for those who choose one: bytes, time, loss and frames a second."""
     names = [
         (f"bake_{scene}_{preset}", scene, preset) for scene in ("lego", "fox") for preset in PRESETS[scene]
     ]
@@ -199,7 +200,7 @@ def presets(results: Results) -> list[str]:
 
 
 def curve(results: Results) -> list[str]:
-    """Loss against bytes: the presets, and what limits on the size give."""
+    """Return the table of loss by bytes: of the presets, and of limits on the size."""
     names = [
         *(f"bytes_lego_{mb}" for mb in LIMITS_MB),
         *(f"bake_lego_{preset}" for preset in PRESETS["lego"]),
@@ -247,7 +248,7 @@ def lookups(results: Results) -> list[str]:
 
 
 def _lookup_rows(name: str, found: dict[str, Any], ks: list[str]) -> list[list[str]]:
-    """Mean loss over views and seeds, give or take what the views leave open, and the range of the seeds."""
+    """Return rows of mean losses over views and seeds, with the views' uncertainty and the seeds' range."""
     scene = name.partition("_")[2]
     rows = []
     every = {seed: np.array(found[f"every, seed {seed}"]["0"]) for seed in SEEDS}
@@ -298,7 +299,7 @@ def page(results: Results) -> list[str]:
 
 
 def playing(results: Results) -> list[str]:
-    """Frames a second by march and quality."""
+    """Return the table of frames a second by march and quality."""
     there, lacking = present(results, [*plays(SCENES["lego"]), *plays(SCENES["fox"])])
     rows = []
     for name in there:
@@ -319,7 +320,7 @@ def playing(results: Results) -> list[str]:
 
 
 def frame_parts(results: Results) -> list[str]:
-    """Where the time of an exact frame goes, and how long the first picture takes."""
+    """Return the table of where the time of an exact frame goes, and of the time to the first picture."""
     needed = [f"trade_{scene}" for scene in SCENES]
     there, lacking = present(results, needed)
     rows = []
@@ -366,7 +367,7 @@ def specks(results: Results) -> list[str]:
 
 
 def expect(results: Results) -> list[str]:
-    """The README's table: lego trained, and of two presets what they take, lose and play."""
+    """Return the README's table: lego's training, and two presets' time, bytes, loss and frame rates."""
     rows, lacking = [], present(results, ["train_lego", "eval_lego"])[1]
     if not lacking:
         trained, score = results["train_lego"]["figures"], results["eval_lego"]["figures"]

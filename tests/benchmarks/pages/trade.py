@@ -1,4 +1,4 @@
-"""The tables of docs/trade.md: what speed and bytes cost, and what to choose when."""
+"""Tables of docs/trade.md: what speed and bytes cost, and which settings to choose for a purpose."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ Row = dict[str, Any]
 
 
 class Wish(NamedTuple):
-    """What somebody wants, and how it chooses among settings."""
+    """Purpose of a user, and the rule by which it chooses among settings."""
 
     wanted: str
     fits: Callable[[Row, float], bool]
-    """Whether a row, whose frame takes so many milliseconds, will do."""
+    """Returns whether a row, whose frame takes so many milliseconds, meets the purpose."""
     cost: Callable[[Row, float], tuple[float, ...]]
-    """The least of these is chosen."""
+    """Returns the cost of a row; the row with the least cost is chosen."""
 
 
 def _loss(row: Row) -> float:
@@ -70,12 +70,13 @@ WISHES = (
 
 
 def played_rows(results: Results, name: str) -> list[Row]:
-    """The settings of a trade that are of an asset."""
+    """Return the settings of a trade that play an asset, not the full model."""
     return [row for row in results[name]["figures"]["settings"] if row["asset"] is not None]
 
 
 def setting_name(row: Row) -> str:
-    """
+    """Return the name of a setting in tables.
+
     >>> setting_name({"asset": "bake_lego_fast", "n_fetches": 0, "quality": "high"})
     'lego, fast; k = all, `high`'
     """
@@ -84,7 +85,7 @@ def setting_name(row: Row) -> str:
 
 
 def choose(results: Results) -> list[str]:
-    """What to choose when, of an object and of a capture."""
+    """Return the table of settings to choose for each purpose, for an object and for a capture."""
     there, lacking = present(results, ["trade_lego", "trade_fox"])
     rows = []
     for wish in WISHES:
@@ -108,7 +109,7 @@ def choose(results: Results) -> list[str]:
 
 
 def scene_section(results: Results, scene: str) -> list[str]:
-    """The plot of a scene, and its settings that nothing else beats; of the dials those with their own k."""
+    """Return a scene's plot and its settings that nothing else beats; for dials, those with their own k."""
     name = f"trade_{scene}"
     if name not in results:
         return missing([name])[1:]
@@ -146,7 +147,7 @@ def scene_section(results: Results, scene: str) -> list[str]:
 
 
 def full_model(results: Results) -> list[str]:
-    """What the models themselves take, which is what baking is for."""
+    """Return the table of the full models' cost, which baking saves."""
     there, lacking = present(results, [f"trade_{scene}" for scene in SCENES])
     rows = []
     for name in there:

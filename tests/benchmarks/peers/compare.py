@@ -1,11 +1,11 @@
-"""Another tool that trains without a GPU beside this one: the same views, machine, minutes and pixels.
+"""Compare another tool that trains without a GPU with this one: same views, machine, minutes and pixels.
 
     python -m tests.benchmarks.peers.compare DATA --nerfstudio NS/bin/python --minutes 2 5 10
 
-NS is an environment of its own that nerfstudio 1.1.5 is installed in. Its nerfacto trains once and is looked
-at after so many minutes, as its schedule does not know how long it will train; vfr-train's does, and trains
-as often as there are minutes. Both have the pictures without their lens' distortion. Prints the PSNR of both
-over the same pixels of all test views, over white where there is alpha: the mean over the views.
+NS is an environment of its own, with nerfstudio 1.1.5. Its nerfacto trains once and is evaluated after each
+number of minutes, because its schedule does not depend on how long it will train. The schedule of vfr-train
+does, so it trains once for each number of minutes. Both get the pictures without lens distortion. Prints the
+PSNR of both over the same pixels of all test views, over white if there is alpha: the mean over the views.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from vfr_bake.training.trainer import Trainer
 
 WHITE = np.ones(3)
 N_PIXELS = 20_000
-"""Pixels of all test views together that are looked at."""
+"""Number of pixels that are compared in all test views together."""
 
 
 class Mark(NamedTuple):
-    """How far a training has come."""
+    """State of a training after some time."""
 
     steps: int
     seconds: float
-    """What the training alone has taken."""
+    """Seconds of training alone."""
     colours: np.ndarray
-    """[n_views, n, 3] in [0, 1], of the pixels that are looked at."""
+    """[n_views, n, 3] in [0, 1]: colours of the pixels that are compared."""
 
 
 def write_nerfstudio(scene: Scene, folder: Path) -> None:
-    """The pictures of a scene without end and their cameras in nerfstudio's format; the names of the files
-    say which of them are held out."""
+    """Write the pictures and cameras of an unbounded scene in nerfstudio's format, in which the names of the
+    files say which pictures are held out."""
     (folder / "images").mkdir()
     frames = []
     for split, views in (("train", scene.train), ("eval", scene.test)):
@@ -60,7 +60,7 @@ def write_nerfstudio(scene: Scene, folder: Path) -> None:
 
 
 def chosen_pixels(scene: Scene) -> np.ndarray:
-    """[n_views, n, 2] int64: row and column of the pixels that are looked at."""
+    """Return the rows and columns of the pixels that are compared, [n_views, n, 2] int64."""
     generator = np.random.default_rng(0)
     n = N_PIXELS // len(scene.test.cameras)
     sizes = np.array([(camera.height, camera.width) for camera in scene.test.cameras])
@@ -68,7 +68,7 @@ def chosen_pixels(scene: Scene) -> np.ndarray:
 
 
 def ours(scene: Scene, minutes: float, places: np.ndarray) -> Mark:
-    """A training of vfr-train that takes so many minutes."""
+    """Train with vfr-train for so many minutes, and return its state."""
     trainer = Trainer(scene, TrainConfig(device="cpu", minutes=minutes))
     for _ in trainer.run():
         pass
@@ -82,7 +82,7 @@ def ours(scene: Scene, minutes: float, places: np.ndarray) -> Mark:
 
 
 def nerfacto(scene: Scene, options: argparse.Namespace, places: np.ndarray) -> list[Mark]:
-    """One training of nerfacto, as it was after each of the minutes."""
+    """Train with nerfacto once, and return its state after each number of minutes."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         if scene.unbounded:

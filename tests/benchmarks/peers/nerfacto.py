@@ -4,10 +4,10 @@ Runs in an environment that has nerfstudio 1.1.5 and not this package; `compare.
 
     python nerfacto.py DATA pixels.npz colours.npz --minutes 2 5 10 --rays 4096 [--object]
 
-DATA is a folder in nerfstudio's format, or one of NeRF-synthetic with --object. pixels.npz has "pixels"
-[n, 3] int64: test view, row and column. colours.npz gets "colours" [n_marks, n, 3] float32 in [0, 1] and,
-for each mark, "steps" and "seconds", of training alone. All settings are nerfacto's own, but for what its
-documentation says of a CPU and of synthetic objects, and the rays of a batch.
+DATA is a folder in nerfstudio's format, or with --object one of NeRF-synthetic. pixels.npz holds "pixels" [n,
+3] int64: test view, row and column. colours.npz gets "colours" [n_marks, n, 3] float32 in [0, 1] and, for
+each mark, "steps" and "seconds" of training alone. All settings are nerfacto's own, except those that its
+documentation advises for CPUs and for synthetic objects, and the rays of a batch.
 """
 
 # pyright: reportMissingImports=false
@@ -30,11 +30,11 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from torchmetrics.image import lpip
 
 AT_ONCE = 4096
-"""Pixels that are rendered at once."""
+"""Number of pixels that are rendered at once."""
 
 
 def configured(data: Path, is_object: bool, n_rays: int, outputs: Path) -> TrainerConfig:
-    """nerfacto's configuration for a CPU."""
+    """Return nerfacto's configuration for a CPU."""
     config = method_configs["nerfacto"]
     config.machine.device_type = "cpu"
     config.mixed_precision = False
@@ -58,7 +58,7 @@ def configured(data: Path, is_object: bool, n_rays: int, outputs: Path) -> Train
 
 
 def train_step(trainer: Trainer, step: int) -> None:
-    """One step, as nerfstudio's own loop takes it."""
+    """Take one step as nerfstudio's own loop does."""
     trainer.pipeline.train()
     for callback in trainer.callbacks:
         callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
@@ -69,7 +69,7 @@ def train_step(trainer: Trainer, step: int) -> None:
 
 @torch.no_grad()
 def rendered(trainer: Trainer, pixels: torch.Tensor) -> np.ndarray:
-    """[n, 3] colours of pixels [n, 3] of the test views."""
+    """Return the colours [n, 3] of pixels [n, 3] of the test views."""
     trainer.pipeline.eval()
     rays = RayGenerator(trainer.pipeline.datamanager.eval_dataset.cameras)
     parts = [trainer.pipeline.model(rays(some))["rgb"] for some in pixels.split(AT_ONCE)]
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--object", action="store_true")
     options = parser.parse_args()
     torch.manual_seed(0)
-    # A score that is not asked for here, and whose network would be downloaded.
+    # A score that is not needed here, and for which a network would be downloaded.
     lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
     with np.load(options.pixels, allow_pickle=False) as found:
         pixels = torch.from_numpy(found["pixels"])

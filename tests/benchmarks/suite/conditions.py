@@ -1,4 +1,4 @@
-"""Under which conditions something is measured: machine, load, commit and versions. Linux alone."""
+"""Conditions under which something is measured: machine, load, commit and versions. Linux alone."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from typing import Any, NamedTuple
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 MEASURED = ("player", "exporters", "vfr_bake", "constraints.txt")
-"""What a figure depends on: a later commit that leaves these alone leaves the figures valid."""
+"""Paths on which figures depend: a later commit that does not change these leaves the figures valid."""
 FEATURES = (
     *("sse4_2", "avx", "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx_vnni"),
     *("avx512_bf16", "amx_int8", "asimd", "asimddp", "i8mm", "sve"),
 )
-"""Processor features that compiled code or a library makes use of."""
+"""Processor features that compiled code or a library uses."""
 LIBRARIES = (
     *("numpy", "numba", "llvmlite", "onnxruntime", "torch", "scipy", "Pillow", "opencv-python-headless"),
     *("pycolmap", "scikit-image", "open3d-cpu", "playwright"),
 )
 QUIET = 0.05
-"""Share of all processors that other programs may take on a machine that counts as quiet."""
+"""Largest share of all processors that other programs may take on a machine that counts as quiet."""
 LOOK = 5.0
-"""Seconds for which a look at the load lasts."""
+"""Seconds for which the load is observed."""
 
 
 class BusyError(Exception):
-    """Other programs kept the machine busy for as long as was to be waited."""
+    """Raised if other programs kept the machine busy for all of the time to wait."""
 
 
 class Ticks(NamedTuple):
@@ -44,7 +44,7 @@ class Ticks(NamedTuple):
 
 
 def parse_ticks(stat: str, ticks_a_second: int) -> Ticks:
-    """The first line of /proc/stat; what a hypervisor gave to others counts as busy.
+    """Parse the first line of /proc/stat. Time that a hypervisor gave to others counts as busy.
 
     >>> parse_ticks("cpu  100 0 50 700 50 0 0 100 0 0", 100)
     Ticks(busy=2.5, total=10.0)
@@ -60,9 +60,9 @@ def ticks() -> Ticks:
 
 
 def adopt_orphans() -> None:
-    """From now on this process becomes the parent of what its children leave behind.
+    """Make this process the parent of processes that its children leave behind from now on.
 
-    A browser does that to the process that draws, whose time would count as another program's.
+    A browser leaves behind the process that draws, whose time would count as another program's.
     """
     subreaper = 36  # PR_SET_CHILD_SUBREAPER
     if ctypes.CDLL(None).prctl(subreaper, 1, 0, 0, 0):
@@ -70,8 +70,8 @@ def adopt_orphans() -> None:
 
 
 def bury_orphans() -> None:
-    """Wait, for a few seconds at most, until all that was adopted has ended; what it took is then known to be
-    of this process."""
+    """Wait, for a few seconds at most, until all adopted processes have ended. From then on their time counts
+    as this process's time."""
     until = time.monotonic() + LOOK
     try:
         while time.monotonic() < until:
@@ -82,8 +82,8 @@ def bury_orphans() -> None:
 
 
 class OthersClock:
-    """The share of all processors that other programs take from now on. What a child of this process took is
-    known when it has ended."""
+    """Measures the share of all processors that other programs take from now on. The time of a child of this
+    process is known when the child has ended."""
 
     def __init__(self) -> None:
         self._ticks, self._own = ticks(), self._seconds()
@@ -100,7 +100,7 @@ class OthersClock:
 
 
 def others_now() -> float:
-    """The share that other programs take while this one waits."""
+    """Return the share that other programs take while this one waits."""
     clock = OthersClock()
     time.sleep(LOOK)
     return clock.share()
@@ -113,16 +113,16 @@ def wait_until_quiet(
     look: Callable[[], float] = others_now,
     now: Callable[[], float] = time.monotonic,
 ) -> float:
-    """Wait for a quiet machine; returns the share that other programs take.
+    """Wait for a quiet machine, and return the share that other programs take.
 
     Args:
         minutes: to wait at most.
-        anyway: go on on a busy machine after that.
-        say: is given a line for the user at every look.
+        anyway: go on after that even if the machine is busy.
+        say: gets a line for the user at every look.
         look: measures the share.
-        now: seconds of a clock.
+        now: returns seconds of a clock.
 
-    Raises BusyError where it is busy for all of that time, unless `anyway`.
+    Raises BusyError if the machine is busy for all of that time, unless `anyway`.
     """
     begin = now()
     while (share := look()) > QUIET:
@@ -142,7 +142,8 @@ def wait_until_quiet(
 
 
 def parse_machine(cpuinfo: str, meminfo: str) -> dict[str, Any]:
-    """What is kept of the machine, from the texts of /proc/cpuinfo and /proc/meminfo.
+    """Return the description of the machine that is recorded, from the texts of /proc/cpuinfo and
+    /proc/meminfo.
 
     >>> cpuinfo = "processor: 0\\nmodel name: AMD EPYC\\ncpu family: 26\\nmodel: 2\\nflags: fpu avx2 fma\\n"
     >>> parse_machine(cpuinfo, "MemTotal: 25165824 kB")["processor"]
@@ -181,12 +182,12 @@ def libraries() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The last commit that changed what is measured."""
+    """Return the last commit that changed something under the paths MEASURED."""
     return _git("log", "-1", "--format=%h", "--abbrev=10", "--", *MEASURED).strip()
 
 
 def changed_files() -> list[str]:
-    """Files of what is measured that are not as they were committed."""
+    """Return the files under the paths MEASURED that differ from the commit."""
     return [line[3:] for line in _git("status", "--porcelain", "--", *MEASURED).splitlines()]
 
 

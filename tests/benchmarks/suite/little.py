@@ -12,9 +12,9 @@ from tests.benchmarks.suite.scenes import SCENES
 
 
 def write_data_sets(root: Path) -> None:
-    """The built-in scene as NeRF-synthetic, 12 views to train on and 2 to test, under every name; what is
-    there stays."""
-    from vfr_bake.data.demo import demo_views  # only where something is written: numba takes memory
+    """Write the built-in scene as NeRF-synthetic, 12 views to train on and 2 to test, under every data set's
+    name, unless `root` exists."""
+    from vfr_bake.data.demo import demo_views  # only if something is written: numba takes memory
 
     if root.is_dir():
         return

@@ -19,30 +19,30 @@ PRESETS = {
     "can": {"balanced": 9.0},
     "demo": {"balanced": 5.0},
 }
-"""Presets that each scene is baked with, and the minutes that they take without AVX-512, as of all parts."""
+"""Presets with which each scene is baked, and the minutes of each, like all parts' without AVX-512."""
 LIMITS_MB = ("1", "2", "3")
-"""The curve of bytes: limits on the size of lego's asset, balanced."""
+"""Limits on the size of lego's balanced asset, in MB, for the curve of loss by bytes."""
 DIALS = {
     "head32": ("--head-width", "32"),
     "head128": ("--head-width", "128"),
     "channels8": ("--n-channels", "8"),
     "cells400": ("--resolution", "400"),
 }
-"""Settings of which one at a time is changed in lego's asset, balanced."""
+"""Settings that are changed one at a time in lego's balanced asset."""
 MINUTES = (1.0, 2.0, 5.0)
-"""Shorter trainings of lego."""
+"""Minutes of shorter trainings of lego."""
 SEEDS = (0, 1, 2)
 REFINED_AT = {"every": "0", "k5": "5"}
-"""Numbers of lookups that the assets of the part `lookups` are baked and refined for; 0: every sample."""
+"""Numbers of lookups for which the assets of the parts `lookups` are baked and refined; 0: every sample."""
 
 
 COMPILING = ("train_lego", "train_fox", "eval_lego", "eval_fox", "bake_lego_balanced", "bake_lego_fidelity",
              "bake_fox_balanced", "bake_fox_phone", "play_fox_phone")  # fmt: skip
-"""Parts that make use of all code that is compiled."""
+"""Parts that together use all compiled code."""
 
 
 def compiled(work: Work) -> dict[str, Any]:
-    """Run a few parts on next to nothing, so that code is compiled and kept before anything is timed."""
+    """Run a few parts on tiny data, so that code is compiled and kept before anything is timed."""
     if not work.quick:
         write_data_sets(work.folder / "data")
         for name in COMPILING:
@@ -53,17 +53,17 @@ def compiled(work: Work) -> dict[str, Any]:
 
 
 def bakes(scene: Scene) -> tuple[str, ...]:
-    """The parts that bake the presets of a scene."""
+    """Return the names of the parts that bake the presets of a scene."""
     return tuple(f"bake_{scene.name}_{preset}" for preset in PRESETS[scene.name])
 
 
 def plays(scene: Scene) -> tuple[str, ...]:
-    """The parts that play what `bakes` has."""
+    """Return the names of the parts that play the assets of `bakes`."""
     return tuple(f"play_{scene.name}_{preset}" for preset in PRESETS[scene.name])
 
 
 PAGES = {name.replace("bake_", "page_"): name for name in (*bakes(LEGO)[1:], "bake_fox_phone")}
-"""The parts that measure a page, and the assets that these are of."""
+"""Parts that measure a page, and the parts that bake their assets."""
 
 
 def _training(scene: Scene, minutes: float) -> Part:
@@ -78,7 +78,7 @@ def _score(scene: Scene, minutes: float) -> Part:
 
 
 def _shorter(minutes: float) -> list[Part]:
-    """Lego trained for fewer minutes, and its score."""
+    """Return the parts that train lego for fewer minutes and score it."""
     trained = f"train_lego_{minutes:g}"
     measures = partial(train, scene=LEGO, minutes=minutes), partial(score, scene=LEGO, model_of=trained)
     return [
@@ -93,7 +93,7 @@ def _bake(name: str, model_of: str, minutes: float, *options: str, core: bool = 
 
 def _play(scene: Scene, name: str, of: str) -> Part:
     measure = partial(played.qualities, scene=scene, asset_of=of)
-    core = not name.endswith("_phone")  # whose frames the trade has, too, but those of the slow march
+    core = not name.endswith("_phone")  # the trade has frames of `phone` too, but not of the slow march
     return Part(name, measure, 4.0 if scene.unbounded else 1.5, (of,), scene.data, core)
 
 
@@ -104,7 +104,7 @@ def _trade(name: str, scene: Scene, of: tuple[str, ...], minutes: float, core: b
 
 
 def _lookups(scene: Scene, minutes: float) -> list[Part]:
-    """Trainings with three seeds, each baked for every sample and for a few lookups; then all are played."""
+    """Return parts that train with three seeds, bake for every sample and for few lookups, and play all."""
     parts, columns = [], {}
     for seed in SEEDS:
         trained = f"train_{scene.name}_seed{seed}"
@@ -146,7 +146,7 @@ def _core() -> list[Part]:
 
 
 def _more() -> list[Part]:
-    """What takes longer than it tells, and is run when it is asked for."""
+    """Return the parts that take long for what they show, and are run on request only."""
     dials = [
         _bake(f"dial_lego_{name}", "train_lego", 4.0, *words, core=False) for name, words in DIALS.items()
     ]

@@ -1,4 +1,4 @@
-"""What is measured of assets: the trade, qualities, exports, pages, lookups."""
+"""Measurements of assets: the trade, qualities, exports, pages, lookups."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.benchmarks.suite.work import Usage, Work
 
 LOOKUPS = ("1", "2", "3", "4", "5", "8", "12", "16", "32", "0")
 TIMES = ("median", "uncertainty", "p95", "frames", "march", "lookups", "head")
-"""What is kept of the times of a setting, in milliseconds a frame."""
+"""Figures of a setting's times that are kept, in milliseconds a frame."""
 EXPORTS: dict[str, tuple[str, int]] = {
     "scene.html": ("", 3),
     "mesh.glb": ("", 3),
@@ -20,13 +20,13 @@ EXPORTS: dict[str, tuple[str, int]] = {
     "points.ply": ("--points 200000", 3),
     "scene.vdb": ("--colour", 1),
 }
-"""Files that are exported: options, and how often: once where it takes a minute or more."""
+"""Files that are exported, with the options and the number of exports: one if it takes a minute or more."""
 
 
 def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, ...]) -> dict[str, Any]:
-    """`vfr-bench` of some assets of a scene: every number of lookups and every quality.
+    """Run `vfr-bench` on some assets of a scene, with every number of lookups and every quality.
 
-    `size` of the figures is that of the frames by which settings are compared.
+    `size` of the figures is the size of the frames by which settings are compared.
     """
     assets = [work.file(name, "asset") for name in bakes]
     model = work.file(f"train_{scene.name}", "model.pt")
@@ -55,7 +55,7 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
 
 
 def qualities(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
-    """Both marches with every quality, frame by frame in turns."""
+    """Measure both marches with every quality, frame by frame in turns."""
     size = work.little(scene.size, "24x24")
     frames = ("--frames", work.little(20, 2), "--numpy-frames", work.little(5, 2))
     words = ("--data", data_of(work, scene), "--views", str(scene.views), "--size", size, *frames)
@@ -64,7 +64,7 @@ def qualities(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
 
 
 def exports(work: Work, asset_of: str) -> dict[str, Any]:
-    """Exports to files, in turns."""
+    """Export to files of each kind, in turns."""
     asset = work.file(asset_of, "asset")
     taken: dict[str, list[Usage]] = {file: [] for file in EXPORTS}
     for turn in range(int(work.little(3, 1))):
@@ -86,28 +86,28 @@ def exports(work: Work, asset_of: str) -> dict[str, Any]:
 
 
 def page(work: Work, asset_of: str) -> dict[str, Any]:
-    """The page of an asset, in a browser that draws with the processor."""
+    """Measure the page of an asset, in a browser that draws on the processor."""
     little = ("--size", work.little(400, 32), "--views", work.little(3, 1), "--rounds", work.little(3, 1))
     work.command("bench_page", work.file(asset_of, "asset"), *little, "--json", work.folder / "page.json")
     return work.read("page.json")
 
 
 def cameras(work: Work, data: str) -> dict[str, Any]:
-    """Cameras that are estimated against those that are known; of a rendered ring to try it out."""
+    """Compare estimated cameras with known ones; of a rendered ring if the machinery is tried out."""
     if work.quick:
         return ring(work)
     return _script(work, "bench_cameras", "compare", work.data(data))
 
 
 def ring(work: Work) -> dict[str, Any]:
-    """The same of a rendered ring, whose cameras are known exactly."""
+    """Compare estimated cameras with the exactly known ones of a rendered ring."""
     folder, size = work.folder / "ring", (work.little(4000, 1000), work.little(3000, 750))
     work.command("bench_cameras", "ring", folder, "--views", work.little(300, 45), "--size", *size)
     return _script(work, "bench_cameras", "compare", folder)
 
 
 def lookups(work: Work, scene: Scene, bakes: dict[str, str]) -> dict[str, Any]:
-    """Loss of each view by the number of lookups; `bakes`: parts by the name of their column."""
+    """Measure each view's loss by the number of lookups; `bakes`: parts by the names of their columns."""
     assets = [work.file(name, "asset") for name in bakes.values()]
     words = ("--data", data_of(work, scene), "--views", work.little(50, 2), "--samples", *LOOKUPS)
     work.command("bench_lookups", *assets, *words, "--json", work.folder / "lookups.json")
@@ -116,19 +116,19 @@ def lookups(work: Work, scene: Scene, bakes: dict[str, str]) -> dict[str, Any]:
 
 
 def compositing(work: Work) -> dict[str, Any]:
-    """Features composited before the head against colours composited behind it."""
+    """Compare features composited before the head with colours composited behind it."""
     words = (work.data("lego_400"), "--minutes", work.little(3, "0.02"), "--views", work.little(12, 1))
     return _script(work, "bench_compositing", *words)
 
 
 def steps(work: Work) -> dict[str, Any]:
-    """Where the time of a training step goes."""
+    """Measure where the time of a training step goes."""
     little = ("--begin", work.little(1000, 5), "--turns", work.little(20, 2), "--steps", work.little(64, 2))
     return _script(work, "bench_training_step", work.data("lego_400"), "--threads", "2", *little)
 
 
 def specks(work: Work) -> dict[str, Any]:
-    """Specks of the balanced asset of lego against the model's pictures."""
+    """Count specks of lego's balanced asset that the model's pictures do not have."""
     asset, model = work.file("bake_lego_balanced", "asset"), work.file("train_lego", "model.pt")
     words = (asset, "--model", model, "--data", work.data("lego_400"), "--views", work.little(10, 1))
     return _script(work, "bench_specks", *words)
@@ -140,7 +140,7 @@ def _script(work: Work, name: str, *words: str | Path) -> dict[str, Any]:
 
 
 def of_runs(values: list[float]) -> dict[str, float]:
-    """The median of a few runs, and the least and the greatest.
+    """Return the median of a few runs, and the least and the greatest.
 
     >>> of_runs([3.0, 1.0, 2.0])
     {'median': 2.0, 'low': 1.0, 'high': 3.0, 'n': 3}

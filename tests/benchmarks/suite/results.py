@@ -1,4 +1,4 @@
-"""The file of results: for each part what it found, and under which conditions."""
+"""The file of results: for each part its figures, and the conditions under which they were found."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from tests.benchmarks.suite.conditions import REPOSITORY
 
 RESULTS = REPOSITORY / "docs" / "benchmarks.json"
 RESULTS_AVX512 = REPOSITORY / "docs" / "benchmarks_avx512.json"
-"""Beside the pages that are rendered from them, so that the source package has all; the first is of
-processors without AVX-512, which most people have, the second of those with it."""
+"""Files of results, beside the pages that are rendered from them, so that the source package has all of them.
+The first is of processors without AVX-512, which most people have; the second is of processors with it."""
 KEYS = {
     *("commit", "date", "machine", "load_before", "load_after", "others_before", "others", "libraries"),
     *("seeds", "commands", "seconds", "figures"),
 }
-"""What is kept of a part. `others_before` and `others` are the shares of all processors that other programs
-took before it and during it."""
+"""Keys that are kept of a part. `others_before` and `others` are the shares of all processors that other
+programs took before the part and during it."""
 
 Results = dict[str, dict[str, Any]]
 
 
 def results_path(machine: dict[str, Any]) -> Path:
-    """The file for what is measured on such a machine.
+    """Return the file for results of such a machine.
 
     >>> results_path({"features": ["avx2", "avx512f"]}).name, results_path({"features": ["avx2"]}).name
     ('benchmarks_avx512.json', 'benchmarks.json')
@@ -34,7 +34,7 @@ def results_path(machine: dict[str, Any]) -> Path:
 
 
 def read_results(path: Path = RESULTS) -> Results:
-    """The parts of a file, by name; none where there is no file. Raises ValueError for something else."""
+    """Return the parts of a file by name, none if there is no file. Raises ValueError for other content."""
     if not path.exists():
         return {}
     document = json.loads(path.read_text(encoding="utf-8"))
@@ -46,15 +46,15 @@ def read_results(path: Path = RESULTS) -> Results:
 
 
 def write_results(parts: Results, order: list[str], path: Path = RESULTS) -> None:
-    """Write the parts in this order, numbers rounded to six digits; parts that are not in `order` are left
-    out."""
+    """Write the parts in this order, with numbers rounded to six digits, without those not in `order`."""
     kept = {name: _rounded(parts[name]) for name in order if name in parts}
     text = json.dumps({"parts": kept}, indent=1, ensure_ascii=False, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
 
 
 def _rounded(value: Any) -> Any:
-    """
+    """Return a value with its numbers rounded to six digits, and None for numbers that are not finite.
+
     >>> _rounded({"psnr": [32.23456789, 3], "ssim": float("inf")})
     {'psnr': [32.2346, 3], 'ssim': None}
     """

@@ -1,4 +1,4 @@
-"""Runs parts, each when what it needs is there, and records each as soon as it has ended."""
+"""Runs parts, each once the parts that it needs are there, and records each as soon as it has ended."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Settings:
 
 
 class Runner:
-    """Some parts, on this machine, at this commit."""
+    """Runs parts on this machine, at this commit."""
 
     def __init__(
         self, parts: dict[str, Part], settings: Settings, commit: str, machine: dict[str, Any]
@@ -49,7 +49,7 @@ class Runner:
         self.settle: Callable[[], object] = conditions.bury_orphans
 
     def order(self, names: Sequence[str]) -> list[str]:
-        """The parts `names` that are to be run, each behind what it needs and lacks."""
+        """Return the parts to run for `names`, each behind the parts that it needs and that are missing."""
         recorded = read_results(self._settings.results)
         ordered: list[str] = []
 
@@ -60,7 +60,7 @@ class Runner:
             measured = (
                 result is not None and result["commit"] == self._commit and result["machine"] == self._machine
             )
-            # What a part has written may be gone, or of another machine, though its figures are there.
+            # Files of a part may be gone, or be another machine's, although its figures are recorded.
             there = measured and (asked or (self._settings.root / name / "whole").exists())
             if there and not (asked and self._settings.again):
                 return
@@ -73,7 +73,7 @@ class Runner:
         return ordered
 
     def run(self, names: Sequence[str]) -> dict[str, str]:
-        """Run them; returns what failed, and why. Raises BusyError."""
+        """Run the parts, and return which failed and why. Raises BusyError."""
         ordered = self.order(names)
         minutes = sum(self._parts[name].minutes for name in ordered)
         _say(f"parts to run: {len(ordered)}, about {minutes:.0f} minutes on two cores")

@@ -1,4 +1,4 @@
-"""The scenes that are measured: trained, scored and baked, each step by a command that a user has."""
+"""Scenes that are measured: trained, scored and baked, each step by a command that users have."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.benchmarks.suite.work import Work
 from vfr_bake.demo import TRAIN_MINUTES
 
 SEED = 0
-"""The commands' own."""
+"""Default seed of the commands."""
 
 
 @dataclass(frozen=True)
@@ -22,20 +22,20 @@ class Scene:
 
     name: str
     data: str
-    """Folder of the data sets, or "demo"."""
+    """Folder of the data set, or "demo"."""
     minutes: float | None = None
-    """Minutes of training, where they are not what the command takes by itself."""
+    """Minutes of training; None for the command's default."""
     reading: tuple[str, ...] = ()
-    """Options of vfr-train that say how pictures are read."""
+    """Options of vfr-train about reading the pictures."""
     unbounded: bool = False
     photographs_alone: bool = False
-    """Whether its cameras are left out and estimated."""
+    """True if its cameras are left out, so that they are estimated."""
     size: str = "800x800"
     """Pixels of the frames that are timed."""
     views: int = 25
-    """Test views of which the trade is measured, at most."""
+    """Largest number of test views for the trade."""
     frames: int = 12
-    """Timed frames of a setting, with which the trade's median is known."""
+    """Number of timed frames of a setting, enough for the median of the trade."""
 
 
 SCENES = {
@@ -50,14 +50,14 @@ SCENES = {
 
 
 def data_of(work: Work, scene: Scene) -> str:
-    """What the commands are given as DATA."""
+    """Return the argument DATA of the commands."""
     if scene.photographs_alone and not work.quick:
         return str(work.file(f"train_{scene.name}", "photos"))
     return work.data(scene.data)
 
 
 def train(work: Work, scene: Scene, minutes: float | None = None, seed: int = SEED) -> dict[str, Any]:
-    """Train, from photographs alone where the scene has them so; `minutes` instead of the scene's."""
+    """Train a scene, from photographs alone if it is measured so; `minutes` replaces the scene's."""
     data = data_of(work, scene)
     if scene.photographs_alone and not work.quick:
         shutil.copytree(Path(work.data(scene.data)) / "images", Path(data) / "images")
@@ -65,7 +65,7 @@ def train(work: Work, scene: Scene, minutes: float | None = None, seed: int = SE
     minutes = minutes or scene.minutes
     length = () if minutes is None else ("--minutes", f"{minutes:g}")
     settings = (*scene.reading, *length, "--seed", str(seed), "--eval-views", "0")
-    if work.quick and scene.unbounded:  # what stands in for its pictures is of an object
+    if work.quick and scene.unbounded:  # the data in place of its pictures show an object
         settings = ("--kind", "unbounded", *settings)
     usage = work.command("vfr-train", data, model, *settings, "--json", report)
     work.seeds.append(seed)
@@ -79,7 +79,7 @@ def train(work: Work, scene: Scene, minutes: float | None = None, seed: int = SE
 
 
 def score(work: Work, scene: Scene, model_of: str) -> dict[str, Any]:
-    """The full model of the part `model_of` against all test views."""
+    """Compare the full model of the part `model_of` with all test views."""
     model = work.file(model_of, "model.pt")
     usage = work.command("vfr-eval", model, data_of(work, scene), "--json", work.folder / "eval.json")
     found = work.read("eval.json")
@@ -123,7 +123,7 @@ def bake(work: Work, model_of: str, *options: str) -> dict[str, Any]:
 
 
 def uncertainty_of_mean(values: list[float]) -> float | None:
-    """Half of the interval around a mean that has it with 95 %, from the values' own spread.
+    """Return half of the 95 % interval around a mean, from the values' own spread.
 
     >>> round(uncertainty_of_mean([1.0, 2.0, 3.0, 4.0]), 3)
     1.265

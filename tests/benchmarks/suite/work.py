@@ -1,4 +1,4 @@
-"""What a part of the benchmarks is, and what it works with: its folder, its data and the commands it runs."""
+"""Parts of the benchmarks, and what they work with: a folder, data sets, and the commands that they run."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ LITTLE: dict[str, tuple[str, ...]] = {
     "vfr-bake": ("--mesh-resolution", "32", "--check-views", "1", "--refine-steps", "20"),
     "vfr-bench": ("--views", "1", "--frames", "2", "--sizes", "24x24", "--samples", "1", "5"),
 }
-"""What is added to a command to try out the machinery."""
+"""Options that are added to a command to try out the machinery."""
 
 
 class PartError(Exception):
-    """A command of a part failed."""
+    """Raised if a command of a part fails."""
 
 
 class Usage(NamedTuple):
-    """What one command took."""
+    """Time and memory that a command took."""
 
     seconds: float
     processor_seconds: float
@@ -47,33 +47,33 @@ class Usage(NamedTuple):
 
 @dataclass
 class Work:
-    """What a part is given."""
+    """Folders, data and commands with which a part works."""
 
     part: str
     root: Path
-    """The folder that has one folder for each part."""
+    """Folder that holds a folder for each part."""
     data_root: Path
-    """The folder of the data sets."""
+    """Folder of the data sets."""
     quick: bool = False
-    """Whether only the machinery is tried out: everything as little as possible."""
+    """True if only the machinery is tried out, with everything as small as possible."""
     commands: list[str] = field(default_factory=list)
     seeds: list[int] = field(default_factory=list)
 
     @property
     def folder(self) -> Path:
-        """Where the part writes."""
+        """Return the folder that the part writes to."""
         return self.root / self.part
 
     def file(self, part: str, name: str) -> Path:
-        """What another part has written."""
+        """Return the path of a file that another part has written."""
         return self.root / part / name
 
     def data(self, name: str) -> str:
-        """A data set, or "demo" for the built-in scene."""
+        """Return the path of a data set, or "demo" for the built-in scene."""
         return name if name == "demo" and not self.quick else str(self.data_root / name)
 
     def little(self, usual: int | str, quick: int | str) -> str:
-        """A setting, or the one to try the machinery out with."""
+        """Return the usual setting, or the one for trying out the machinery."""
         return str(quick if self.quick else usual)
 
     def command(self, name: str, *arguments: str | Path) -> Usage:
@@ -92,27 +92,27 @@ class Work:
         return Usage(time.monotonic() - start, used, usage.ru_maxrss * 1024 / 1e6)
 
     def told(self, name: str, words: list[str]) -> str:
-        """The command as a reader types it: no folder of this machine is in it."""
+        """Return the command as a reader types it, without folders of this machine."""
         shown = " ".join(words).replace(f"{self.root}/", "").replace(f"{self.data_root}/", "")
         return f"{name if name in COMMANDS else f'python -m tests.benchmarks.{name}'} {shown}"
 
     def read(self, name: str) -> Any:
-        """A JSON file of the part."""
+        """Return the content of a JSON file of the part."""
         return json.loads((self.folder / name).read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
 class Part:
-    """One piece of the benchmarks, which is run whole or not at all."""
+    """One piece of the benchmarks, which is run as a whole or not at all."""
 
     name: str
     measure: Callable[[Work], dict[str, Any]]
-    """Returns the figures."""
+    """Function that returns the figures."""
     minutes: float
-    """About how long it takes on two cores."""
+    """Approximate minutes on two cores."""
     needs: tuple[str, ...] = ()
     """Parts whose files it reads."""
     data: str | None = None
-    """The data set that it reads, beside what those parts have written."""
+    """The data set that it reads, beside the files of those parts."""
     core: bool = True
     """Whether `make benchmarks` runs it."""

@@ -1,11 +1,12 @@
-"""What Blender makes of files: bounds, colours and a picture of each. Run inside Blender, not by pytest:
+"""Bounds, colours and a picture of files as Blender imports them. Run inside Blender, not by pytest:
 
 blender --background --factory-startup --python blender_look.py -- JOBS.json
 
 JOBS is a list of {"file", "camera": {"c2w", "width", "height", "fx", "fy", "cx", "cy"}, "picture", "arrays"}.
-The pictures are PNG with alpha, view transform Standard; `arrays` is an NPZ of what was imported. A GLB keeps
-the material that the importer made of it, so the picture shows what a user sees first; others get the recipe
-of docs/export.md: an emission of the colour attribute, for a volume an absorption too.
+The pictures are PNG with alpha, rendered with the view transform Standard; `arrays` is the path of an NPZ of
+what was imported. A GLB keeps the material that Blender's importer makes, so its picture shows what a user
+sees first. Other files get the material that docs/export.md describes: an emission of the colour attribute,
+and for a volume an absorption too.
 """
 
 import json
@@ -16,7 +17,7 @@ import bpy  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 if not hasattr(np, "bool"):
-    # Debian 12 ships Blender 3.4 with a numpy that no longer has the name that its glTF importer uses.
+    # Debian 12 ships Blender 3.4 with a numpy that no longer has `bool`, which the glTF importer uses.
     np.bool = bool
 
 
@@ -50,7 +51,7 @@ def look_at_mesh(thing) -> dict:
     places = np.array([thing.matrix_world @ vertex.co for vertex in mesh.vertices])
     attribute = mesh.color_attributes[0]
     raw = np.empty(4 * len(attribute.data), np.float32)
-    attribute.data.foreach_get("color", raw)  # linear, whatever the attribute is stored as
+    attribute.data.foreach_get("color", raw)  # linear values, however the attribute is stored
     corners = np.empty(len(mesh.loops), np.int32)
     mesh.loops.foreach_get("vertex_index", corners)
     colours = np.zeros((len(places), 4), np.float32)

@@ -1,7 +1,6 @@
-"""An asset that is a block of known place, size and colours, as a volume and as a mesh: what other programs
-are asked about.
+"""An asset of a block of known place, size and colours, as a volume and as a mesh, to open in other programs.
 
-The colour is a function of the place alone, sigmoid of a linear one, so that volume and mesh have the same.
+The colour is the sigmoid of a linear function of the place alone, so that both have the same colours.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from tests.vertex_grids import arrays_of
 
 RESOLUTION = 64
 LOW, HIGH = np.array([20, 16, 24]), np.array([36, 40, 56])
-"""Vertices of the block's corners; a vertex is every 1/32 model unit, 1/16 world unit."""
+"""Grid indices of the block's corners; vertices are 1/32 model unit, or 1/16 world unit, apart."""
 BOUNDS = np.array([[0.5, 1.25, 2.5], [2.0, 2.25, 4.5]])
 """The same corners in the world, by hand: x = 1 - 2 v, y = 2 + 2 u, z = 3 + 2 w with u = i / 32 - 1."""
 SIGMA = 20.0
-"""Density, 1/world unit: 1.25 a voxel, and opaque through a block that is 16 voxels thick."""
+"""Density in 1/world unit: an optical depth of 1.25 per voxel, so the block, 16 voxels thick, is opaque."""
 _WEIGHTS = np.array([[0.03, 0.0, -0.02], [0.0, 0.025, 0.01], [-0.02, 0.01, 0.03]])
 _BIAS = np.array([0.2, -0.3, 0.4])
 
 
 def colours(index: np.ndarray) -> np.ndarray:
-    """[n, 3] sRGB 0..1 at vertices [n, 3]."""
+    """Return the colours [n, 3], sRGB 0..1, at vertices [n, 3]."""
     codes = index * 2.0 - 64
     return 1 / (1 + np.exp(-(codes @ _WEIGHTS + _BIAS)))
 
@@ -60,13 +59,13 @@ def write_block(folder: Path) -> Path:
     )
     features = (vertices * 2 - 64).astype(np.int8)
     arrays = arrays_of((coords, masks, codes), (coords, masks, features), (RESOLUTION, RESOLUTION))
-    head = head_onnx(linear_head(_WEIGHTS, np.zeros((3, 3)), _BIAS))  # the direction counts for nothing
+    head = head_onnx(linear_head(_WEIGHTS, np.zeros((3, 3)), _BIAS))  # the direction does not matter
     write_asset(folder, manifest, arrays, head, ply_bytes(_mesh()), write_cameras(cameras()))
     return folder
 
 
 def cameras() -> list[Camera]:
-    """Around the block, above and below it; the middle of the picture is not where they look."""
+    """Return cameras around, above and below the block, with principal points beside the picture's middle."""
     middle = BOUNDS.mean(axis=0)
     eyes = [middle + offset for offset in ([5.0, 2.0, 2.0], [-3.0, 4.0, -1.5], [1.0, -5.0, 3.0])]
     return [
@@ -76,7 +75,7 @@ def cameras() -> list[Camera]:
 
 
 def _mesh() -> TriangleMesh:
-    """The block's faces cut finely, so that colours that are linear between vertices are near enough."""
+    """Return the block's faces, cut so finely that colours interpolated between vertices are close."""
     coarse = box(tuple(LOW.tolist()), tuple(HIGH.tolist()))
     corners, n = coarse.vertices[coarse.faces], 16
     i, j = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]).T

@@ -1,4 +1,4 @@
-"""A box of known place and size comes back at its place, in every format and frame, in two other programs."""
+"""Tests that two other programs find an exported box at its place, in every format and frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from player.errors import ConfigError
 from tests.exporters.conftest import BOX
 from tests.player.conftest import WORLD_FROM_MODEL
 
-Y_UP = {  # which files hold (x, z, -y)
+Y_UP = {  # the formats whose files hold (x, z, -y)
     "world": {"glb"},
     "model": {"glb"},
     "gltf": {"ply", "obj", "glb", "stl"},
@@ -23,7 +23,10 @@ Y_UP = {  # which files hold (x, z, -y)
 
 
 def expected_bounds(frame: str, suffix: str) -> np.ndarray:
-    """Written out by hand: x = 1 - 2 v, y = 2 + 2 u, z = 3 + 2 w for a point (u, v, w) of the model."""
+    """Return the box's bounds [2, 3] in a file, written out by hand.
+
+    For a point (u, v, w) of the model: x = 1 - 2 v, y = 2 + 2 u, z = 3 + 2 w.
+    """
     (x0, y0, z0), (x1, y1, z1) = BOX
     if frame == "model":
         (x0, x1), (y0, y1) = ((y0 - 2) / 2, (y1 - 2) / 2), ((1 - x1) / 2, (1 - x0) / 2)

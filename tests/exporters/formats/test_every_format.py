@@ -1,4 +1,4 @@
-"""What holds for every format alike: the same bytes again, read back and compared, complete or not there."""
+"""Tests of every format: equal bytes every time, comparison with the source, and no half-written files."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_old_stays_until_the_new_is_complete(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The last thing that can fail is the renaming, in whichever way."""
+    """An old file stays as it was if the last step, the renaming of the new file, fails."""
     target = Path(call(cube_asset, tmp_path, way)[1])
     if target.suffix:
         target.write_text("old")
@@ -110,14 +110,14 @@ def test_the_old_stays_until_the_new_is_complete(
 
 
 def moved(mesh: TriangleMesh) -> TriangleMesh:
-    """One corner elsewhere, by a thousandth."""
+    """Return the mesh with one corner moved by a thousandth."""
     vertices = mesh.vertices.astype(np.float64)
     vertices[mesh.faces[0, 0] if len(mesh.faces) else 0] += [0, 0, 1e-3]
     return replace(mesh, vertices=vertices)
 
 
 def denser(volume: Volume) -> Volume:
-    """One voxel, by a thousandth."""
+    """Return the volume with the density of one voxel raised by a thousandth."""
     density = volume.density.copy()
     density[5] *= np.float32(1.001)
     return replace(volume, density=density)
@@ -134,7 +134,7 @@ def with_first(change: Callable[[Any], Any], original: Callable[..., Any]) -> Ca
 
 
 def damage(way: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Let the writer of a format write something else than it was given; what the message has to name."""
+    """Make a format's writer write something other than it is given; return what the message must name."""
     meshes = {
         "obj": (obj, "obj_bytes"),
         "glb": (glb, "glb_bytes"),
@@ -164,7 +164,7 @@ def damage(way: str, monkeypatch: pytest.MonkeyPatch) -> str:
             asset_head, "Head", lambda *given: lambda *inputs: head(*given)(*inputs) + np.float32(0.01)
         )
         return "rgb, one pixel: pixel 0"
-    page = import_module("player.page.page")  # its package has a function of that name
+    page = import_module("player.page.page")  # by name, because its package has a function `page`
     if way == "html":
         text = page.text_of_bytes
         monkeypatch.setattr(page, "text_of_bytes", lambda data: text(data[:-1] + bytes([data[-1] ^ 1])))

@@ -1,4 +1,4 @@
-"""EXR pictures: every channel read by OpenEXR and by OpenImageIO, and what the numbers mean."""
+"""Tests of EXR pictures: OpenEXR and OpenImageIO read every channel, and what the numbers mean."""
 
 from __future__ import annotations
 
@@ -88,7 +88,8 @@ def test_what_the_channels_mean(frame: Frame, camera: Camera, opened: Asset) -> 
 
 
 def test_header_projects_positions_onto_their_pixels(frame: Frame, camera: Camera, tmp_path: Path) -> None:
-    """By OpenEXR's own convention: row vectors, (0, 0) the upper left corner, (1, 1) the lower right one."""
+    """The header's matrices project positions onto their pixels, by OpenEXR's convention: row vectors, and
+    (0, 0) is the upper left corner, (1, 1) the lower right one."""
     channels = exr_channels(frame, camera)
     path = tmp_path / "a.exr"
     write_exr(path, channels, exr_header(camera))
@@ -191,7 +192,7 @@ def test_what_a_full_disk_and_no_openexr_say(
 
 
 def test_the_primaries_are_those_of_srgb(camera: Camera) -> None:
-    """White and the three colours' x, y give the matrix from linear RGB to XYZ, which the standard has."""
+    """The header's chromaticities give the standard's matrix from linear sRGB to XYZ."""
     xy = np.array(exr_header(camera)["chromaticities"]).reshape(4, 2)
     xyz = np.stack([xy[:, 0], xy[:, 1], 1 - xy.sum(axis=1)], axis=0) / xy[:, 1]
     scales = np.linalg.solve(xyz[:, :3], xyz[:, 3])

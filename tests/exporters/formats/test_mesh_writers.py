@@ -1,4 +1,4 @@
-"""PLY, OBJ and GLB: golden bytes, and what two other programs read in them."""
+"""Tests of the PLY, OBJ and GLB writers: golden bytes, and what two other programs read in them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_glb_golden() -> None:
         + struct.pack("<3I", 0, 1, 2)
     )
     data = glb_bytes(triangle())
-    # The sign of a zero coordinate is nobody's business: compare numbers there, bytes everywhere else.
+    # The sign of a zero coordinate does not matter: compare coordinates as numbers, all else as bytes.
     got_document, got_buffer = parse_glb(data, "triangle.glb")
     assert got_document == json.loads(document)
     assert data[:20] == struct.pack("<4sIII4s", b"glTF", 2, len(data), len(data) - 28 - len(buffer), b"JSON")
@@ -111,7 +111,7 @@ def test_trimesh_reads(suffix: str, mesh: TriangleMesh) -> None:
         np.testing.assert_allclose(
             read.volume, 1.0, rtol=1e-6
         )  # 1 * 2 * 3 / 6: positive, so faces look outwards
-    if suffix != ".glb":  # there trimesh drops COLOR_0 beside a material; Open3D reads it below
+    if suffix != ".glb":  # trimesh drops a GLB's COLOR_0 if there is a material; Open3D reads it below
         n_colours = 3 if suffix == ".obj" else 4
         colours = np.asarray(read.visual.vertex_colors)  # type: ignore[union-attr]
         assert np.array_equal(colours[:, :n_colours], mesh.colours[:, :n_colours])
@@ -125,12 +125,12 @@ def test_glb_colours_are_linear() -> None:
     colours = np.frombuffer(buffer, "<u2", 16, view["byteOffset"]).reshape(4, 4)
     assert accessor["normalized"] and accessor["componentType"] == 5123
     assert (colours[:, :3] == round(0.2158605 * 65535)).all()
-    assert (colours[:, 3] == 128 * 257).all()  # alpha has no curve
+    assert (colours[:, 3] == 128 * 257).all()  # alpha is linear
 
 
 @pytest.mark.needs("open3d")
 def test_open3d_reads(tmp_path: Path) -> None:
-    """On the platforms where pyproject.toml asks for Open3D it must be there: not importable is a failure."""
+    """Open3D reads what was written. Where pyproject.toml asks for Open3D, a missing one is a failure."""
     import open3d
 
     mesh = random_mesh(300, 500)
@@ -139,7 +139,7 @@ def test_open3d_reads(tmp_path: Path) -> None:
         path.write_bytes(writer(mesh))
         read = open3d.io.read_triangle_mesh(str(path))
         vertices, normals = (y_up(a) if suffix == ".glb" else a for a in (mesh.vertices, mesh.normals))
-        corners = np.asarray(read.triangles)  # Open3D numbers the vertices of an OBJ anew: compare by corner
+        corners = np.asarray(read.triangles)  # Open3D renumbers the vertices of an OBJ: compare by corner
         np.testing.assert_allclose(
             np.asarray(read.vertices)[corners], vertices[mesh.faces], rtol=0, atol=2e-6
         )
@@ -163,7 +163,7 @@ def test_read_ply_gives_back_what_was_written(tmp_path: Path) -> None:
 
 
 def test_the_mesh_of_an_asset_is_small_and_gets_the_normals_of_its_faces() -> None:
-    """trimesh reads it as it lies there; positions, faces and colours come back, normals from the faces."""
+    """A small PLY gives back positions, faces and colours; normals come from faces. trimesh reads it too."""
     mesh = sphere(20)
     data = small_ply_bytes(mesh)
     assert len(data) == small_ply_size(len(mesh.vertices), len(mesh.faces)) < 0.8 * len(ply_bytes(mesh))
@@ -234,7 +234,7 @@ def test_parity(suffix: str) -> None:
         check_mesh_bytes(suffix, data, replace(mesh, faces=mesh.faces[:-1]), "mesh")
     with pytest.raises(ParityError, match="vertices: number"):
         check_mesh_bytes(suffix, data, replace(mesh, vertices=mesh.vertices + 1e-4), "mesh")
-    inner = mesh.vertices.copy()  # the bounds stay
+    inner = mesh.vertices.copy()  # move an inner vertex: the bounds stay
     place = int(np.argmin(np.abs(inner).max(axis=-1)))
     inner[place] += 1e-3
     with pytest.raises(ParityError, match=f"vertices: number {place}: expected"):

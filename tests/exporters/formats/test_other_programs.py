@@ -1,4 +1,4 @@
-"""Exports opened in the programs that people use: Blender, OpenVDB, Khronos' glTF validator.
+"""Tests that open exports in the programs that people use: Blender, OpenVDB, Khronos' glTF validator.
 
 `make other-programs` installs them. A program that is missing is a failure.
 """
@@ -50,7 +50,7 @@ def run(*command: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The block's asset, its exports, what `vfr-play` shows of it, and what Blender makes of the exports."""
+    """Create a folder with the block's asset, its exports, and the pictures that `vfr-play` makes of it."""
     folder = tmp_path_factory.mktemp("programs")
     asset = block.write_block(folder / "asset")
     for suffix, (name, *more) in EXPORTS.items():
@@ -64,7 +64,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def blender(folder: Path) -> Path:
-    """One start of Blender for all files: it is most of the cost. Each file has another camera."""
+    """Run Blender on the exports, seen by the block's cameras in turns; return the folder with the results.
+
+    Blender is started only once for all files, because starting it is most of the cost.
+    """
     jobs = []
     for k, (suffix, (name, *_)) in enumerate(EXPORTS.items()):
         camera = asdict(block.cameras()[k % 3])
@@ -78,7 +81,7 @@ def blender(folder: Path) -> Path:
 
 
 def pictures(folder: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]:
-    """[h, w, 4] 0..255 of Blender and of `vfr-play`, the same camera."""
+    """Return the pictures [h, w, 4], 0..255, of Blender and of `vfr-play` with the same camera."""
     k = list(EXPORTS).index(suffix) % 3
     paths = folder / f"{suffix}.png", folder / "played" / f"view_{k}.png"
     theirs, ours = (np.asarray(Image.open(path)).astype(float) for path in paths)
@@ -94,7 +97,7 @@ def test_blender_imports_place_size_and_colours(suffix: str, blender: Path) -> N
         assert int(seen["n_faces"]) == len(mesh.faces)
     np.testing.assert_allclose([places.min(0), places.max(0)], block.BOUNDS, rtol=0, atol=1e-6)
     np.testing.assert_allclose(places, mesh.vertices, rtol=0, atol=1e-6)
-    # Blender hands out linear light; what it stores may be sRGB bytes
+    # Blender returns linear colours, even where it stores sRGB bytes
     np.testing.assert_allclose(srgb_from_linear(colours[:, :3]) * 255, mesh.colours[:, :3], rtol=0, atol=0.51)
     outwards = (normals * (places - block.BOUNDS.mean(axis=0))).sum(axis=-1)
     assert (outwards > 0).all()
@@ -102,13 +105,13 @@ def test_blender_imports_place_size_and_colours(suffix: str, blender: Path) -> N
 
 @pytest.mark.parametrize("suffix", EXPORTS)
 def test_blender_s_picture_is_ours(suffix: str, blender: Path) -> None:
-    """Place and size by silhouette and middle, colour where both are opaque.
+    """Blender's picture agrees with ours: silhouettes and their middles, and colours where both are opaque.
 
-    A mesh ends where it is. The played block fades where a ray cuts less than 1/20 of a unit off an edge, and
-    its colour comes from as deep, where it is up to 5 levels another one: 0.95, and 3 levels in the mean. Of
-    the volume, Blender interpolates the density from 0 over a voxel around the block, 2.4 pixels, and the
-    player stops at the last vertex: 0.85, and 4 levels. sRGB taken for linear light would be 20 levels and
-    more, half a voxel beside the place 1.2 pixels.
+    For a mesh, silhouettes overlap by 0.95 and colours differ by 3 levels in the mean. A mesh ends sharply,
+    but the played block fades where a ray cuts less than 1/20 of a unit off an edge. Its colours come from
+    that depth, where they are up to 5 levels off. For the volume the limits are 0.85 and 4 levels: Blender
+    lets the density fall to 0 over a voxel (2.4 pixels) around the block, the player stops at the vertices.
+    sRGB taken for linear light would be off by 20 levels and more, a shift of half a voxel by 1.2 pixels.
     """
     theirs, ours = pictures(blender, suffix)
     a, b = theirs[..., 3] > 127, ours[..., 3] > 127
@@ -135,7 +138,7 @@ def test_blender_loads_both_grids(blender: Path) -> None:
 
 
 def test_openvdb_reads_every_voxel(folder: Path) -> None:
-    """By the library itself, in the Python that Debian builds it for."""
+    """OpenVDB itself reads every voxel, run in the system's Python, for which Debian builds it."""
     out = folder / "openvdb.npz"
     script = """
 import sys
@@ -171,7 +174,7 @@ np.savez(sys.argv[2], **arrays)
 
 
 def test_vdb_print_reads_it(folder: Path) -> None:
-    """The colours are a voxel wider than the density on every side."""
+    """`vdb_print` reads both grids; the colours are a voxel wider than the density on every side."""
     text = run(program("vdb_print"), "-l", folder / "world.vdb")
     assert text.count("Number of active voxels:       14,025") == 1
     assert text.count("Number of active voxels:       17,955") == 1
@@ -182,7 +185,7 @@ def test_vdb_print_reads_it(folder: Path) -> None:
 
 @pytest.mark.parametrize("arguments", [[], ["--frame", "gltf"], ["--faces", "500"]])
 def test_khronos_validator_has_no_error(arguments: list[str], folder: Path, tmp_path: Path) -> None:
-    """No error and no warning; a hint may be about unused things, which we do not have either."""
+    """The validator reports neither an error nor a warning nor a hint."""
     package = Path(sys.prefix) / "share/gltf-validator/node_modules/gltf-validator"
     if not package.is_dir():
         pytest.fail(f"{package}: expected Khronos' validator: `make other-programs` installs it")

@@ -1,4 +1,4 @@
-"""Point clouds: evenly over the surface, read by two other programs."""
+"""Tests of point clouds: points are spread evenly over the surface, and two other programs read them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_evenly_over_the_area() -> None:
         "y": (cloud.vertices[:, 1] < 1e-9),
         "z": (cloud.vertices[:, 2] < 1e-9),
     }
-    # a stratified count differs from its share by a point a triangle or two
+    # sampling is stratified: a triangle's count differs from its share by a point or two
     assert (
         abs(on["x"].sum() - 8000) <= 4 and abs(on["y"].sum() - 4000) <= 4 and abs(on["z"].sum() - 2000) <= 4
     )

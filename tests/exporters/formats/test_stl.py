@@ -1,4 +1,4 @@
-"""STL: golden bytes, another reader, parity."""
+"""Tests of STL: golden bytes, another reader, and the comparison with the source (parity)."""
 
 from __future__ import annotations
 

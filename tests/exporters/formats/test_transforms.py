@@ -1,4 +1,4 @@
-"""transforms.json and COLMAP: the training cameras see the exported world as they saw their own."""
+"""Tests of transforms.json and COLMAP exports: the cameras see the exported world as they saw their own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.exporters.meshes import box
 
 
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Pixels [n, 2] of points [n, 3], written out: x right, y up, looks along -z."""
+    """Return the pixels [n, 2] of points [n, 3]: the camera's x is right, y is up, and it looks along -z."""
     local = (points - camera.c2w[:3, 3]) @ camera.c2w[:3, :3]
     x = camera.cx + camera.fx * local[:, 0] / -local[:, 2]
     y = camera.cy - camera.fy * local[:, 1] / -local[:, 2]
@@ -59,7 +59,7 @@ def test_in_the_world_they_are_the_asset_s(opened: Asset, shells_asset: Path, tm
 def test_pycolmap_reads_the_model(
     opened: Asset, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An independent program, on its own axes: a point lands on the same pixel."""
+    """pycolmap, an independent program with other camera axes, projects points onto the same pixels."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pycolmap
@@ -124,7 +124,7 @@ def test_parity() -> None:
 
 
 def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quaternion, a translation and a point that are not those of the source."""
+    """A quaternion or a point in the files that differs from the source is refused."""
     camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
     corners = box((0, 0, 0), (1, 1, 1))
     monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))

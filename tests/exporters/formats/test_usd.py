@@ -1,4 +1,4 @@
-"""USD: what the stage says, that Pixar's library reads every number back, and its place in every frame."""
+"""Tests of USD: what the stage states, that Pixar's library reads every number, and bounds in all frames."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_every_number(suffix: str) -> None:
 @pytest.mark.parametrize("suffix", ["usdc", "usda"])
 @pytest.mark.parametrize("frame", COORDINATES)
 def test_the_box_is_at_its_place(frame: str, suffix: str, shells_asset: Path, tmp_path: Path) -> None:
-    """By the library's own bounds, and the stage says which way is up in them."""
+    """The library's bounds of the box are as expected in every frame, and the stage states its up axis."""
     path = tmp_path / f"box.{suffix}"
     assert cli.main([str(shells_asset), str(path), "--frame", frame, "--method", "baked"]) == 0
     stage = Usd.Stage.Open(str(path))

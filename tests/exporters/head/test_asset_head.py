@@ -1,4 +1,4 @@
-"""The exported head: valid, self-describing, and the asset's own colours."""
+"""Tests of the exported head: it is valid, describes itself, and gives the asset's own colours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.exporters.head.test_onnx_head import inputs, random_head
 
 @pytest.fixture(params=["float32", "int8"])
 def with_real_head(request: pytest.FixtureRequest, opened: Asset, tmp_path: Path) -> Asset:
-    """The asset with a head as the bake writes it, in front of the same four channels."""
+    """Return a copy of the asset with a head of random weights as the bake writes it, for four channels."""
     weights = random_head(n_channels=4)
     ranges = activation_ranges(weights, *inputs(500, 4)) if request.param == "int8" else None
     folder = tmp_path / "asset"
@@ -53,7 +53,7 @@ def test_is_the_asset_s_head(decode: bool, with_real_head: Asset) -> None:
 
 
 def test_decode_takes_any_number_of_pixels_and_fetches(with_real_head: Asset) -> None:
-    """Against numpy and the player's head, with weights that are not special: float32 sums may differ."""
+    """The model that decodes agrees with numpy and the player's head, but for rounding of float32 sums."""
     session = onnxruntime.InferenceSession(
         head_bytes(with_real_head, True), providers=["CPUExecutionProvider"]
     )
@@ -90,7 +90,7 @@ def test_comparisons_are_exact_in_float32() -> None:
 def test_another_head_is_noticed(
     decode: bool, with_real_head: Asset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A weight that the editing of the graph would have changed."""
+    """A weight that was changed while the graph was edited is noticed by the comparison."""
     original = asset_head._compare
 
     def damaged(asset: Asset, data: bytes, decode: bool, where: str) -> float:

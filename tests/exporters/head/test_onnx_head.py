@@ -1,4 +1,4 @@
-"""The ONNX head, run by onnxruntime, against the float64 oracle."""
+"""Tests of the ONNX head, run by onnxruntime, against the float64 oracle."""
 
 from __future__ import annotations
 
@@ -84,14 +84,16 @@ def test_extreme_constant_features(value: float) -> None:
 
 @pytest.mark.parametrize("scale", [1e4, 1e30, np.inf])
 def test_extreme_random_features(scale: float) -> None:
-    """Near a grey pixel the logits of thousands cancel: float32 keeps 2^-24 of the largest, and a sigmoid
-    passes a quarter.
+    """Huge features give finite colours, as exact as float32 allows.
+
+    Near a grey pixel, logits in the thousands cancel: float32 rounds by 2^-24 of the largest, and the
+    sigmoid's slope is a quarter.
     """
     weights, (features, dirs) = random_head(), inputs(200)
     if not np.isfinite(scale):
         features = np.sign(features) * np.float32(3e38)
         rgb = run(weights, features, dirs)
-        assert rgb.shape == (200, 3)  # beyond float32: NaN is honest, a crash is not
+        assert rgb.shape == (200, 3)  # beyond float32: NaN is acceptable, a crash is not
         return
     rgb = run(weights, (features * np.float32(scale)), dirs)
     assert np.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1

@@ -1,4 +1,4 @@
-"""The head in 8 bits: near the float head, independent of the batch, right at the ends of its ranges."""
+"""Tests of the 8-bit head: near the float head, independent of the batch, clipped at its ranges' ends."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ def test_a_pixel_does_not_depend_on_its_neighbours(weights: HeadWeights) -> None
 
 
 Squeeze = Callable[[int, np.ndarray], np.ndarray]
-"""What becomes of h (0), e (1) and each z (2, 3), which layers in 8 bits take in."""
+"""Function (number, x) -> x applied to the inputs of 8-bit layers: h (0), e (1) and each z (2, 3)."""
 
 
 def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) -> np.ndarray:
-    """The head in float64, without rounding, with `squeeze` on what its 8-bit layers take in."""
+    """Evaluate the head in float64, without rounding, with `squeeze` applied to inputs of 8-bit layers."""
     activation = ACTIVATIONS[weights.activation]
     h = seen["features"].astype(np.float64)
     for weight, bias in weights.spatial:
@@ -103,7 +103,7 @@ def oracle(weights: HeadWeights, seen: dict[str, np.ndarray], squeeze: Squeeze) 
 
 @pytest.mark.parametrize("size", [4.0, 1e4])
 def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: float) -> None:
-    """Codes that wrapped around, as a cast to 8 bits does, would be those of quite another activation."""
+    """Activations out of range are clipped. Wrapping around, as a cast to 8 bits does, would be far off."""
     seen = inputs(100, seed=4)
     seen["features"] *= size
     ranges = activation_ranges(weights, **inputs(4000))
@@ -120,7 +120,7 @@ def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: fl
         return low + (x - low) % (high - low)
 
     expected = play_in_integers(read_head(head_onnx(weights, ranges), "head"), seen["features"], seen["dirs"])
-    error = np.asarray(rgb) - expected  # an activation beside the border of two levels may cross it
+    error = np.asarray(rgb) - expected  # an activation near the border of two levels may cross it
     EXTREME.check(error)
     assert np.sqrt(np.mean(error**2)) < 5e-4
     assert np.sqrt(np.mean((rgb - oracle(weights, seen, clipped)) ** 2)) < 0.02, "what 8 bits round"
@@ -129,8 +129,8 @@ def test_extreme_features_are_clipped_not_wrapped(weights: HeadWeights, size: fl
 
 
 def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None:
-    """Activations of inputs that the ranges were not made from lie within them, but for two in ten
-    thousand."""
+    """Ranges contain zero and all but 0.4 to 5 in ten thousand activations of other inputs than those that
+    they were measured on."""
     ranges = activation_ranges(weights, **inputs(4000))
     assert len(ranges) == 4
     found: dict[int, np.ndarray] = {}
@@ -148,7 +148,8 @@ def test_ranges_contain_zero_and_almost_everything(weights: HeadWeights) -> None
 
 
 def test_weights_are_within_half_a_step_of_their_codes(weights: HeadWeights) -> None:
-    """A step of an output is 1/127 of the largest sum of two neighbouring weights' magnitudes."""
+    """Weights are within half a quantization step of what is stored. A step of an output is 1/127 of the
+    largest sum of two neighbouring weights' magnitudes."""
     model = onnx.load_from_string(head_onnx(weights, activation_ranges(weights, **inputs(4000))))
     constants = {entry.name: onnx.numpy_helper.to_array(entry) for entry in model.graph.initializer}
     wide = [weights.to_sh[0], *weights.directional_first[:2], *(weight for weight, _ in weights.directional)]

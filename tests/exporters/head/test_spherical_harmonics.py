@@ -1,4 +1,4 @@
-"""The polynomial table against quadrature, scipy's Legendre functions and the published constants."""
+"""Tests of the polynomial table against quadrature, scipy's Legendre functions and published constants."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ def unit_directions(n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("degree", range(1, 9))
 def test_agrees_with_angles_and_legendre_functions(degree: int) -> None:
-    # Same sign convention on both sides: Condon-Shortley. 1e-12: powers up to 7 with coefficients up to about
-    # 200.
+    # Both sides use the Condon-Shortley sign convention. The bound of 1e-12 allows for powers up to 7 with
+    # coefficients up to about 200.
     dirs = unit_directions(200)
     HARMONICS.check(evaluate(dirs, degree), spherical_harmonics(dirs, degree))
 
 
 def test_orthonormal_on_the_sphere() -> None:
-    """Gauss-Legendre in z times equal angles integrates polynomials of order 14 = 2 (8 - 1) exactly."""
+    """The harmonics are orthonormal, by Gauss-Legendre quadrature in z times equal angles, which integrates
+    polynomials of order 14 = 2 (8 - 1) exactly."""
     z, weight_z = np.polynomial.legendre.leggauss(8)
     phi = np.arange(16) * (2 * np.pi / 16)
     z, phi = (axis.ravel() for axis in np.meshgrid(z, phi, indexing="ij"))

@@ -1,4 +1,4 @@
-"""Texels: which face holds which, the padding, and the places whose colours are asked for."""
+"""Tests of texels: which face contains them, their padding, and the points whose colours are asked for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from player.errors import DataError
 
 
 def naive_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> dict[int, int]:
-    """The first face that holds each centre, by edge functions, texel after texel."""
+    """Return the first face that contains the centre of each texel, by edge functions in a plain loop."""
     found = {}
     for row in range(size):
         for column in range(size):
@@ -56,7 +56,7 @@ def test_padding_takes_the_nearest() -> None:
 
 
 def flat() -> tuple[TriangleMesh, np.ndarray]:
-    """A square of 2 x 2 at z = 5, laid out over the whole picture, its first row at y = 2."""
+    """Return a square of 2 x 2 at z = 5, laid out over the whole picture with its first row at y = 2."""
     vertices = np.array([[0.0, 0, 5], [2, 0, 5], [0, 2, 5], [2, 2, 5]])
     faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
     up, white = np.tile([0.0, 0, 1], (4, 1)), np.full((4, 4), 255, np.uint8)
@@ -81,7 +81,7 @@ def test_paint_asks_for_the_places_under_the_centres() -> None:
     )
     assert (points[:, 2] == 5).all() and (normals == [0, 0, 1]).all()
     assert texture.image[0, 7].tolist() == [239, 239, 0] and texture.image[7, 7].tolist() == [239, 16, 0]
-    assert texture.image[0, 0].tolist() == texture.image[0, 2].tolist()  # no colour there: the nearest
+    assert texture.image[0, 0].tolist() == texture.image[0, 2].tolist()  # unknown there: the nearest colour
     with pytest.raises(DataError, match="expected colours on the surface, got none"):
         paint(mesh, uvs, 8, lambda points, normals: KnownColours(points, np.zeros(len(points), bool)))
     with pytest.raises(DataError, match="expected a texel under some face"):

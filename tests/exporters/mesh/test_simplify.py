@@ -1,4 +1,4 @@
-"""Fewer faces, with the shape and the colours of the source."""
+"""Tests of simplified meshes: they have fewer faces, and the shape and colours of the source."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_sphere_keeps_its_shape_and_colours() -> None:
     assert np.abs(few.colours[:, :2] - expected).max() < 12 and (few.colours[:, 2:] == 255).all()
     a, b, c = (few.vertices[few.faces[:, k]] for k in range(3))
     volume = (a * np.cross(b, c)).sum() / 6
-    # 800 flat faces cut two hundredths off a ball; positive: they still look outwards
+    # 800 flat faces cut 2 % off a ball's volume; it is positive if they still look outwards
     assert abs(volume / (4 / 3 * np.pi) - 1) < 0.04
 
 

@@ -1,4 +1,4 @@
-"""Layouts by xatlas: the faces are the same, no two of them share a texel, and it can be stopped."""
+"""Tests of layouts by xatlas: faces stay the same, no two share a texel, and a time limit ends xatlas."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_faces_stay_and_share_no_texel() -> None:
     size = 512
     texels, _, _ = covered_texels(uvs, cut.faces, size)
     alone = sum(len(covered_texels(uvs, cut.faces[n : n + 1], size)[0]) for n in range(len(cut.faces)))
-    assert alone <= 1.02 * len(texels)  # on the edge between two faces a centre may be in both
+    assert alone <= 1.02 * len(texels)  # a centre on the edge between two faces may be in both
     assert len(texels) > 0.5 * size * size
     again = unwrap(MESH, 256, 60.0)
     assert again[1].tobytes() == uvs.tobytes() and again[0].faces.tobytes() == cut.faces.tobytes()
@@ -42,7 +42,7 @@ def test_parts_hold_every_face_once() -> None:
 
 
 def test_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other process is gone when the error is raised."""
+    """A layout that exceeds its time limit raises an error, and its process has ended by then."""
     started = []
     original = module.subprocess.Popen
 
@@ -74,7 +74,7 @@ def test_without_xatlas(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_seconds_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The layout waits first, so that it takes seconds on any machine."""
+    """The seconds that passed are reported. The layout sleeps first, to take seconds on any machine."""
 
     def slow(name: str, folder: str) -> list[str]:
         program = f"import time, runpy; time.sleep(2.5); runpy.run_module({name!r}, None, '__main__', True)"

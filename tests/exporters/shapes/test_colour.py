@@ -1,4 +1,4 @@
-"""The sRGB curves, at the joint above all."""
+"""Tests of the sRGB curves, above all where their two pieces meet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The crop: forms of a box, which faces stay, and what is said of those that go."""
+"""Tests of the crop: the forms of a box, which faces stay, and what is reported about the removed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a TriangleMesh accepts, and how it moves."""
+"""Tests of TriangleMesh: what it accepts, and how it is transformed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files with a texture: what other programs read in them, and what is compared before they are there."""
+"""Tests of files with a texture: what other programs read in them, and the comparison before writing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.exporters.meshes import tetrahedron
 
 
 def cornered() -> tuple[TriangleMesh, Texture]:
-    """A tetrahedron whose corners are in the middle of the quarters of a picture of four colours."""
+    """Return a tetrahedron and a texture of four coloured quarters, with a corner in the middle of each."""
     uvs = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]], np.float32)
     image = np.zeros((16, 16, 3), np.uint8)
     image[:8, :8], image[:8, 8:], image[8:, :8], image[8:, 8:] = COLOURS
@@ -80,7 +80,7 @@ def test_the_picture_is_srgb_unlit_and_alone() -> None:
     ]
     view = document["bufferViews"][image["bufferView"]]
     png = buffer[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(png))), texture.image)  # as they are: sRGB
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(png))), texture.image)  # unchanged: sRGB
     assert len(buffer) % 4 == 0 and not np.array_equal(
         linear_from_srgb(texture.image / 255), texture.image / 255
     )

@@ -1,4 +1,4 @@
-"""Volumes: what the numbers in an NPZ and a VDB mean, and that they are compared before they appear."""
+"""Tests of volumes: what the numbers in an NPZ and a VDB mean, and the comparison before writing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.vertex_grids import grid_of
 
 
 def some_volume(n: int = 900, colour: bool = True) -> Volume:
-    """Spread over several of the tree's inner nodes, in no order."""
+    """Return a volume of voxels in random order, spread over several inner nodes of the VDB tree."""
     random = np.random.default_rng(3)
     index = np.unique(random.integers(0, 700, (n, 3)), axis=0).astype(np.int32)
     random.shuffle(index)
@@ -43,7 +43,8 @@ def block_asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_block_is_at_its_place_with_its_density(block_asset: Path, tmp_path: Path) -> None:
-    """World units: SIGMA is per world unit, the asset has it per model unit, which is two world units."""
+    """The block is exported with its place and density in world units, though the asset stores the density
+    per model unit, which is two world units."""
     path = tmp_path / "a.npz"
     summary = export.export_asset(block_asset, path, ExportOptions(colour=True))
     with np.load(path) as file:
@@ -52,20 +53,20 @@ def test_the_block_is_at_its_place_with_its_density(block_asset: Path, tmp_path:
     places = arrays["index"] @ arrays["matrix"][:3, :3].T + arrays["matrix"][:3, 3]
     np.testing.assert_allclose([places.min(0), places.max(0)], block.BOUNDS, atol=1e-12)
     np.testing.assert_allclose(summary["bounds"], block.BOUNDS, atol=1e-12)
-    # half a step of the 8-bit logarithm, (6 - -2) / 255 / 2
+    # half a quantization step of the 8-bit logarithm, (6 - -2) / 255 / 2
     np.testing.assert_allclose(arrays["density"], block.SIGMA, rtol=0.016)
     assert info["voxel"] == pytest.approx(1 / 16) and info["level"] == pytest.approx(np.log(2) * 16)
     assert info["frame"] == "world" and info["unit"] == "1/world unit" and info["colour_space"] == "srgb"
     assert summary["voxels"] == len(places) == np.prod(block.HIGH - block.LOW + 1)
-    # the features are integers: the head's own rounding to bytes is all that differs
+    # the features are exact integers: only the rounding of colours to bytes differs
     np.testing.assert_allclose(arrays["colour"] / 255, block.colours(arrays["index"]), atol=0.51 / 255)
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("rise", [(1, 0, 0), (0, -2, 0), (3, 2, -1)])
 def test_colours_are_looked_at_up_the_density(size: float, rise: tuple[int, int, int]) -> None:
-    """Codes that are linear in the vertex: their gradient in model units, in a box of three edges and
-    of any size; down where they are even."""
+    """Directions follow the gradient of linear codes in model units, in a box of three different edges and
+    of any size, and point down where the codes are constant."""
     vertices = np.argwhere(np.ones((9, 9, 9)))
     coords, masks, order = pack_vertices(vertices)
     vertices = vertices[order]
@@ -95,7 +96,7 @@ def test_dense_as_the_docstring_says(block_asset: Path) -> None:
 
 
 def test_density_scales_with_the_frame(block_asset: Path, tmp_path: Path) -> None:
-    """The optical depth of a voxel is the same in every frame: density times length."""
+    """The optical depth of a voxel (density times length) is the same in every frame."""
     for frame, length in (("world", 1 / 16), ("model", 1 / 32), ("gltf", 1 / 16), ("blender", 1 / 16)):
         path = tmp_path / f"{frame}.npz"
         export.export_asset(block_asset, path, ExportOptions(frame=frame))  # type: ignore[arg-type]
@@ -117,8 +118,8 @@ def test_blender_s_half_voxel(block_asset: Path, tmp_path: Path) -> None:
 
 
 def test_colours_look_down_the_slope(opened: Asset) -> None:
-    """Shells around the origin of the model: the inner side of each is seen outwards, the outer inwards. The
-    head of that asset depends on the direction, so a wrong sign or axis is another colour."""
+    """Colours of a shell's outer side are those seen looking inwards, and of its inner side outwards. The
+    asset's head depends on the direction, so a wrong sign or axis would give another colour."""
     volume, _ = asset_volume(opened, np.eye(4), colour=True)
     place = volume.index / shells.RESOLUTION * 2 - 1
     radius = np.linalg.norm(place, axis=-1)
@@ -126,7 +127,7 @@ def test_colours_look_down_the_slope(opened: Asset) -> None:
     expected = _sigmoid_head(opened, np.flatnonzero(chosen), -place[chosen] / radius[chosen, None])
     got = volume.colours
     assert got is not None and chosen.sum() > 500
-    # the slope is a central difference of rounded codes: some degrees from the radius
+    # the slope is a central difference of rounded codes, some degrees off the radius
     assert np.abs(got[chosen] / 255 - expected).mean() < 0.01
     wrong = _sigmoid_head(opened, np.flatnonzero(chosen), place[chosen] / radius[chosen, None])
     assert np.abs(got[chosen] / 255 - wrong).mean() > 0.05
@@ -216,7 +217,7 @@ def test_bad_volumes() -> None:
 def test_crop_and_what_it_prints(
     block_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The half of the block with z up to 3.5: 17 of 33 layers."""
+    """A crop at z up to 3.5 keeps 17 of the block's 33 layers, and what it removed is reported."""
     target = tmp_path / "a.vdb"
     assert cli.main([str(block_asset), str(target), "--crop", "1.25,1.75,3,9,9,1"]) == 0
     text = capsys.readouterr().out

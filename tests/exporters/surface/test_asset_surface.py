@@ -1,4 +1,4 @@
-"""Colours of corners that no picture shows: from those around them, ring after ring."""
+"""Tests of colours of vertices that no picture shows: they spread from known ones, ring after ring."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from exporters.surface.asset_surface import _from_around
 
 
 def strip(n: int) -> np.ndarray:
-    """Faces along a strip of n corners, each of three corners that follow one another."""
+    """Return the faces of a strip of n vertices, each of three consecutive vertices."""
     return np.array([[i, i + 1, i + 2] for i in range(n - 2)])
 
 
 def test_a_colour_goes_on_from_corner_to_corner() -> None:
-    """One known colour spreads over the whole strip, and alpha stays each corner's own."""
+    """One known colour spreads over the whole strip, and every vertex keeps its own alpha."""
     colours = np.zeros((9, 4))
     colours[:, 3] = np.arange(9)
     colours[0, :3] = 10, 20, 30
@@ -24,7 +24,7 @@ def test_a_colour_goes_on_from_corner_to_corner() -> None:
 
 
 def test_an_unknown_corner_has_the_mean_of_its_faces() -> None:
-    """A face's colour is the mean of what is known of it; by hand."""
+    """An unknown vertex gets the mean of its faces' colours, each the mean of the face's known vertices."""
     faces = np.array([[0, 1, 4], [2, 3, 4], [0, 0, 0]])
     colours = np.zeros((6, 4))
     colours[:4, 0] = 10, 30, 100, 7

@@ -1,4 +1,4 @@
-"""Connected parts of meshes: which go, which stay."""
+"""Tests of connected parts of meshes: which are removed, and which stay."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_floaters_are_removed() -> None:
     assert n_removed == 1
     assert mesh.vertices.tolist() == tetrahedron().vertices.tolist()
     assert mesh.faces.tolist() == tetrahedron().faces.tolist()
-    assert remove_small_components(two_parts(), 0.2)[1] == 0  # exactly the share: stays
+    assert remove_small_components(two_parts(), 0.2)[1] == 0  # a part of exactly this share stays
     assert remove_small_components(two_parts(), 1.0)[1] == 1  # the largest part always stays
     empty = replace(mesh, faces=mesh.faces[:0])
     assert remove_small_components(empty, 0.5) == (empty, 0)

@@ -1,4 +1,4 @@
-"""What training cameras see: pictures of depth that are known, and points before, behind and beside them."""
+"""Tests of what training cameras see: known depth pictures, and points before, behind and beside them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def camera(eye: tuple[float, float, float], size: int = 64) -> Camera:
 
 
 def sphere_view(eye: tuple[float, float, float], radius: float) -> DepthView:
-    """What a camera sees of a ball around the origin."""
+    """Return the view of a ball around the origin by a camera, in closed form."""
     seen_by = camera(eye)
     rays_o, rays_d = (a.astype(np.float64) for a in seen_by.rays())
     along = -(rays_o * rays_d).sum(-1)
@@ -59,7 +59,7 @@ def test_half_of_a_ball_is_seen_from_one_side() -> None:
     seen = sightings([sphere_view((0.0, 0.001, 5.0), 1.0)], mesh.vertices, mesh.normals, 0.02).seen > 0
     height = mesh.vertices[:, 2]  # tangents from (0, 0, 5) touch at z = 1/5
     assert not seen[height < 1 / 5 - 0.05].any()
-    # A pixel inside the outline, 0.05 wide here, the ball is sqrt(2 * 0.05) higher.
+    # One pixel (0.05 wide here) inside the outline, the ball is sqrt(2 * 0.05) higher.
     assert seen[height > 1 / 5 + 0.35].all()
     assert sightings(all_around(1.0), mesh.vertices, mesh.normals, 0.02).seen.all()
 
@@ -78,7 +78,7 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
 def test_what_is_hidden_and_what_floats_goes() -> None:
     outer = sphere(120)
     inner = replace(sphere(30), vertices=sphere(30).vertices * 0.8)
-    # as near as the outer one, but looking inwards
+    # as near as the outer sphere, but with normals inwards
     wall = replace(sphere(30), vertices=sphere(30).vertices * 0.99, normals=-sphere(30).normals)
     tiny = np.array([[1.5, 0, 0], [1.5, 0.01, 0], [1.5, 0, 0.01]])
     out = np.tile([1.0, 0, 0], (3, 1))
@@ -103,7 +103,8 @@ def test_what_fills_a_hole_stays() -> None:
 
 
 def test_views_that_show_something_at_a_point_and_views_that_see_through_it() -> None:
-    """A ball of radius 1 and points on it, before it and where the pictures show nothing; by hand."""
+    """`seen` counts the views that see a point, `solid` those that show a surface there; by hand, for points
+    on a ball of radius 1, before it, inside it, and where the pictures show nothing."""
     points = np.array([[0.0, 0, 1], [0, 0, 1.5], [0, 0, 0.99], [0, 0, 0.5], [1.25, 0, 0]])
     out = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
     found = sightings([sphere_view((0.0, 0.001, 4.0), 1.0)] * 3, points, out, 0.05)
@@ -112,8 +113,8 @@ def test_views_that_show_something_at_a_point_and_views_that_see_through_it() ->
 
 
 def test_haze_goes() -> None:
-    """A shell of haze around the ball that the pictures show, closed and with more faces than the ball; the
-    same shell alone, which nothing is seen of, is no surface."""
+    """A closed shell of haze around the ball in the pictures is removed, though it has more faces than the
+    ball. The shell alone is refused: every picture sees through it."""
     ball, haze = sphere(60), sphere(120)
     haze = replace(haze, vertices=haze.vertices * 1.3)
     kept, removed = cleaned(joined(haze, ball), all_around(1.0), 0.02)
@@ -145,7 +146,7 @@ def test_the_surface_of_a_ball_with_what_was_removed(ball_asset: Asset) -> None:
         radius = np.linalg.norm(outward, axis=-1)
         assert np.abs(radius - 2 * BALL_RADIUS).max() < 2 * 4 / 72
         cosines = (mesh.normals * outward).sum(-1) / radius
-        # depth comes from the nearest pixel, as wide as a voxel here: steps, and thin faces at their edges
+        # depth is that of the nearest pixel, as wide as a voxel here: it has steps, and thin faces at them
         assert cosines.min() > 0.99 if method == "density" else cosines.mean() > 0.9
         assert removed.unseen_faces < 0.02 * len(mesh.faces)
         assert (mesh.colours == 255).all()

@@ -1,4 +1,4 @@
-"""Colours of a ball's vertices, fitted to pictures of a ball whose colours are known."""
+"""Tests of colours of a ball's vertices, fitted to pictures of a ball whose colours are known."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tests.exporters.surface.test_depth_views import all_around, joined
 
 
 def colour_of(places: np.ndarray) -> np.ndarray:
-    """Linear in the place, so that faces can show it: what is left is that they are flat and pixels bytes."""
+    """Return colours linear in the place, so that only flat faces and rounded pixels cause errors."""
     return 0.5 + 0.4 * places / np.linalg.norm(places, axis=-1, keepdims=True)
 
 
 def pictures(bias: float = 0.0) -> list[DepthView]:
-    """Views of the ball from all around; in the second half of them everything is brighter by `bias`."""
+    """Return views of the ball from all around; in every second one everything is brighter by `bias`."""
     views = []
     for number, view in enumerate(all_around(1.0)):
         rays_o, rays_d = view.camera.rays()
@@ -48,7 +48,7 @@ def test_the_colours_of_a_ball() -> None:
 
 @pytest.mark.needs("open3d")
 def test_no_other_colours_are_nearer_to_the_pictures() -> None:
-    """Pictures that contradict each other have their mean, opposite sides being seen by one alone."""
+    """Where pictures contradict each other, colours are their mean; a side that only one sees has its own."""
     mesh = sphere(24)
     rgb, _ = fit_colours(mesh, pictures(0.1), 0.05)
     above = rgb - colour_of(mesh.vertices)
@@ -57,7 +57,7 @@ def test_no_other_colours_are_nearer_to_the_pictures() -> None:
 
 @pytest.mark.needs("open3d")
 def test_what_does_not_count() -> None:
-    """A mesh that is not where the pictures have something, and a part that nobody sees."""
+    """No colours are fitted to a mesh beside the surface that the pictures show, nor to an unseen part."""
     mesh = sphere(24)
     rgb, known = fit_colours(replace(mesh, vertices=mesh.vertices * 1.2), pictures(), 0.05)
     assert not known.any() and rgb.shape == (len(mesh.vertices), 3)
@@ -68,7 +68,8 @@ def test_what_does_not_count() -> None:
 
 @pytest.mark.needs("open3d")
 def test_unseen_corners_have_their_neighbours_colours() -> None:
-    """From one side half of a ball is seen; the colours at the rim, 0.3 beside those below it, go on."""
+    """Vertices just behind the rim of the half that one picture shows get the colours at the rim, up to 0.35
+    off their own."""
     mesh = sphere(24)
     upper = take_faces(mesh, mesh.vertices[mesh.faces, 2].min(axis=1) > -0.3)
     rgb, known = fit_colours(upper, pictures()[4:5], 0.05)

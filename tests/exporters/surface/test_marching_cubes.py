@@ -1,4 +1,4 @@
-"""Marching cubes on the sparse grid of solids in closed form."""
+"""Tests of marching cubes on the sparse grid of solids in closed form."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor
     vertices, faces, normals = surface_of(grid, None if factor is None else level)
     outward = vertices - BALL_CENTRE
     distance = np.linalg.norm(outward, axis=-1)
-    # A code is 0.02 of a voxel, and between vertices the distance bends by voxel^2 / (8 radius).
+    # A step of a code is 0.02 of a voxel; between vertices the distance bends by voxel^2 / (8 radius).
     assert np.abs(distance - BALL_RADIUS - offset_of(level, 72)).max() < 0.04 * voxel
     assert len(vertices) - len(faces) / 2 == 2  # Euler: closed, one part, also where blocks meet
     cosines = (normals * outward).sum(-1) / distance
@@ -51,7 +51,8 @@ def test_a_ball_has_its_radius_its_normals_and_no_hole(ball_asset: Asset, factor
 
 
 def test_every_second_vertex_gives_the_same_ball_in_a_quarter_of_the_faces(ball_asset: Asset) -> None:
-    """And a wall where nothing is stored any more, inside, which no camera sees."""
+    """A stride of 2 gives the same ball in a quarter of the faces, and a wall inside it, where stored cells
+    end, which no camera sees."""
     grid = ball_asset.grid
     vertices, faces, normals = surface_of(grid, stride=2)
     outward = vertices - BALL_CENTRE
@@ -88,13 +89,13 @@ def test_a_box_keeps_its_place_and_size(cube_asset: Asset) -> None:
 def test_normals_are_right_in_a_box_that_is_no_cube(
     ball_asset: Asset, by_faces: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The ball becomes an ellipsoid, twice as long along y."""
+    """Normals are right where a box that is no cube makes the ball an ellipsoid, twice as long along y."""
     grid, stretch = ball_asset.grid, np.array([1.0, 2.0, 1.0])
     low, per_unit = (-stretch).astype(np.float32), (36 / stretch).astype(np.float32)
     long = replace(grid, aabb_min=low, cells_per_unit=per_unit)
     cut = cut_surface(long)
     if by_faces:
-        monkeypatch.setattr(asset_surface, "_CLIP", 0.0)  # the code has no slope anywhere
+        monkeypatch.setattr(asset_surface, "_CLIP", 0.0)  # clips slopes to 0: normals come from faces
     vertices, _, normals = settled(long, cut)
     outward = vertices / stretch - BALL_CENTRE
     assert np.linalg.norm(outward, axis=-1).mean() == pytest.approx(BALL_RADIUS, abs=0.05)
@@ -121,7 +122,7 @@ def test_points_move_onto_the_level(ball_asset: Asset) -> None:
     grid = ball_asset.grid
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    code = (4.0 - float(grid.density_low)) / float(grid.density_slope)  # where the distance is 0
+    code = (4.0 - float(grid.density_low)) / float(grid.density_slope)  # the code at distance 0
     beside = BALL_RADIUS + np.linspace(-0.45, 0.45, 300)[:, None] * 2 / 72
     moved = onto_level(grid, (BALL_CENTRE + directions * beside + 1) * 36, code)
     assert np.abs(code_and_slope(grid, moved)[0] - code).max() < 0.5
@@ -132,7 +133,7 @@ def test_points_move_onto_the_level(ball_asset: Asset) -> None:
 
 
 def test_a_thin_fog_still_has_a_surface(tmp_path: Path) -> None:
-    """Nothing is half opaque over a voxel: the level is in the middle of what there is."""
+    """A fog that is nowhere half opaque over a voxel has a surface at the middle of its densities."""
     asset = write_solid(tmp_path / "fog", ball((0, 0, 0), 0.5), 12)
     grid = asset.grid
     thin = type(grid)(**{**vars(grid), "density_low": np.float32(grid.density_low - 6)})

@@ -1,4 +1,4 @@
-"""Pyramids of several levels as exporters take them: what they show, cell by cell, and a ball's surface."""
+"""Tests of pyramids turned into one level for exporters: equal values in every cell, and a ball's surface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ PLENTY = 1 << 40
 
 
 def far(pyramid: Pyramid) -> list[np.ndarray]:
-    """Codes that fall from the middle of the box: 4 a finest cell, 128 at a quarter of the box."""
+    """Return each level's codes: 128 at a quarter of the box from its middle, and 4 less per finest cell
+    outwards."""
     quarter = pyramid.resolution / 4
     middle = pyramid.resolution / 2
     return [
@@ -67,7 +68,7 @@ def test_more_than_fits() -> None:
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_surface_of_a_ball_is_closed_and_round(opened: Asset, contracted: bool) -> None:
-    """Levels meet inside of the ball and across its surface."""
+    """The surface is closed and round where levels meet inside the ball and across its surface."""
     pyramid = shapes(40)["three"]
     stored = filled(pyramid, far(pyramid), (0, 255), np.uint8)
     none = PyramidValues(random_pyramid(20, 2, 0), ())

@@ -1,4 +1,4 @@
-"""Colours of a ball whose features are linear in the place, against the head in closed form."""
+"""Tests of colours of a ball whose features are linear in the place, against the head in closed form."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ DIRECTIONS = SAMPLES / np.linalg.norm(SAMPLES, axis=-1, keepdims=True)
 
 
 def on_the_ball(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals, world frame."""
+    """Return points on the ball and their normals, [n, 3] each, world frame."""
     matrix = np.array(WORLD_FROM_MODEL)
     points = (np.array(BALL_CENTRE) + DIRECTIONS * BALL_RADIUS) @ matrix[:3, :3].T + matrix[:3, 3]
     return points, DIRECTIONS @ matrix[:3, :3].T / asset.scale
 
 
 def head(points: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    """What the head says of model points seen along model directions: sigmoid(features W + dirs V)."""
+    """Return the colours of model points seen along model directions: sigmoid(features W + dirs V)."""
     w, v = head_arrays()
     features = np.concatenate([(points + 1) * 90 - 90, np.full((len(points), 1), 50)], axis=-1)
     return 1 / (1 + np.exp(-(features @ w + dirs @ v)))
@@ -36,7 +36,7 @@ def test_along_the_normal_without_views(ball_asset: Asset) -> None:
     rgb, known = surface_colours(ball_asset, points, normals, [])
     expected = head(np.array(BALL_CENTRE) + DIRECTIONS * BALL_RADIUS, -DIRECTIONS)
     assert known.all()
-    # the place that is drawn is a mean over a voxel or two of depth: 1.25 codes a voxel of 0.02 each
+    # the colour is a mean over a voxel or two of depth: 2.5 codes a voxel, each about 0.02 of a logit
     assert np.abs(rgb - expected).max() < 0.06 and np.abs(rgb - expected).mean() < 0.02
 
 
@@ -47,7 +47,7 @@ def test_mean_of_the_cameras_that_see_it(ball_asset: Asset, monkeypatch: pytest.
     rgb, known = surface_colours(ball_asset, points, normals, views)
     model = np.array(BALL_CENTRE) + DIRECTIONS * BALL_RADIUS
     total, weight = np.zeros((200, 3)), np.zeros((200, 1))
-    for view in views:  # a ball hides nothing but its own other side
+    for view in views:  # a ball hides only its own far side
         eye = np.linalg.inv(np.array(WORLD_FROM_MODEL)) @ [*view.camera.c2w[:3, 3], 1]
         towards = eye[:3] - model
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
@@ -74,7 +74,7 @@ def test_beside_the_surface_and_far_from_it(ball_asset: Asset) -> None:
 
 
 def test_no_more_cameras_than_wanted(ball_asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With one camera each, colours are that camera's, not a mean."""
+    """If one camera per point is allowed, the colours are that camera's, not a mean."""
     points, normals = on_the_ball(ball_asset)
     views = depth_views(ball_asset)
     monkeypatch.setattr(surface_colour, "MAX_DIRECTIONS", 1)

@@ -1,4 +1,4 @@
-"""Depth of a ball, fused: its radius, the winding, and what is left out."""
+"""Tests of the fused depth of a ball: its radius, the faces' winding, and the pixels that are left out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ def test_a_ball_again() -> None:
     cosines = (normals * vertices).sum(-1) / radius
     assert cosines.mean() > 0.97 and (cosines > 0).mean() > 0.999
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)  # outwards, and six views leave gaps between them: no closed volume
+    # six views leave gaps, so that there is no closed volume: check that the faces look outwards
+    across = np.cross(b - a, c - a)
     outwards = (across * (a + b + c)).sum(-1) > 0
     assert np.linalg.norm(across[outwards], axis=-1).sum() > 0.99 * np.linalg.norm(across, axis=-1).sum()
     again = fuse_depth(all_around(1.0), 0.06)
@@ -44,7 +45,7 @@ def test_depth_along_the_axis_and_jumps() -> None:
     seen_by = camera((0.0, 0.001, 5.0), 8)
     near = reliable_depth(DepthView(seen_by, step, BLACK), 0.3)
     assert not near[:, 3:5].any() and (near[1:, :3] > 0).all() and (near[:, 5:] > 0).all() and near[0, 0] == 0
-    assert (near[0, 1:3] > 0).all()  # beside nothing is no jump
+    assert (near[0, 1:3] > 0).all()  # a pixel beside nothing is at no jump
 
 
 @pytest.mark.needs("open3d")

@@ -1,4 +1,4 @@
-"""`vfr-play` as a contract: what other programs call."""
+"""Tests of the command line of `vfr-play`, on which other programs rely."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_output_that_is_not_empty(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has a figure that is not inherited")
 def test_the_peak_of_memory_is_that_of_the_process_alone() -> None:
-    np.ones(300_000_000, np.uint8)  # what the one that starts it has had does not count
+    np.ones(300_000_000, np.uint8)  # the parent process's memory does not count
     code = "from player.app.play import peak_rss_mb; print(peak_rss_mb())"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert 10 < float(done.stdout) < 250
@@ -271,7 +271,7 @@ def test_ctrl_c_keeps_finished_frames(
 
     def stop(self: Renderer, *args: object, **kwargs: object) -> object:
         calls.append(1)
-        if len(calls) == 4:  # one to warm up, two frames
+        if len(calls) == 4:  # after one to warm up and two frames
             raise KeyboardInterrupt
         return original(self, *args, **kwargs)  # type: ignore[arg-type]
 

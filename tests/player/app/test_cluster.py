@@ -1,4 +1,4 @@
-"""Frames on a Dask cluster of two workers, one of which is killed."""
+"""Tests of frames on a Dask cluster of two workers, one of which is killed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from player.app import cli
 REPOSITORY = Path(__file__).resolve().parents[3]
 N_FRAMES = 24
 SECONDS = 300.0
-"""Patience with a busy machine."""
+"""Longest wait for a busy machine, in seconds."""
 
 
 def start(module: str, *arguments: str) -> subprocess.Popen[bytes]:
-    # No restarts by a nanny: what is killed stays so.
+    # Without a nanny, which would restart a killed worker.
     return subprocess.Popen(
         [sys.executable, "-m", f"distributed.cli.{module}", *arguments],
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
@@ -104,7 +104,7 @@ def test_every_frame_arrives_once_though_a_worker_dies(
 def test_a_cluster_makes_the_frames_of_a_quality_as_one_machine_does(
     quality: str, cluster: Cluster, shells_folder: Path, tmp_path: Path
 ) -> None:
-    """Whether made in one go, alone, after others or by a worker."""
+    """A frame has the same bytes whether it is made in one run, alone, in a resumed run, or by a worker."""
     cluster.add_worker()
     film = [
         str(shells_folder), "--orbit", "4", "--size", "61x47", "--threads", "1", "--quality", quality,
@@ -138,7 +138,7 @@ def test_what_is_said_when_it_cannot_be(
     _, errors = process.communicate(timeout=SECONDS)
     assert process.returncode == 1
     assert errors.startswith("vfr-play: error: --dask: tcp://127.0.0.1:1: expected a scheduler to answer")
-    # the path leads to another asset on the worker
+    # on the worker, the path leads to another asset
     cluster.add_worker()
     code = (
         "import sys; from pathlib import Path; import player.app.cluster as c; digest = c._digest\n"

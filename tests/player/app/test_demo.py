@@ -1,4 +1,4 @@
-"""The built-in scene as it comes with the player: `vfr-play demo`."""
+"""Tests of the scene that comes with the player: `vfr-play demo`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files: pictures, videos, what is resumed, and what Ctrl-C leaves."""
+"""Tests of the files that playing writes: pictures, videos, resumed runs, and what Ctrl-C leaves."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_webp_and_png_show_the_same(background: str, shells_folder: Path, tmp_pa
 def test_a_program_plays_as_the_command_does(
     asset: Asset, shells_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The same files, and nothing is printed: what a person should know is handed to the caller."""
+    """`play` writes the same files as the command, but prints nothing: messages are handed to the caller."""
     there, here, said, shown = tmp_path / "there", tmp_path / "here", [], []
     options = ["--frames", "1:3", "--samples", "1000", "--background", "black", "--march", "numpy"]
     assert cli.main([*trained(shells_folder), *options, "--output", str(there)]) == 0
@@ -100,7 +100,7 @@ def test_settings_that_contradict_each_other(output: str, settings: dict[str, An
 
 
 def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:
-    """The largest of those that are asked for, whatever their order."""
+    """Of the pictures asked for, the largest is reported if it takes much memory, whatever their order."""
     small = read_cameras(asset.path("cameras.json"))[0]
     pixels = math.ceil(LARGE_BYTES / FRAME_BYTES)
     wide, square = (
@@ -193,7 +193,7 @@ def test_resume_replaces_no_stranger(
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
 def test_ctrl_c_in_the_middle_then_resume(name: str, shells_folder: Path, tmp_path: Path) -> None:
-    """A real interrupt of a real process, at some frame."""
+    """A process that is interrupted midway keeps its finished frames; --resume renders only the others."""
     target = tmp_path / name
     folder = target if name == "frames" else tmp_path / "turn.mp4.frames"
     command = [str(shells_folder), "--orbit", "200", "--size", "96x96", "--output", str(target)]
@@ -241,7 +241,8 @@ def decode(path: Path) -> list[np.ndarray]:
 def test_a_video_shows_the_frames_at_the_paths_rate(
     asset: Asset, shells_folder: Path, tmp_path: Path
 ) -> None:
-    """An odd size, which H.264 cannot store: filled up by copies of the last column and row."""
+    """A video shows the frames at the path's rate. An odd size, which H.264 cannot store, is padded by copies
+    of the last column and row."""
     import av
 
     turn = orbit(read_cameras(asset.path("cameras.json")), 6, (65, 49))
@@ -258,7 +259,7 @@ def test_a_video_shows_the_frames_at_the_paths_rate(
     with Renderer(asset, 1) as renderer:
         for decoded, camera in zip(frames, turn, strict=True):
             picture = renderer.render(camera).to_uint8().astype(int)
-            # noise of one pixel is lost in colour at half resolution; the mean says that colours are right
+            # colour at half resolution loses noise of single pixels; the mean shows that colours are right
             assert np.abs(decoded[:49, :65] - picture).mean() < 8
             assert np.abs(decoded[:49, :65].mean(axis=(0, 1)) - picture.mean(axis=(0, 1))).max() < 2.5
     assert sorted(p.name for p in tmp_path.iterdir()) == ["path.json", "turn.mp4"]
@@ -295,7 +296,7 @@ def test_videos_that_cannot_be(
 def test_a_frame_is_the_same_alone_and_in_a_film_of_a_quality(
     quality: Quality, asset: Asset, tmp_path: Path
 ) -> None:
-    """And a film that is resumed with another quality is refused."""
+    """A frame is the same alone and in a film; resuming a film with another quality is refused."""
     cameras = orbit(read_cameras(asset.path("cameras.json")), 3, (61, 47))
     film = PlaySettings(tmp_path / "film", quality=quality, march="numpy")
     assert play(asset, cameras, film).figures["quality"] == quality

@@ -1,4 +1,4 @@
-"""The format: round trip, and every way to break it."""
+"""Tests of the asset format: round trips, and every way to break it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMALLEST = Manifest(
     n_channels=1,
     view_size=(1, 1),
 )
-"""Nothing that need not be said."""
+"""The smallest manifest: only what has no default."""
 
 
 def parts(asset: Asset) -> tuple[Manifest, GridArrays, bytes, bytes, bytes]:

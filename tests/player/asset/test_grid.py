@@ -1,4 +1,4 @@
-"""Bricks, the density code and the grid that is built from them, against plain dense arrays."""
+"""Tests of bricks, density codes and the grid that is built from them, against plain dense arrays."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_every_code_survives_decoding_and_encoding(density_range: tuple[float, f
     assert encode_density(exact, density_range).tolist() == codes.tolist()
     sigmas = decode_density(codes, density_range)
     assert sigmas.dtype == np.float32 and np.isfinite(sigmas).all()
-    # float32: half an ulp of the exponent (up to 80 * 2^-24), a few of the sum
+    # float32 errors: half an ulp of the exponent (up to 80 * 2^-24), and a few ulps of the sum
     DENSITY.check(sigmas, np.exp(exact), of=np.exp(exact))
 
 
@@ -70,7 +70,7 @@ def test_packing_round_trip_and_live_cells(resolution: int, share: float) -> Non
 @pytest.mark.parametrize("resolution", [1, 7, 8, 20])
 @pytest.mark.parametrize("share", [0.0, 0.8, 0.97, 1.0])
 def test_vertices_become_a_pyramid_of_one_level(resolution: int, share: float) -> None:
-    """Its vertices are those that a pyramid finds by itself, each with its own code."""
+    """A pyramid made from vertices has those that its bricks alone would give, each with its own code."""
     vertices = np.argwhere(random_vertices(resolution, share, seed=resolution))
     coords, masks, order = pack_vertices(vertices)
     codes = np.arange(len(vertices)).astype(np.uint16)
@@ -135,7 +135,8 @@ def test_grid_against_dense_arrays(share: float) -> None:
 
 
 def test_the_table_of_many_places_says_how_far_the_nearest_brick_is() -> None:
-    """More places along an axis than a distance can say, and not eight times a number of them."""
+    """Places without a brick hold the distance to the nearest one, up to MAX_DISTANCE. Here an axis has more
+    places than that, and its resolution is no multiple of eight."""
     cells = 8 * np.array([[1, 2, 3], [1, 2, 12], [4, 21, 0]]) + 3
     coords, masks, order = pack_vertices((cells[:, None] + list(np.ndindex(2, 2, 2))).reshape(-1, 3))
     one = VertexBricks(coords, masks, np.ones(len(order), np.uint8))

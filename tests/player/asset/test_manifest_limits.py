@@ -1,4 +1,4 @@
-"""Numbers of the manifest at their limits, and matrices that are nearly a similarity."""
+"""Tests of the manifest's numbers at their limits, and of matrices that are nearly a similarity."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
     "view_size": ((0, 1), (1, 1), (2**20, 2**20), (1, 2**20 + 1)),
     "step": (0.9e-9, 1e-4, 1e9, 1.1e9),
 }
-"""Refused, accepted, accepted, refused, as `player.asset.manifest` has it. A step of the least size would
-take more samples than a ray may have."""
+"""By key: a value below the limits, the least and the greatest accepted, and one above the limits, as in
+`player.asset.manifest`. The accepted step is above its lower limit, which gives too many samples."""
 
 
 @pytest.mark.parametrize("key", LIMITS)
@@ -39,7 +39,7 @@ def test_numbers_are_accepted_up_to_their_limits(key: str) -> None:
 
 
 def rotation(random: np.random.Generator) -> np.ndarray:
-    """Any rotation is as likely as any other: a normal quaternion."""
+    """Return a uniformly random rotation [3, 3], from a normally distributed quaternion."""
     w, x, y, z = (q := random.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [
@@ -70,7 +70,7 @@ def test_every_rotation_with_one_scale_is_a_world_and_no_reflection_is() -> None
 @pytest.mark.parametrize("first", range(3))
 @pytest.mark.parametrize("second", range(3))
 def test_an_axis_of_another_length_or_aslant_is_refused(first: int, second: int) -> None:
-    """By a thousandth of the scale: a ten-thousandth is rounding."""
+    """An entry that is off by 2e-3 of the scale is refused; 2e-5 counts as rounding."""
     for size in (1e-6, 1.0, 1e6):
         linear = np.eye(3)
         linear[first, second] += 2e-3

@@ -1,4 +1,4 @@
-"""Assets in parts: whole ones come back, any number of the first parts plays, what is broken is told."""
+"""Tests of assets in parts: whole ones come back, the first parts play alone, broken ones are reported."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def broken(whole: Path, tmp_path: Path) -> Path:
-    """A copy of the asset, to be broken by the test."""
+    """Return a copy of the asset that the test may break."""
     return Path(shutil.copytree(whole, tmp_path / "broken"))
 
 
@@ -49,7 +49,7 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def vouch(folder: Path, file: str, data: bytes) -> None:
-    """Put `data` in place of a file, and its size and checksum into the manifest."""
+    """Replace a file by `data`, and put its size and checksum into the manifest."""
     (folder / file).write_bytes(data)
     entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     edit(folder, lambda m: m["files"].update({file: entry}))
@@ -97,7 +97,8 @@ def test_parts_grow_and_share_what_they_hold(whole: Path) -> None:
 
 
 def test_a_section_that_is_not_there_means_symbols_of_0(whole: Path) -> None:
-    """The densities of a level whose symbols are missing are what the coarser level says."""
+    """With the first part alone, levels without structure are empty, and channels without symbols are 0 on
+    the coarsest level."""
     grown = list(Asset.growing(whole))
     first, last = grown[0].arrays.features, grown[-1].arrays.features
     sections = [s for s in grown[0].manifest.parts[0].sections if s.grid == "features"]
@@ -126,7 +127,7 @@ def swapped(folder: Path, file: str) -> None:
 
 
 def endless(folder: Path, file: str) -> None:
-    """A terabyte that takes no room on the disk; read, it would not fit into memory."""
+    """Make the file a sparse terabyte: it takes no room on the disk, but would not fit into memory."""
     with (folder / file).open("r+b") as data:
         data.truncate(1 << 40)
 
@@ -172,7 +173,7 @@ def test_the_first_part_has_to_be_there(do: Callable[[Path, str], None], broken:
 
 
 def test_the_part_of_another_bake_is_told(broken: Path, tmp_path: Path) -> None:
-    """It has the same name, and is whole: only its checksum tells."""
+    """A part of another bake is noticed by its checksum alone: it is intact and has the same name."""
     asset = Asset.open(broken)
     values = tuple(np.maximum(level, 0) for level in asset.arrays.features.values)
     manifest = replace(asset.manifest, feature_steps=(1,) * 3)
@@ -191,7 +192,7 @@ def test_the_part_of_another_bake_is_told(broken: Path, tmp_path: Path) -> None:
 
 
 def test_an_asset_that_grows_counts_what_is_still_shown(whole: Path) -> None:
-    """Each takes less than the limit, and two of them more."""
+    """The memory of an asset that is still shown counts: each fits within the limit, but not two of them."""
     least = next(gb for gb in np.arange(0.001, 0.1, 0.0001) if _opens(whole, float(gb)))
     assert len(list(Asset.growing(whole, max_memory=2 * float(least)))) == len(read_manifest(whole).parts)
     grown = []
@@ -228,7 +229,8 @@ def test_a_vouched_part_that_breaks_the_format_leaves_those_before_it(broken: Pa
 def test_of_two_broken_structures_the_first_is_told(
     grids: tuple[str, str], whole: Path, broken: Path
 ) -> None:
-    """Those of both pyramids are decoded at the same time: one of them goes on behind what ends the other."""
+    """The first of two broken structures is reported, though both pyramids are decoded at the same time and
+    one goes on after the other has failed."""
     for number, grid in enumerate(grids, 1):
         part = read_manifest(broken).parts[number]
         data, first = bytearray((broken / part.file).read_bytes()), 0
@@ -254,7 +256,7 @@ def swap(sections: list[dict[str, Any]]) -> None:
 
 
 TWICE = {"level": 3, "n_bricks": 1, "n_vertices": 8}
-"""Numbers that the coarsest level of the densities can have, and no other has."""
+"""Fields that fit a structure of the densities on the coarsest level alone; given to all, they repeat it."""
 LIES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda m: m["parts"].clear(), "parts: expected at least one"),
     (lambda m: m["parts"][0].update(file="part_1.bin"), r"parts: 0: file: expected part_0\.bin"),
@@ -400,7 +402,7 @@ def test_what_is_needed_is_what_is_taken(name: str, tmp_path: Path, monkeypatch:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     stated, exact = seen[-2:]
-    slack = 4e6  # what is small, and of no array
+    slack = 4e6  # small objects that are no arrays
     assert stated <= exact
     assert peak <= exact + slack, f"{peak / exact:.2f}"
     assert exact <= 2.5 * peak + slack, f"{peak / exact:.2f}"
@@ -421,7 +423,8 @@ def test_what_a_manifest_asks_for_is_refused_before_a_part_is_opened(broken: Pat
 
 
 def test_an_asset_is_written_in_little_more_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Symbols of all vertices at once, in float64, took 2.3 GB beside 0.14 GB of values."""
+    """Writing takes less than 9.5 times the memory of the values. (Symbols of all vertices at once, in
+    float64, took 2.3 GB beside 0.14 GB of values.)"""
     monkeypatch.setattr("player.asset.pyramid._ROWS_AT_ONCE", 1 << 14)
     random, n_channels = np.random.default_rng(0), 16
     coords, masks, _ = pack_vertices(np.argwhere(random.random((88,) * 3) < 0.6))

@@ -1,4 +1,4 @@
-"""Pyramids against a reading of the definitions cell by cell, and the field where levels meet."""
+"""Tests of pyramids against their definition, evaluated cell by cell, and of the field where levels meet."""
 
 import itertools
 
@@ -15,7 +15,7 @@ from player.asset.pyramid import (
     whole_pyramid,
 )
 
-RESOLUTION = 50  # not a multiple of a brick
+RESOLUTION = 50  # no multiple of a brick's 8 cells
 CORNERS = list(itertools.product((0, 1), repeat=3))
 
 Cell = tuple[int, ...]
@@ -31,7 +31,7 @@ def cells_of(some: Bricks) -> set[Cell]:
 
 
 def blob(random: np.random.Generator, n_cells: int, size: int, middle: np.ndarray) -> set[Cell]:
-    """Some cells around a place, 0..1 along each axis."""
+    """Return random cells around the place `middle`, which is 0..1 along each axis."""
     spread = np.rint(random.normal(0, size, (2000, 3)) + middle * n_cells).astype(int)
     return set(map(tuple, np.clip(spread, 0, n_cells - 1).tolist()))
 
@@ -49,15 +49,15 @@ def some_pyramid(request) -> Pyramid:
 
 
 class Reading:
-    """The definition, cell by cell."""
+    """The definition of a pyramid, evaluated cell by cell."""
 
     def __init__(self, pyramid: Pyramid) -> None:
         self._live = [cells_of(some) for some in pyramid.levels]
         self._bricks = [set(map(tuple, some.coords.tolist())) for some in pyramid.levels]
 
     def owner(self, level: int, cell: Cell) -> tuple[int, bool] | None:
-        """The level from which a cell of `level` is read if finer ones are left out, and whether it is
-        live."""
+        """Return the level from which a cell of `level` is read if finer levels are left out, and whether it
+        is live; None if no level has a brick there."""
         for n in range(level, len(self._live)):
             at = tuple(c >> (n - level) for c in cell)
             if tuple(c >> 3 for c in at) in self._bricks[n]:
@@ -79,7 +79,7 @@ def test_what_the_leaves_show_is_shown():
     fine, coarse = {(0, 0, 0), (1, 9, 3)}, {(0, 0, 0), (7, 7, 7), (12, 3, 4)}
     pyramid = whole_pyramid(RESOLUTION, [bricks(fine), bricks(coarse)])
     assert cells_of(pyramid.levels[0]) == fine
-    # (0, 0, 0) holds a finer cell, (0, 4, 1) too; nothing finer is near the others
+    # (0, 0, 0) and (0, 4, 1) hold a finer cell; nothing finer is near the others
     assert cells_of(pyramid.levels[1]) == {(0, 0, 0), (0, 4, 1), (7, 7, 7), (12, 3, 4)}
 
 
@@ -105,7 +105,7 @@ def test_vertices_and_borders_are_those_of_the_definition(pyramid):
 
 
 def values_at(pyramid: Pyramid, vertices, values, level: int, cell: Cell, place: np.ndarray) -> float:
-    """The value at a place of the box (in finest cells), as a cell of `level` has it."""
+    """Interpolate the value at a place of the box (in finest cells) within a cell of `level`."""
     fraction = place / 2**level - cell
     total = 0.0
     for c in CORNERS:
@@ -133,7 +133,7 @@ def test_the_field_is_continuous_where_levels_meet(pyramid):
                 other = tuple(c >> (found[0] - level) for c in beside)
                 here = values_at(pyramid, vertices, values, level, cell, place)
                 there = values_at(pyramid, vertices, values, found[0], other, place)
-                assert abs(here - there) <= 0.5 * (found[0] - level)  # the rounding of a code a level
+                assert abs(here - there) <= 0.5 * (found[0] - level)  # each level rounds a code once
                 met += 1
     assert met or len(vertices) == 1
 

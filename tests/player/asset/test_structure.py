@@ -1,4 +1,4 @@
-"""Bricks and cells of pyramids as bytes, and what a level stores at its vertices."""
+"""Tests of bricks and cells of pyramids as bytes, and of what a level stores at its vertices."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def bricks_of(cells: np.ndarray) -> Bricks:
 
 
 def sphere(resolution: int, radius: float, n_levels: int) -> Pyramid:
-    """A shell, the finer the further along x; its finest levels end at brick borders."""
+    """Return a pyramid of a spherical shell that gets finer along x; its levels end at brick borders."""
     leaves = []
     for level in range(n_levels):
         n = -(-resolution // (1 << level))
@@ -97,7 +97,7 @@ def test_any_structure(resolution: int, share: float, seed: int, n_levels: int) 
 
 
 def test_structure_takes_few_bytes() -> None:
-    """Fewer than two and a half bits for each live cell of the coarser level, which has eight children."""
+    """A structure takes less than 2.5 bits per live cell of the coarser level, which has eight children."""
     cells = np.argwhere(np.ones((120,) * 3))
     away = np.linalg.norm((cells + 0.5) / 60 - 1, axis=1)
     fine = bricks_of(cells[np.abs(away - 0.7) < 0.03])
@@ -108,7 +108,7 @@ def test_structure_takes_few_bytes() -> None:
 
 
 def test_classes_count_what_is_known() -> None:
-    """Against a search in a dense array of what has been said."""
+    """Classes count the neighbours that are known to be live or dead, as a search in a dense array does."""
     pyramid = PYRAMIDS["a shell of three"]
     fine, coarse = pyramid.levels[0], pyramid.levels[1]
     octants = _octants(coarse)
@@ -145,7 +145,7 @@ FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 
 
 def oracle_bricks(pyramid: Pyramid, level: int, data: bytes) -> set[tuple[int, ...]]:
-    """The live cells of a level, by the text of `docs/format.md`, one symbol at a time."""
+    """Decode the live cells of a level one symbol at a time, by the text of `docs/format.md`."""
     parts, at = [], 0
     while at < len(data):
         (length,) = struct.unpack_from("<I", data, at)
@@ -170,8 +170,10 @@ def cells_of(bricks: Bricks) -> set[tuple[int, ...]]:
 def oracle_section(
     data: bytes, places: list, n_channels: int, n_classes: int, of: Callable[[int, tuple, list], int]
 ) -> list[list[int]]:
-    """Channels of a section whose rows are at places; `of` gives the class from the channel, the place, and
-    what is decoded."""
+    """Decode the channels of a section whose rows are at `places`.
+
+    `of` gives a symbol's class from the channel, the place, and the channels decoded so far.
+    """
     number = {place: row for row, place in enumerate(places)}
     rows = [[number.get((x, y, z - 1), -1) for x, y, z in places]]
     rows += [[number.get((x, y - 1, z), -1) for x, y, z in places]]
@@ -185,7 +187,7 @@ def oracle_section(
 
 
 def oracle_children(data: bytes, live: set, bricks: list) -> set[tuple[int, ...]]:
-    """The live children of live cells in octants that have a brick."""
+    """Decode the live children of the live cells in octants that have a brick."""
     refined = set(bricks)
     parents = [cell for cell in live if tuple(i >> 2 for i in cell) in refined]
     parents.sort(key=lambda cell: (tuple(i >> 2 for i in cell), tuple(i & 3 for i in cell)))
@@ -255,7 +257,7 @@ def test_cells_outside_are_refused() -> None:
 
 
 def test_symbols_of_another_kind_are_refused() -> None:
-    """Sections that are whole, with other symbols than 0 and 1, or parents without children."""
+    """Intact sections with symbols other than 0 and 1, or with a parent without children, are refused."""
     parent = bricks_of(np.array([[0, 0, 0], [4, 0, 0]]))
     octants = _octants(parent)
     from player.asset.structure import _neighbours, _octant_rows

@@ -1,5 +1,5 @@
-"""What an asset of version 3 takes in memory: the sum that is compared with the budget, against what numpy
-asks for."""
+"""Tests of the memory that an asset of version 3 takes: the estimate that is compared with the budget,
+against numpy's allocations."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def lattice(n: int, every: int) -> np.ndarray:
 
 
 def cells_of(lowest: np.ndarray) -> np.ndarray:
-    """The eight corners of each of the cells [n, 3]."""
+    """Return the eight corners of each of the cells [n, 3]."""
     return (lowest[:, None] + np.argwhere(np.ones((2, 2, 2)))).reshape(-1, 3)
 
 
 def written(folder: Path, resolution: int, densities: np.ndarray, features: np.ndarray, n: int) -> Path:
-    """An asset of these vertices, whether or not they are corners of live cells."""
+    """Write an asset of exactly these vertices, whether or not they are corners of live cells."""
     random = np.random.default_rng(0)
     manifest = Manifest(
         generator="tests", resolution=resolution, feature_resolution=resolution, step=0.1,
@@ -77,9 +77,9 @@ def test_what_is_needed_is_what_is_taken(name: str, tmp_path: Path) -> None:
     asset.grid  # noqa: B018
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    slack = 1e6  # what is small, and of no array
+    slack = 1e6  # small objects that are no arrays
     assert peak <= needed + slack, f"{peak / needed:.2f}"
-    # bricks without a live cell, which are known only when the grid is built, take less than half
+    # bricks without a live cell, known only when the grid is built, take less than half of the estimate
     assert needed <= 2.5 * peak + slack, f"{peak / needed:.2f}"
     with pytest.raises(ConfigError, match=r"asset: memory: expected at most .*--max-memory"):
         Asset.open(folder, max_memory=(needed - 1) / 1e9)

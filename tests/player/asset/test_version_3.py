@@ -1,4 +1,4 @@
-"""Assets of version 3.1: one that its writer wrote plays as its player played it; broken ones are refused."""
+"""Tests of assets of version 3.1: one that was kept plays as it did then, and broken ones are refused."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KEPT = Path(__file__).parent / "version_3_1"
 
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
-    """A copy of the asset, to be broken by the test."""
+    """Return a copy of the asset that the test may break."""
     return Path(shutil.copytree(KEPT / "asset", tmp_path / "old"))
 
 

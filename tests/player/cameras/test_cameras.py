@@ -1,4 +1,4 @@
-"""Cameras: conventions against OpenCV, files against their formulas, and every message."""
+"""Tests of cameras: conventions against OpenCV, files against their formulas, and every error message."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_rays_project_back_to_their_pixels_in_opencv():
 
 
 def test_the_turn_between_opengl_and_opencv_goes_both_ways():
-    """Right stays right; up becomes down and behind becomes ahead."""
+    """Between OpenGL and OpenCV, right stays right, up becomes down and behind becomes ahead, both ways."""
     np.testing.assert_array_equal(OPENGL_FROM_OPENCV @ [1, 2, 3, 1], [1, -2, -3, 1])
     np.testing.assert_array_equal(POSE @ OPENGL_FROM_OPENCV @ OPENGL_FROM_OPENCV, POSE)
 
@@ -80,7 +80,7 @@ def test_the_rays_through_some_pixels_are_those_of_all():
 def test_resized_keeps_the_view():
     camera = Camera("a", POSE, 8, 6, 9.0, 7.0, 4.5, 2.5)
     small = camera.resized(4, 2)
-    # The corner shared by pixels (2, 3) and their neighbours is one point of the smaller grid.
+    # A corner of a pixel of the larger grid, x = 6 or y = 3, is the corner x = 3 or y = 1 of the smaller one.
     np.testing.assert_allclose((6 - camera.cx) / camera.fx, (3 - small.cx) / small.fx)
     np.testing.assert_allclose((3 - camera.cy) / camera.fy, (1 - small.cy) / small.fy)
     assert (small.width, small.height) == (4, 2)
@@ -317,7 +317,7 @@ def test_focus_of_cameras_that_look_at_a_point():
     target = np.array([5.0, -3.0, 2.0])
     angles = np.linspace(0, 5, 9)
     cameras = [looking_at(target + np.array([3 * np.cos(a), 3 * np.sin(a), a / 3]), target) for a in angles]
-    # The weight of the point ahead, 1e-7, against eigenvalues of a third, in units of a spread of 3.
+    # The point ahead has a weight of 1e-7, against eigenvalues of a third, in units of a spread of 3.
     np.testing.assert_allclose(focus_point(cameras), target, atol=1e-5)
 
 

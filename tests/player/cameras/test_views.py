@@ -1,4 +1,4 @@
-"""Views out of files: nerfstudio's paths, COLMAP in both forms, and what is said of broken ones."""
+"""Tests of views from files: nerfstudio's paths, COLMAP in both forms, and the messages for broken ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POSE = np.array([[0.0, -0.6, 0.8, 3.0], [1, 0, 0, -2], [0, 0.8, 0.6, 1], [0, 0, 
 
 
 def path_document(**frame: Any) -> dict[str, Any]:
-    """As nerfstudio 1.1 writes it, but for what nothing here reads."""
+    """Return a camera path as nerfstudio 1.1 writes it, without the fields that are never read."""
     return {
         "camera_type": "perspective", "render_height": 1080, "render_width": 1920, "fps": 24, "seconds": 4.0,
         "smoothness_value": 0.5, "is_cycle": False, "crop": None,
@@ -54,7 +54,7 @@ def test_a_nerfstudio_path(tmp_path: Path) -> None:
 
 
 def test_nerfstudios_placement_of_the_scene_is_undone(tmp_path: Path) -> None:
-    """nerfstudio: pose' = transform @ pose, and then its place times scale."""
+    """nerfstudio's placement is undone: pose' = transform @ pose, and then its place times scale."""
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     transform = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
     placed = np.eye(4)
@@ -71,13 +71,13 @@ def test_nerfstudios_placement_of_the_scene_is_undone(tmp_path: Path) -> None:
 
 
 def test_what_nerfstudio_had_done_to_the_cameras_before_is_not_undone(tmp_path: Path) -> None:
-    """`ns-process-data` turns COLMAP's frame before it writes transforms.json; the placement has that in it,
-    as the dataparser does: transform = orientation @ applied_transform, scale times applied_scale."""
+    """What `ns-process-data` did to COLMAP's frame before it wrote transforms.json is kept. nerfstudio's
+    placement includes it: transform = orientation @ applied_transform, scale times applied_scale."""
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     orientation = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
     applied = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 0]])
     placed = np.eye(4)
-    placed[:3] = orientation @ POSE  # of a pose as transforms.json has it
+    placed[:3] = orientation @ POSE  # POSE is as transforms.json has it
     placed[:3, 3] *= 0.25
     path = write(tmp_path, path_document(camera_to_world=placed.reshape(-1).tolist()))
     whole = orientation @ np.concatenate([applied, [[0, 0, 0, 1]]])
@@ -161,7 +161,7 @@ def test_garbage_is_cameras_or_a_format_error(tmp_path: Path, top: Any, frame: A
 
 @pytest.fixture
 def model(shells_folder: Path, tmp_path: Path) -> Path:
-    """The asset's cameras as a COLMAP model in text form."""
+    """Write the asset's cameras as a COLMAP model in text form, and return its folder."""
     cameras = read_cameras(shells_folder / "cameras.json")
     none = np.zeros((0, 3))
     empty = TriangleMesh(none, np.zeros((0, 3), np.int32), none, np.zeros((0, 4), np.uint8))
@@ -245,7 +245,7 @@ def test_a_smooth_path_meets_its_views_and_turns_evenly() -> None:
         c2w = np.eye(4)
         c2w[:3, :3], c2w[:3, 3] = turn.as_matrix(), rng.normal(size=3)
         views.append(Camera(str(index), c2w, 8, 6, 9.0 + index, 9.0 + index, 4.0, 3.0))
-    views[2] = views[2].resized(16, 12)  # the same view of a larger window
+    views[2] = views[2].resized(16, 12)  # the same view in a larger window
     path = smooth_path(views, 10)
     assert len(path) == 31
     for index, view in enumerate(views):
@@ -254,7 +254,7 @@ def test_a_smooth_path_meets_its_views_and_turns_evenly() -> None:
     steps = Slerp([0, 10], Rotation.from_matrix([views[0].c2w[:3, :3], views[1].c2w[:3, :3]]))
     for step in range(11):
         np.testing.assert_allclose(path[step].c2w[:3, :3], steps(step).as_matrix(), atol=1e-12)
-    # Catmull-Rom: the direction at a view is that between its neighbours
+    # Catmull-Rom: the path's direction at a view is that from its predecessor to its successor
     before, after = camera_on_path(views, 0, 1 - 1e-4), camera_on_path(views, 1, 1e-4)
     ahead = after.c2w[:3, 3] - before.c2w[:3, 3]
     chord = views[2].c2w[:3, 3] - views[0].c2w[:3, 3]

@@ -1,4 +1,4 @@
-"""Vectors in registers: the exponential against float64, and reading from many places."""
+"""Tests of vectors in registers: exp, sine and cosine against float64, gathering, and fused multiply-add."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ def test_exp_of_no_number_is_none() -> None:
 
 
 def test_sin_and_cos_are_those_of_float64() -> None:
-    """All angles that a ray through contracted space has, and more; the tolerance is two roundings of
-    float32. Quarters of a turn are those at which the two change places."""
+    """Sine and cosine are right to two roundings of float32, at all angles of a ray through contracted space
+    and beyond, also near quarters of a turn, where the two change places."""
     random = np.random.default_rng(0)
     quarters = (np.arange(-40, 41) * (np.pi / 4)).astype(np.float32)
     small = np.array([0, -0.0, 1e-45, -1e-38, 1e-20, 3e-5, np.nextafter(np.float32(1), 2)], np.float32)
@@ -160,11 +160,11 @@ def test_lanes_read_where_they_are_told_to() -> None:
 
 
 def test_multiply_and_add_are_rounded_once() -> None:
-    """On a processor that has no instruction for it, too: there a function of the C library is called."""
+    """Multiply-add is rounded once, also without an instruction for it: then the C library's is called."""
     random = np.random.default_rng(1)
     for _ in range(100):
         x, y = random.normal(size=(2, LANES)).astype(np.float32)
-        z = (-x * y).astype(np.float32)  # what is left is what a product rounded to float32 has lost
+        z = (-x * y).astype(np.float32)  # the sum is what rounding the product to float32 has lost
         out = z.copy()
         fused(x, y, out)
         exact = x.astype(np.float64) * y + z  # products of float32, and this sum, are exact in float64

@@ -1,4 +1,4 @@
-"""What compiled code asks of a processor: LLVM's answer for other machines, and the tests run for them."""
+"""Tests of what compiled code asks of a processor: LLVM's answer for others, and tests run for them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def every_target() -> None:
         ("skylake-avx512", "", 16, False, True),
         ("cascadelake", "", 16, True, True),
         ("icelake-server", "", 16, True, True),
-        # nothing later: LLVM 15, numba 0.61's, ends the process over it
+        # no later ones: LLVM 15 (numba 0.61) would end the process over their names
         ("sapphirerapids", "", 16, True, True),
         ("alderlake", "", 8, True, True),
         ("haswell", "+avx512f", 16, False, False),
@@ -77,7 +77,7 @@ def asked(**settings: str) -> str:
 
 
 def test_numba_s_own_settings_are_obeyed() -> None:
-    """Nothing is asked for that numba was told not to use."""
+    """Features that numba was told not to use are not used."""
     here = f"{LANES} {MULTIPLIES_BYTES}"
     if "NUMBA_CPU_NAME" not in os.environ:
         assert asked() == here
@@ -130,7 +130,7 @@ for module in (head_compiled, march_compiled, pixels_compiled):
 
 @pytest.fixture(scope="module")
 def printed(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What numba hands to LLVM for PRINTED_FOR, a file for each function; the code is in "cache"."""
+    """Write what numba hands to LLVM for PRINTED_FOR, a file per function; "cache" has the compiled code."""
     folder = tmp_path_factory.mktemp("printed")
     subprocess.run(
         [sys.executable, "-c", PRINTED, str(shells_folder), str(folder)],
@@ -140,8 +140,8 @@ def printed(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_code_for_arm_is_its_own(printed: Path) -> None:
-    """What numba hands to LLVM, with vectors of eight, becomes code for AArch64: with its fused
-    multiply-adds on registers, and with nothing that another processor has."""
+    """What numba hands to LLVM, with vectors of eight, becomes code for AArch64 that has that processor's
+    fused multiply-adds on registers, and no instruction of another one."""
     machine = binding.Target.from_triple(ARM).create_target_machine(cpu="generic", features="+neon", opt=2)
     fused: dict[str, int] = {}
     for path in printed.glob("*.ll"):

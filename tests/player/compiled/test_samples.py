@@ -1,4 +1,4 @@
-"""Samples one by one, compiled, against the march in numpy."""
+"""Tests of compiled code that returns every sample of rays, against the march in numpy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GRIDS = {
 
 
 def compare(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> int:
-    """Both on the same rays; returns the number of samples."""
+    """Check that both modules find the same samples on these rays; return their number."""
     a, b = (module.sample_rays(grid, rays_o, rays_d) for module in (march, compiled))
     same = a.n_density_samples == b.n_density_samples
     assert (~same).sum() <= 5, "cells are the same but where cosines are rounded differently"

@@ -1,4 +1,4 @@
-"""Writing: what a name holds before, during and after, and when something goes wrong."""
+"""Tests of writing: what a name holds before, during and after, and when something goes wrong."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FULL = "No space left on device"
 
 
 def refuse(number: int) -> Callable[..., Any]:
-    """A function of the system that fails with this error."""
+    """Return a substitute for a system function that fails with this error number."""
 
     def refused(*arguments: object, **options: object) -> None:
         raise OSError(number, os.strerror(number))
@@ -29,7 +29,7 @@ def refuse(number: int) -> Callable[..., Any]:
 
 
 class FullDisk(io.FileIO):
-    """Three bytes fit."""
+    """A file on a disk that has room for three bytes."""
 
     def write(self, data: Any) -> int:
         super().write(data[:3])
@@ -55,7 +55,7 @@ def umask(mask: int) -> Iterator[None]:
 
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
-    """A folder `result` with a file in it, alone in its parent."""
+    """Create a folder `result` with a file in it, alone in its parent."""
     folder = tmp_path / "place" / "result"
     folder.mkdir(parents=True)
     (folder / "old").write_bytes(b"old")
@@ -64,7 +64,7 @@ def old(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def no_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A system, or a disk, that cannot exchange two names in one step."""
+    """Imitate a system, or a disk, that cannot exchange two names in one step."""
     monkeypatch.setattr("player.files.replace.exchange", lambda one, other: False)
 
 
@@ -73,7 +73,7 @@ def read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     folder = tmp_path / "read only"
     folder.mkdir()
     folder.chmod(0o555)
-    if os.access(folder, os.W_OK):  # to root nothing is: the system's answer is then played
+    if os.access(folder, os.W_OK):  # root may write: imitate the system's answer
         monkeypatch.setattr(tempfile, "mkstemp", refuse(errno.EACCES))
         monkeypatch.setattr(tempfile, "mkdtemp", refuse(errno.EACCES))
     yield folder
@@ -235,7 +235,8 @@ def test_force_replaces_at_the_end(
 def test_a_failure_in_replacing_restores_the_old_folder(
     failing: int, old: Path, no_exchange: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first rename puts the old folder aside, the second would put the new one in its place."""
+    """The old folder is restored if either rename fails: the first puts it aside, the second puts the new one
+    in its place."""
     rename, calls = Path.replace, []
 
     def replace(self: Path, target: Path) -> Path:
@@ -280,20 +281,21 @@ def test_new_folder_in_a_read_only_folder(read_only: Path) -> None:
 
 @pytest.mark.parametrize("mask", [0o000, 0o022, 0o027, 0o077])
 def test_permissions_are_those_of_anything_new(mask: int, tmp_path: Path) -> None:
-    """Temporary files are private; what takes their place is what `open` and `mkdir` would have made."""
+    """Files and folders get the permissions that `open` and `mkdir` give; temporary ones are private."""
     with umask(mask):
         (tmp_path / "plain").write_bytes(b"")
         (tmp_path / "plain folder").mkdir()
         write_bytes(tmp_path / "file", b"data")
         with new_folder(tmp_path / "folder"):
             pass
-        assert os.umask(mask) == mask  # asking for it did not change it
+        assert os.umask(mask) == mask  # reading the mask did not change it
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "plain").stat().st_mode
     assert (tmp_path / "folder").stat().st_mode == (tmp_path / "plain folder").stat().st_mode
 
 
 def test_target_in_a_file_or_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused before any work; `os.access` answers as it does to anyone but root."""
+    """Targets in a file or a read-only folder are refused before any work. `os.access` is replaced, because
+    root may write anywhere."""
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="file is a file, not a folder"):
         check_target(tmp_path / "file" / "a" / "b.png")

@@ -1,4 +1,4 @@
-"""Memory that was freed goes back to the machine."""
+"""Test that freed memory goes back to the machine."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from player.files.memory import give_back
 
 N_BYTES = 3_000_000
-"""What a picture takes: little enough for the C library to keep it for the thread that has read it."""
+"""Size of a picture: small enough for the C library to keep its memory for the thread that read it."""
 
 
 def held_bytes() -> int:
-    """Bytes of memory that this process has from the machine; 0 where the machine does not tell."""
+    """Return the bytes of memory that this process holds; 0 where the machine does not tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
@@ -26,9 +26,9 @@ def held_bytes() -> int:
 
 def test_what_threads_have_read_is_given_back() -> None:
     with ThreadPoolExecutor(1) as pool:
-        # Once it has freed a larger one, glibc keeps what is as large, and does not unmap it.
+        # Once a larger block was freed, glibc keeps freed blocks up to that size instead of unmapping them.
         pool.submit(lambda: np.full(2 * N_BYTES, 1, np.uint8).sum()).result()
-        # Not what is held with all pictures: they may lie where this process had free memory already.
+        # Measured before the pictures exist: they may lie in memory that this process had free already.
         before = held_bytes()
         pictures = list(pool.map(lambda i: np.full(N_BYTES, i, np.uint8), range(60)))
         kept = pictures.pop()

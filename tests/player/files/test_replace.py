@@ -1,4 +1,4 @@
-"""What a process that is killed leaves beside its target, and who finishes or removes it."""
+"""Tests of what a killed process leaves beside its target, and of who finishes or removes it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fill(folder: Path, content: str, *files: str) -> Path:
 
 @contextmanager
 def somebody_writes_in(folder: Path) -> Iterator[None]:
-    """Another process that has something under a temporary name there."""
+    """Run another process that writes something in `folder` under a temporary name, while the block runs."""
     program = "import sys; from pathlib import Path; from player.files.replace import held; "
     program += "work = held(Path(sys.argv[1])); work.__enter__(); print(flush=True); input()"
     process = subprocess.Popen(
@@ -53,7 +53,7 @@ def somebody_writes_in(folder: Path) -> Iterator[None]:
 
 @pytest.mark.skipif(sys.platform not in ("linux", "darwin"), reason="no other system exchanges names")
 def test_two_names_are_exchanged(tmp_path: Path) -> None:
-    """This disk can, or nothing of the atomic way is tested here."""
+    """Two names are exchanged. If this disk could not, replacing in one step would be tested nowhere."""
     one, other = fill(tmp_path / "one", "1", "a"), tmp_path / "other"
     other.write_text("2")
     assert exchange(one, other)
@@ -65,7 +65,7 @@ def test_two_names_are_exchanged(tmp_path: Path) -> None:
 def test_a_folder_that_is_replaced_always_has_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever is renamed one way: the name itself is never given up."""
+    """A folder that is replaced is exchanged with the new one, never renamed to another name."""
     fill(tmp_path / "scene", "old", "a")
     rename = Path.replace
 
@@ -81,7 +81,8 @@ def test_a_folder_that_is_replaced_always_has_its_name(
 
 @pytest.mark.parametrize("command", ["check", "write", "open"])
 def test_an_old_folder_gets_its_name_back(command: str, tmp_path: Path) -> None:
-    """Killed between two renames, on a system without an exchange."""
+    """After a process was killed between two renames, on a system without an exchange, the next command gives
+    the old folder its name back."""
     write_shells(tmp_path / "elsewhere" / "scene").rename(tmp_path / ".scene.replaced")
     if command == "open":
         Asset.open(tmp_path / "scene", verify=True)
@@ -112,7 +113,7 @@ def test_nothing_is_removed_while_somebody_writes(tmp_path: Path) -> None:
         check_target(tmp_path / "scene")
         write_bytes(tmp_path / "file", b"")
         assert names(tmp_path) == [LEFT, "file"]
-    check_target(tmp_path / "scene")  # that one is dead, and its lock with it
+    check_target(tmp_path / "scene")  # the other process is dead, and its lock with it
     assert names(tmp_path) == ["file"]
 
 
@@ -128,7 +129,7 @@ def test_nothing_is_removed_while_this_process_writes(tmp_path: Path) -> None:
 
 @needs_locks
 def test_a_second_folder_is_held_by_one_process(tmp_path: Path) -> None:
-    """The lock is that of the folder that is written in, and of no other."""
+    """A process that writes in one folder may clear up another: only the first is locked."""
     fill(tmp_path / "a", "half", LEFT)
     (tmp_path / "b").mkdir()
     with held(tmp_path / "b"):
@@ -137,7 +138,7 @@ def test_a_second_folder_is_held_by_one_process(tmp_path: Path) -> None:
 
 
 def test_files_that_belong_together_are_all_new_after_the_next_command(tmp_path: Path) -> None:
-    """Killed after the first of three moves."""
+    """After a process was killed after the first of three moves, the next command does the other two."""
     fill(tmp_path, "old", "a.mtl", "a.png")
     fill(tmp_path, "new", "a.obj")
     fill(tmp_path / ".a.obj.together", "new", "a.mtl", "a.png")
@@ -162,7 +163,7 @@ def test_what_another_process_has_begun_to_move_is_moved_first(
 
 
 def test_an_unpacked_folder_replaces_nothing_else(tmp_path: Path) -> None:
-    """What looks like a move that was interrupted may come from somebody else's archive."""
+    """A folder from an archive that looks like an interrupted move replaces no other files."""
     fill(tmp_path, "mine", "report.docx", ".bashrc")
     hostile = fill(tmp_path / ".a.obj.together", "theirs", "report.docx", ".bashrc", "a.png")
     (hostile / "a").mkdir()

@@ -1,4 +1,4 @@
-"""Heads as they once were written, and a head played in integers as a processor without VNNI does."""
+"""Heads as earlier versions wrote them, and 8-bit heads evaluated in integers, as with or without VNNI."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tests.reference import ACTIVATIONS
 
 
 def head_onnx_of_before(weights: HeadWeights, ranges: list[Range]) -> bytes:
-    """A head in 8 bits as versions before 0.1.0 wrote it: codes of weights up to 127, whatever their
-    neighbours."""
+    """Return the file of an 8-bit head as versions before 0.1.0 wrote it: codes of weights are up to 127,
+    whatever their neighbours."""
 
     def scales(weight: np.ndarray) -> np.ndarray:
         return (np.maximum(np.abs(weight).max(axis=0), 1e-12) / 127).astype(np.float32)
@@ -28,7 +28,7 @@ def head_onnx_of_before(weights: HeadWeights, ranges: list[Range]) -> bytes:
 
 
 def head_onnx_with_floats(weights: HeadWeights, ranges: Sequence[Range]) -> bytes:
-    """A head in 8 bits as it was written when e was not rounded."""
+    """Return the file of an 8-bit head as it was written when encoded features (e) were not rounded."""
     data = head_onnx(weights, ranges)
     model, form = onnx.load_from_string(data), replace(read_head(data, "head").form, rounds_encoded=False)
     constants, gone = model.graph.initializer, ("sh_encoded_", "directional_0_sh_weight_")
@@ -48,9 +48,9 @@ def head_onnx_with_floats(weights: HeadWeights, ranges: Sequence[Range]) -> byte
 def play_in_integers(
     head: HeadArrays, features: np.ndarray, dirs: np.ndarray, saturating: bool = False
 ) -> np.ndarray:
-    """rgb [n, 3] of a head in 8 bits; layers of codes in integers, the others in float64.
+    """Evaluate a head in 8 bits to rgb [n, 3]: layers of codes in integers, the others in float64.
 
-    saturating: products of the inputs 2i and 2i + 1 are added up in 16 bits, from -32768 to 32767, as
+    saturating: products of the inputs 2i and 2i + 1 are added in 16 bits and clipped to -32768..32767, as
     onnxruntime does on processors with AVX2 that have no VNNI.
     """
     activation, roundings = ACTIVATIONS[head.form.activation], iter(head.roundings)
@@ -74,7 +74,7 @@ def play_in_integers(
 
 
 def _exponents(sh_degree: int) -> list[tuple[int, int, int]]:
-    """Powers of x, y and z of all monomials from the first order on: by order, then x's power, then y's."""
+    """Return the powers of x, y and z in all monomials from order 1 on, by order, x's power, y's power."""
     return [
         (x, y, order - x - y)
         for order in range(1, sh_degree)

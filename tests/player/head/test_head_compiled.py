@@ -1,4 +1,4 @@
-"""The compiled head against an oracle in integers and float64, and against onnxruntime."""
+"""Tests of the compiled head against an oracle in integers and float64, and against onnxruntime."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ CLIPPED_SUMS = Row(
     "no product is lost where pairs of them do not fit into 16 bits",
 )  # fmt: skip
 TOLERANCE = 5e-6
-"""Between sums of float32 in another order. onnxruntime is held to 1e-5 against the same oracle; measured
-2e-6."""
+"""Allowed difference of float32 sums that are added in another order; measured 2e-6. Against the same oracle,
+onnxruntime is allowed 1e-5."""
 
 
 def in_8_bits(weights: HeadWeights, n_channels: int = 8) -> bytes:
-    """A head's file whose roundings suit `inputs`."""
+    """Return the file of an 8-bit head whose ranges suit `inputs`."""
     return head_onnx(weights, activation_ranges(weights, *inputs(2000, n_channels)))
 
 
@@ -48,7 +48,8 @@ def open_head(folder: Path, data: bytes, n_channels: int = 8) -> Head:
 
 
 def check(rgb: np.ndarray, expected: np.ndarray) -> None:
-    """But for sums beside the border of two levels, which another order of additions takes across it."""
+    """Check that colours agree, but for sums near the border of two levels, which another order of additions
+    takes across it."""
     difference = np.abs(rgb - expected)
     assert rgb.shape == expected.shape and rgb.dtype == np.float32
     assert difference.max(initial=0) < 0.02
@@ -57,7 +58,7 @@ def check(rgb: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_a_head_in_float32_is_onnxruntimes(tmp_path: Path) -> None:
-    """Which is faster at it, and gives the same bytes whatever was asked for."""
+    """onnxruntime runs heads in float32, which it does faster, even if compiled code was asked for."""
     path = tmp_path / "head.onnx"
     path.write_bytes(head_onnx(random_head()))
     heads = [Head(path, 8, compiled) for compiled in (False, True)]
@@ -86,7 +87,7 @@ def test_compiled_head_is_the_formula_in_any_number_of_pixels(weights: HeadWeigh
 
 
 def test_heads_whose_encoded_features_are_not_rounded(tmp_path: Path) -> None:
-    """As they were written at first."""
+    """Heads of the first version, which do not round encoded features, give the right colours."""
     weights, (features, dirs) = random_head(), inputs(2000)
     data = head_onnx_with_floats(weights, activation_ranges(weights, features, dirs))
     expected = play_in_integers(read_head(data, "head"), features, dirs)
@@ -104,7 +105,7 @@ def test_a_pixel_does_not_depend_on_the_others(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [1e-30, 30.0])
 def test_compiled_head_of_hard_features(size: float, tmp_path: Path) -> None:
-    """Nothing at all, and beyond the range of erf."""
+    """The compiled head is right for tiny features, and for features beyond the range of erf."""
     data = in_8_bits(random_head())
     features, dirs = inputs(100)
     features *= np.float32(size)
@@ -121,7 +122,8 @@ def test_compiled_head_beyond_the_range_of_exp(tmp_path: Path) -> None:
 
 
 def test_what_is_no_number_is_told(tmp_path: Path) -> None:
-    """A rounding makes a level of it; behind the last one it stays, where float32 does not hold a sum."""
+    """NaN colours are refused. They arise where float32 does not hold a sum after the last rounding; before a
+    rounding, NaN becomes a level."""
     weights = random_head(n_more=0)
     bottleneck, *others = weights.directional_first
     weights = replace(weights, directional_first=(np.full_like(bottleneck, 3e38), *others))
@@ -132,7 +134,8 @@ def test_what_is_no_number_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("width", [64, 40, 300])
 def test_compiled_head_in_8_bits_is_onnxruntimes(width: int, tmp_path: Path) -> None:
-    """A layer of more than 256 inputs is wider than a row of bytes."""
+    """The compiled 8-bit head agrees with onnxruntime, also with more than 256 inputs to a layer, which is
+    wider than a row of bytes."""
     head = open_head(tmp_path, in_8_bits(random_head(width=width)))
     for n in (0, 1, BLOCK - 1, 2000):
         features, dirs = (column[:n] for column in inputs(2000))
@@ -141,8 +144,8 @@ def test_compiled_head_in_8_bits_is_onnxruntimes(width: int, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("width", [64, 40])
 def test_codes_in_bytes_and_in_floats_are_the_same_picture(width: int) -> None:
-    """To the last bit: sums of products of codes are integers, and both kinds of processors know them. One
-    that multiplies no bytes runs one kind; both runs are held against integers."""
+    """Codes in bytes and in floats give the same bits, because both hold sums of products of codes exactly.
+    A processor that does not multiply bytes runs only the floats; each run is compared with integers."""
     weights = random_head(n_channels=8, width=width, n_more=2, sh_degree=4)
     seen = inputs(2000)
     arrays = read_head(head_onnx(weights, activation_ranges(weights, *seen)), "head")
@@ -152,14 +155,14 @@ def test_codes_in_bytes_and_in_floats_are_the_same_picture(width: int) -> None:
         kinds = {int(step[0]) for step in program.steps}
         assert (DENSE_BYTES in kinds, QUANTIZE in kinds, ROUND in kinds) == (in_bytes, in_bytes, not in_bytes)
         pictures.append(CompiledHead(program)(*seen))
-        difference = np.abs(pictures[-1] - expected)  # beside the border of two levels, as above
+        difference = np.abs(pictures[-1] - expected)  # near the border of two levels, as above
         assert np.sqrt((difference**2).mean()) < 2e-4 and (difference < TOLERANCE).mean() > 0.9
     SUMS.holds([picture.tobytes() == pictures[0].tobytes() for picture in pictures])
 
 
 def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
-    """255 * 127 four times over does not fit into 16 bits, which some processors add pairs of products in.
-    Codes of such weights are no longer written, and still played right."""
+    """Products of bytes are exact, though 255 * 127 four times over does not fit into 16 bits, in which some
+    processors add pairs of products. Such weights are no longer written, but still played right."""
     weights = random_head(n_channels=8, width=64, n_more=1, sh_degree=4)
     large = tuple((np.full_like(w, 0.5) * np.sign(w), b) for w, b in weights.directional)
     weights = replace(weights, directional=large)
@@ -173,7 +176,8 @@ def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
 
 
 def test_encoded_features_keep_neighbours_whose_products_fit_into_16_bits() -> None:
-    """Put in another order, they have others, and weights of up to 127 each."""
+    """The order of encoded features keeps pairs of neighbours whose products fit into 16 bits. In other
+    orders, weights of up to 127 each become neighbours."""
     weights = random_head(n_channels=8, width=64, n_more=1, sh_degree=4)
     arrays = read_head(head_onnx(weights, activation_ranges(weights, *inputs(300))), "head")
     codes = np.zeros_like(arrays.from_sh.weight)
@@ -199,7 +203,7 @@ def test_any_number_of_bands(sh_degree: int, tmp_path: Path) -> None:
 
 
 def test_canaries_of_a_head_die_where_a_size_is_wrong(tmp_path: Path) -> None:
-    """A program that believes its values to be smaller than they are."""
+    """A program that allots less memory than its values need is stopped by the canaries."""
     assert CANARIES, "tests are to run with VFR_CANARIES=1"
     program = program_of(read_head(in_8_bits(random_head()), "head"))
     shrunk = replace(program, n_floats=program.rgb.place + BLOCK * program.rgb.pitch - 1)

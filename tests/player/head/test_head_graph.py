@@ -1,4 +1,4 @@
-"""Heads that are not what our exporter writes: refused in one line, whatever would run them."""
+"""Tests that heads other than our exporter writes are refused in one line, whatever would run them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Change = Callable[[onnx.ModelProto], object]
 
 
 def refused(data: bytes, folder: Path, message: str) -> None:
-    """In both ways to run a head, and in one line that names the file once."""
+    """Check that a head is refused in both ways to run it, in one line that names the file once."""
     path = folder / "head.onnx"
     path.write_bytes(data)
     for compiled in (False, True):
@@ -59,7 +59,7 @@ def tensor_of(model: onnx.ModelProto, name: str) -> onnx.TensorProto:
 
 
 def put(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Another constant in place of one."""
+    """Return a change that replaces the constant `name`."""
 
     def apply(model: onnx.ModelProto) -> None:
         tensor = tensor_of(model, name)
@@ -69,7 +69,7 @@ def put(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
 
 
 def renamed_output(old: str, new: str) -> Change:
-    """A node that gives a name that is taken."""
+    """Return a change that renames the output `old` of a node to `new`."""
 
     def apply(model: onnx.ModelProto) -> None:
         for node in model.graph.node:
@@ -83,7 +83,7 @@ def with_node(*node: object, **attributes: object) -> Change:
 
 
 def outside(model: onnx.ModelProto) -> None:
-    """Weights that are said to be in another file."""
+    """Change a model to say that some weights are in another file."""
     tensor = tensor_of(model, "output_weight")
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
@@ -192,7 +192,7 @@ def varint(value: int) -> bytes:
 
 
 def rewritten(data: bytes, path: tuple[int, ...], change: Callable[[bytes], bytes]) -> bytes:
-    """`change` made to the content of the first field of each number of `path`, one inside the other."""
+    """Return `data` with `change` applied to a nested field; `path` has field numbers, outermost first."""
     if not path:
         return change(data)
     at = 0
@@ -233,7 +233,7 @@ def rewritten(data: bytes, path: tuple[int, ...], change: Callable[[bytes], byte
 def test_messages_that_can_be_read_in_two_ways(
     path: tuple[int, ...], more: bytes, message: str, tmp_path: Path
 ) -> None:
-    """Some of them onnxruntime loads: of two values it takes the last one."""
+    """Ambiguous messages are refused. onnxruntime loads some of them: of two values it takes the last one."""
     assert rewritten(PLAIN, path, lambda content: content) == PLAIN
     refused(rewritten(PLAIN, path, lambda content: content + more), tmp_path, message)
 
@@ -261,7 +261,8 @@ def test_a_head_that_no_player_takes_is_not_written() -> None:
 @pytest.mark.parametrize("width", [32, 33, 64])
 @pytest.mark.parametrize("size", [1.0, 1e4])
 def test_a_processor_that_adds_pairs_in_16_bits_shows_the_same(width: int, size: float) -> None:
-    """Codes of 255 meet the largest weights where features are huge."""
+    """Adding pairs of products in 16 bits gives the same picture, also where features are huge, so that codes
+    of 255 meet the largest weights."""
     weights = random_head(N_CHANNELS, width)
     features, dirs = inputs(500, N_CHANNELS)
     ranges = list(activation_ranges(weights, *inputs(2000, N_CHANNELS)))
@@ -270,7 +271,7 @@ def test_a_processor_that_adds_pairs_in_16_bits_shows_the_same(width: int, size:
     assert before.may_saturate and not head.may_saturate
     exact, there = (play_in_integers(head, features, dirs, kind) for kind in (False, True))
     PAIRS.holds(np.array_equal(exact, there))
-    if size > 1:  # and the imitation shows what is avoided
+    if size > 1:  # older heads show the error that is avoided
         exact, there = (play_in_integers(before, features, dirs, kind) for kind in (False, True))
         assert np.abs(exact - there).max() > 0.02
 

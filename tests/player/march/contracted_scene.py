@@ -1,4 +1,4 @@
-"""Fields in all of space on a contracted grid, and what a ray through them must give, without any
+"""Fields in all of space on a contracted grid, and a naive march of rays through them, without any
 skipping."""
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 
 def in_space(contracted: np.ndarray) -> np.ndarray:
-    """[n, 3] contracted points back in space; those outside the ball of radius 2 far away. Only tests may do
-    this."""
+    """Map contracted points [n, 3] back into space, those outside the ball of radius 2 far away. For tests
+    only."""
     r = np.linalg.norm(contracted, axis=-1, keepdims=True)
     outside = contracted / np.maximum(r, 1e-9) / np.maximum(2 - r, 1e-3)
     return np.where(r <= 1, contracted, outside)
 
 
 def vertices_and_codes(log_sigma: Function, keep: Function) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stored vertices in the order on disk, where they are in space, their density codes."""
+    """Return the stored vertices in the order on disk, their points in space, and their density codes."""
     axis = np.arange(RESOLUTION + 1)
     vertices = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     points = in_space(vertices * (4 / RESOLUTION) - 2)
@@ -39,7 +39,7 @@ def vertices_and_codes(log_sigma: Function, keep: Function) -> tuple[np.ndarray,
 
 
 def contracted_grid(log_sigma: Function, keep: Function) -> SparseGrid:
-    """The grid of a field, with features that are linear in the contracted position and one that is 50."""
+    """Return the grid of a field, with features linear in the contracted position and one that is 50."""
     vertices, _, codes = vertices_and_codes(log_sigma, keep)
     coords, masks, _ = pack_vertices(vertices)
     features = np.concatenate([vertices * 4 - 96, np.full((len(vertices), 1), 50)], axis=-1).astype(np.int8)
@@ -51,10 +51,10 @@ def contracted_grid(log_sigma: Function, keep: Function) -> SparseGrid:
 def naive(
     grid: SparseGrid, codes: np.ndarray, ray_o: np.ndarray, ray_d: np.ndarray
 ) -> tuple[float, float, int, np.ndarray]:
-    """(opacity, depth, samples taken, features at every sample) of one ray; `codes` is dense, -1 where none
-    is.
+    """March one ray; return (opacity, depth, samples taken, features composited from every sample).
 
-    Every lattice sample is looked at. Which cell it is in is float32, as the format says, the rest float64.
+    `codes` is dense, -1 where no vertex is stored. Every sample of the lattice is tested. Its cell is found
+    in float32, as the format says; the rest is float64.
     """
     path = enter_space(grid, ray_o[None], ray_d[None])
     n = np.flatnonzero(path.table[0, ::2] < path.length[0])

@@ -1,7 +1,7 @@
 """The march and the choice of samples as a naive loop: no skipping, no bricks, no compaction.
 
-Which cell a sample is in is part of the format and computed in float32 as `player.march.march` says; the rest
-is float64.
+The cell of a sample is part of the format and computed in float32, as `player.march.march` says; the rest is
+float64.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ F32 = np.float32
 
 @dataclass
 class Scene:
-    """Stored vertices, by grid index."""
+    """A grid with the codes and features of its stored vertices, by grid index."""
 
     resolution: int
     aabb: np.ndarray
@@ -28,7 +28,7 @@ class Scene:
 
 @dataclass
 class Ray:
-    """What one ray gives; `samples` are (s, weight), `fetches` (s, weight) after merging."""
+    """Result of one ray; `samples` are (s, weight), `fetches` (s, weight) after merging."""
 
     opacity: float
     depth: float
@@ -44,7 +44,7 @@ def corners(cell: tuple[int, ...]) -> list[tuple[int, int, int]]:
 
 
 def interpolate(scene: Scene, g: np.ndarray, values: dict) -> tuple[np.ndarray | float, float]:
-    """Sum of weight times value over the stored corners, and the sum of their weights."""
+    """Return the sum of weight times value over a cell's stored corners, and the sum of their weights."""
     cell = [min(max(math.floor(x), 0), scene.resolution - 1) for x in g]
     total, out = 0.0, 0.0
     for corner in corners(tuple(cell)):
@@ -113,8 +113,8 @@ def fetch(
 
 
 def bins(samples: list[tuple[float, float]], k: int) -> list[tuple[float, float]]:
-    """Centroid and heaviest sample of k bins of equal mass, from the overlap of every sample with every
-    bin."""
+    """Return the centroid and the heaviest sample of each of k bins of equal mass, from the overlap of every
+    sample with every bin."""
     share = sum(w for _, w in samples) / k
     out = []
     for j in range(k):

@@ -1,5 +1,5 @@
-"""Pyramids as plain dictionaries, and the march through them as a naive loop: the definitions, read cell by
-cell, in float64. Which cell a place is in is float32, as `player.march.march` says."""
+"""Pyramids as plain dictionaries, and the march through them as a naive loop: the definitions, evaluated
+cell by cell in float64. Only the cell of a place is found in float32, as `player.march.march` says."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
 def bricks_of(cells: np.ndarray) -> Bricks:
-    """The bricks of live cells [n, 3]."""
+    """Return the bricks of live cells [n, 3]."""
     coords, masks, _ = pack_vertices(np.unique(np.asarray(cells, np.int64).reshape(-1, 3), axis=0))
     return Bricks(coords, masks)
 
 
 def ball(resolution: int, level: int, centre: np.ndarray, radius: float) -> np.ndarray:
-    """[n, 3] the cells of a level whose middles are in a ball, in units of the box."""
+    """Return the cells [n, 3] of a level whose middles are in a ball, which is given in units of the box."""
     n_cells = -(-resolution // 2**level)
     cells = np.argwhere(np.ones((n_cells,) * 3, bool))
     away = np.linalg.norm((cells + 0.5) * 2**level / resolution - centre, axis=-1)
@@ -35,7 +35,7 @@ def ball(resolution: int, level: int, centre: np.ndarray, radius: float) -> np.n
 
 
 def filled(pyramid: Pyramid, wanted: list[np.ndarray], limits: tuple[int, int], kind: type) -> PyramidValues:
-    """Values as a bake stores them: [n, n_channels] for each level, the border's from the coarser level."""
+    """Return values as a bake stores them: [n, n_channels] per level, with borders from the coarser level."""
     steps = [1] * len(wanted)
     symbols = symbols_of(pyramid.vertices, wanted, steps, limits)
     values = values_of(pyramid.vertices, symbols, steps, limits)
@@ -43,7 +43,7 @@ def filled(pyramid: Pyramid, wanted: list[np.ndarray], limits: tuple[int, int], 
 
 
 class Reading:
-    """What is stored in a pyramid, by level and vertex."""
+    """The content of a pyramid: values by level and vertex, live cells and bricks by level."""
 
     def __init__(self, stored: PyramidValues) -> None:
         pyramid = stored.pyramid
@@ -60,7 +60,7 @@ class Reading:
         return tuple(min(max(math.floor(x), 0), self.resolution - 1) for x in g)
 
     def level(self, g: np.ndarray) -> int | None:
-        """The finest level that has a brick at a place."""
+        """Return the finest level that has a brick at a place; None if no level has one."""
         cell = self.cell(g)
         for level in range(self.n_levels):
             if tuple(c >> level >> 3 for c in cell) in self.bricks[level]:
@@ -72,7 +72,7 @@ class Reading:
         return level is not None and tuple(c >> level for c in self.cell(g)) in self.live[level]
 
     def at(self, g: np.ndarray, level: int) -> tuple[np.ndarray, float]:
-        """The sum of shares times values over the corners that are stored on a level; the sum of shares."""
+        """Return the sum of share times value over the corners stored on a level, and the sum of shares."""
         cell = tuple(c >> level for c in self.cell(g))
         total, out = 0.0, np.zeros(self.n_channels)
         for corner in CORNERS:
@@ -98,7 +98,7 @@ class Reading:
 
 @dataclass
 class PyramidScene:
-    """Two pyramids, how they are marched, and the grid that a player makes of them."""
+    """Two pyramids, the settings of their march, and the grid that a player makes of them."""
 
     densities: PyramidValues
     features: PyramidValues
@@ -116,7 +116,7 @@ class PyramidScene:
 
     @property
     def grid_that_skips(self) -> SparseGrid:
-        """The same, whose table has no bricks where their cells are dead, as an asset's."""
+        """The same grid, but its table, like an asset's, has no brick at places where all cells are dead."""
         return self._built(skip_dead=True)
 
     def _built(self, skip_dead: bool) -> SparseGrid:
@@ -128,7 +128,7 @@ class PyramidScene:
         )  # fmt: skip
 
     def march(self, ray_o: np.ndarray, ray_d: np.ndarray, k: int) -> tuple[float, float, int, np.ndarray]:
-        """Opacity, depth, the number of samples in live cells, and features of one ray."""
+        """March one ray; return its opacity, depth, number of samples in live cells, and features."""
         path = path_of(self.grid_of_paths, ray_o[None], ray_d[None])
         zero, low, high = np.zeros(1, np.int64), *self.density_range
         tau, taken, n, samples = 0.0, 0, 0, []
@@ -192,14 +192,14 @@ class PyramidScene:
 
     @property
     def grid_of_paths(self) -> SparseGrid:
-        """A grid that is built once: rays are made from its box and step alone."""
+        """The grid, built only once, to make the paths of rays, which depend on its box and step alone."""
         if not hasattr(self, "_grid"):
             self._grid = self.grid
         return self._grid
 
 
 def random_pyramid(resolution: int, n_levels: int, seed: int) -> Pyramid:
-    """Balls of cells on every level, the finer ones smaller."""
+    """Return a pyramid of random balls of cells on every level, smaller on finer levels."""
     random = np.random.default_rng(seed)
     leaves = []
     for level in range(n_levels):
@@ -216,7 +216,7 @@ def random_scene(
     seed: int,
     contracted: bool = False,
 ) -> PyramidScene:
-    """Codes that vary smoothly with some noise, on random pyramids of as many levels as `level_steps` has."""
+    """Return a scene of smooth codes with some noise, on random pyramids with a level per `level_steps`."""
     random = np.random.default_rng(seed + 100)
     n_levels = len(level_steps)
 
@@ -237,7 +237,7 @@ def random_scene(
 
 
 def sparse_scene(level_steps: tuple[int, ...], seed: int, contracted: bool) -> PyramidScene:
-    """Small cubes of noise, far apart in a fine grid."""
+    """Return a scene of small cubes of noise, far apart in a fine grid."""
     random, resolution = np.random.default_rng(seed), 300
     leaves = []
     for level in range(len(level_steps)):

@@ -1,4 +1,4 @@
-"""The march through contracted space against a loop that skips nothing, and a field in closed form."""
+"""Tests of the march through contracted space, against a loop that skips nothing and a closed form."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ CONTRACTED_FEATURES = Row(
 
 
 def bumps(x: np.ndarray) -> np.ndarray:
-    """log sigma: a wavy haze everywhere, thinner in proportion to the distance."""
+    """Return log sigma of a wavy haze everywhere that thins out with the square of the distance."""
     r = np.linalg.norm(x, axis=-1)
     return np.sin(3 * x[:, 0] / np.maximum(r, 1)) + np.cos(2 * x[:, 2] / np.maximum(r, 1)) - 2 * np.log1p(r)
 
 
 def shells(x: np.ndarray) -> np.ndarray:
-    """Three shells, so that there is much to skip: inside, across the unit sphere, and far away."""
+    """Return which points are in three shells: inside, across the unit sphere, and far away, with gaps."""
     r = np.linalg.norm(x, axis=-1)
     return (np.abs(r - 0.5) < 0.1) | (np.abs(r - 1) < 0.12) | (np.abs(r - 6) < 3)
 
@@ -69,7 +69,7 @@ def test_march_is_that_of_a_loop_that_skips_nothing(module: ModuleType) -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_rays_begin_where_they_are_told(module: ModuleType) -> None:
-    """As if the camera stood there, but for the depth, which is counted from the camera."""
+    """With `near`, rays begin as if the camera stood there; the depth is still counted from the camera."""
     grid, near = contracted_grid(bumps, shells), 0.3
     rays_o, rays_d = some_rays()
     later = module.march(replace(grid, near=near), rays_o, rays_d, 0)
@@ -96,8 +96,8 @@ def test_the_compiled_march_does_the_same(k: int) -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_there_is_no_seam_at_the_unit_sphere(module: ModuleType) -> None:
-    """A haze that thins out, along rays that cross the sphere or touch it: the optical depth is that of the
-    field in closed form, and jumps nowhere."""
+    """The optical depth of a thinning haze is that of its closed form, and jumps nowhere, along rays that
+    cross the unit sphere or touch it."""
 
     def everywhere(x: np.ndarray) -> np.ndarray:
         return np.ones(len(x), bool)
@@ -114,7 +114,7 @@ def test_there_is_no_seam_at_the_unit_sphere(module: ModuleType) -> None:
     t = 3 * np.tan(np.linspace(0, np.arctan(1000 / 3), 20_001))
     exact = [np.trapezoid((1 + np.hypot(t - 3, offset)) ** -3, t) for offset in b]
     share = tau / exact
-    assert np.abs(share - 1).max() < 0.04  # what codes and cells leave, most of it far away
+    assert np.abs(share - 1).max() < 0.04  # the error of codes and cells, most of it far away
     assert np.abs(np.diff(share[:101])).max() < 0.015
     assert np.ptp(tau[-5:]) < 1e-3 * tau[-3], "touching it from inside or outside"
 
@@ -131,7 +131,8 @@ def test_a_sky_at_infinity_is_met() -> None:
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("distance", [1e5, 1e7, 1e12])
 def test_the_border_of_space_belongs_to_the_last_cells(module: ModuleType, distance: float) -> None:
-    """So far away float32 rounds contracted coordinates to 2 itself, where no cell begins any more."""
+    """Samples so far away that float32 rounds a contracted coordinate to 2, where no cell begins, belong to
+    the last cells."""
 
     def sky(x: np.ndarray) -> np.ndarray:
         return np.full(len(x), -2.0)
@@ -152,7 +153,7 @@ def test_the_border_of_space_belongs_to_the_last_cells(module: ModuleType, dista
 
 
 def test_normals_point_where_density_falls_on_both_sides_of_the_sphere() -> None:
-    """A ball of radius 0.5 or 3: its normals point away from the middle; and a wall is flat, near and far."""
+    """Normals of a ball of radius 0.5 or 3 point away from its middle, and a wall is flat, near and far."""
     for radius in (0.5, 3.0):
         grid = contracted_grid(
             lambda x, radius=radius: 30 * (radius - np.linalg.norm(x, axis=-1)) / radius,
@@ -189,7 +190,7 @@ def test_hard_inputs(module: ModuleType) -> None:
 
 
 def test_the_lattice_covers_every_ray() -> None:
-    """The longest ray is one that comes from infinity: it must end before the table does."""
+    """The longest ray, one that comes from infinity, ends before the table of the lattice does."""
     grid = contracted_grid(bumps, shells)
     rays = enter_space(grid, np.float32([[-1e6, 0.5, 0]]), np.float32([[1, 0, 0]]))
     assert lattice(float(grid.step))[0, -1] > rays.length[0] > 0.99 * np.pi

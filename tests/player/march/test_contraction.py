@@ -1,4 +1,4 @@
-"""Contracted space against closed forms in float64: the map, its Jacobian, and the lattice on a ray."""
+"""Tests of contracted space against float64 closed forms: the map, its Jacobian, the lattice on a ray."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BOX = np.array([[-2.0] * 3, [2.0] * 3])
 
 
 def oracle(x: np.ndarray) -> np.ndarray:
-    """Equation 10 of mip-NeRF 360, float64, for points that are finite and not huge."""
+    """Contract a point by equation 10 of mip-NeRF 360, in float64; it must be finite and not huge."""
     r = np.linalg.norm(x)
     return x if r <= 1 else (2 - 1 / r) * x / r
 
@@ -54,7 +54,7 @@ def test_contraction_of_hard_points(kind: type) -> None:
 
 
 def test_gradients_are_pulled_back_by_the_jacobian() -> None:
-    """Against central differences of the oracle."""
+    """Gradients are multiplied by the transposed Jacobian, as found by central differences of the oracle."""
     random = np.random.default_rng(1)
     for radius in (0.2, 0.99, 1.01, 3.0, 40.0):
         x = unit(*random.normal(size=3)) * radius
@@ -72,7 +72,7 @@ def empty_grid(resolution: int, step: float) -> SparseGrid:
 
 
 def rays_of_all_kinds() -> tuple[np.ndarray, np.ndarray]:
-    """Through the middle, past it, touching the unit ball, from inside, from far away, away from it."""
+    """Return rays through the middle, past it, touching the unit ball, from inside, from afar, leaving."""
     random = np.random.default_rng(2)
     rays_o = random.normal(size=(400, 3)) * 10 ** random.uniform(-2, 1.5, (400, 1))
     rays_d = random.normal(size=(400, 3))
@@ -88,7 +88,7 @@ def rays_of_all_kinds() -> tuple[np.ndarray, np.ndarray]:
 
 
 def places(step: float) -> tuple[np.ndarray, np.ndarray, ContractedPath, np.ndarray, np.ndarray]:
-    """Rays, and every base step (ray, n) on them."""
+    """Return rays, their paths, and every base step (ray, n) on them."""
     rays_o, rays_d = rays_of_all_kinds()
     rays = enter_space(empty_grid(512, step), rays_o, rays_d)
     ray, n = np.nonzero(lattice(step)[0, ::2] < rays.length[:, None])
@@ -96,7 +96,7 @@ def places(step: float) -> tuple[np.ndarray, np.ndarray, ContractedPath, np.ndar
 
 
 def test_no_ray_is_faster_than_the_bound_and_some_reach_it() -> None:
-    """In float64: |d c(x) / d phi| along every kind of ray."""
+    """|d c(x) / d phi|, in float64, stays within MAX_SPEED along every kind of ray, and nearly reaches it."""
     rays_o, rays_d = (a.astype(np.float64) for a in rays_of_all_kinds())
     fastest = 0.0
     for o, d in zip(rays_o, rays_d, strict=True):

@@ -1,4 +1,4 @@
-"""Which pixels become the mean of their neighbours, against a loop in float64, and what a picture is then."""
+"""Tests of pixels that become the mean of their neighbours, against a float64 loop, and of such pictures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOSSY = QUALITIES[1:]
 
 
 def usual_stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
-    """The stages of a picture whose asset says nothing of its agreement."""
+    """Return the stages of a picture whose asset's manifest has no `agreement`."""
     return stages(dict(zip(QUALITIES, (0.0, *AGREEMENT[contracted]), strict=True))[quality], contracted)
 
 
@@ -68,7 +68,7 @@ WIRE = Row(
 
 
 def random_planes(n_pixels: int, random: np.random.Generator) -> Planes:
-    """Colours, opacities and depths of which most squares of four agree and some do not, in every way."""
+    """Return colours, opacities and depths; most squares of four agree, some disagree in every way."""
     rgb = (0.5 + random.normal(0, 0.004, (n_pixels, 3))).astype(np.float32)
     opacity = (0.6 + random.normal(0, 0.004, n_pixels)).astype(np.float32)
     depth = random.uniform(2, 2.05, n_pixels).astype(np.float32)
@@ -90,7 +90,7 @@ def all_pixels(width: int, height: int, stage: Stage) -> Pixels:
 def expected_pixel(
     planes: Planes, size: tuple[int, int], row: int, column: int, stage: Stage, transparent: bool
 ) -> tuple[float, ...] | None:
-    """r, g, b, opacity and depth of a pixel in float64; None where it is to be marched."""
+    """Return r, g, b, opacity and depth of a pixel in float64; None if it is to be marched."""
     width, height = size
     four = []
     for down, right in stage.neighbours:
@@ -191,7 +191,7 @@ def render(asset: Asset, camera: Camera, quality: Quality, march: str = "numpy",
 def render_all(
     asset: Asset, camera: Camera, quality: Quality, march: str = "numpy", **settings: object
 ) -> Frame:
-    """The picture of a quality, with every pixel marched."""
+    """Render the picture of a quality with every pixel marched."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("player.render.stages", lambda *_: stages(0.0))
         return render(asset, camera, quality, march, **settings)
@@ -235,7 +235,7 @@ def test_marched_pixels_are_those_of_the_whole_picture(
 
 
 def with_fetches(asset: Asset, fetches: tuple[int, int] | None) -> Asset:
-    """The asset with so many fetches of a ray in `high` and `fast` pictures, whose pixels are all marched."""
+    """Return the asset with `fetches` per ray in `high` and `fast` pictures, whose pixels are all marched."""
     changed = Asset.open(asset.folder)
     manifest = replace(asset.manifest, agreement=(0.0, 0.0), quality_fetches=fetches)
     object.__setattr__(changed, "manifest", manifest)
@@ -311,7 +311,7 @@ def test_layers_are_those_of_the_pixels_that_were_marched(
 
 @pytest.fixture(scope="module")
 def wires(tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    """Upright and level wires, straight and a cell to each side wide, that cross before an empty box."""
+    """Write an asset of an upright and a level straight wire, a cell wide to each side, in an empty box."""
     axis = np.arange(RESOLUTION + 1)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     near = [np.maximum(abs(a - 32), abs(y - 32)) for a in (x, z)]
@@ -336,7 +336,7 @@ def wires(tmp_path_factory: pytest.TempPathFactory) -> Asset:
 def test_a_wire_between_the_pixels_of_the_lattice_does_not_vanish(
     quality: Quality, at: tuple[int, int], wires: Asset
 ) -> None:
-    """One pixel wide, on an odd row and an odd column of which no other pixel shows it."""
+    """A wire on one odd row and one odd column alone, between the lattice's pixels, does not vanish."""
     row, column = at
     c2w = np.array([[1.0, 0, 0, 0], [0, 0, -1, -100], [0, 1, 0, 0], [0, 0, 0, 1]])  # along y, z is up
     camera = Camera("wire", c2w, 80, 80, 1600.0, 1600.0, column + 0.5, row + 0.5)

@@ -1,4 +1,4 @@
-"""The marches through pyramids of several levels against the naive loop, and what must not show."""
+"""Tests of marches through pyramids of several levels against the naive loop, and of what must not show."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = [(1,), (1, 1), (1, 2), (1, 1, 2), (2, 2, 4), (1, 4, 4, 8)]
 
 
 def rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """From all around and from inside, and along the faces of cells and of the box."""
+    """Return rays from all around and from inside, and along the faces of cells and of the box."""
     random = np.random.default_rng(seed)
     rays_o = random.normal(size=(n, 3)) * random.uniform(0.2, 2, (n, 1))
     rays_d = random.uniform(-0.7, 0.7, (n, 3)) - rays_o
@@ -38,7 +38,7 @@ def rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compare(scene: PyramidScene, module: ModuleType, k: int, n: int = 60) -> int:
-    """Both marches of rays against the naive loop; returns how many hit."""
+    """Compare a march of rays with the naive loop; return how many rays hit."""
     rays_o, rays_d = rays(n)
     result = module.march(scene.grid, rays_o, rays_d, k)
     expected = [scene.march(o, d, k) for o, d in zip(rays_o, rays_d, strict=True)]
@@ -82,7 +82,7 @@ def full(resolution: int, level: int) -> np.ndarray:
 
 
 def shapes(resolution: int) -> dict[str, Pyramid]:
-    """Pyramids that fill the box."""
+    """Return pyramids that fill the box, by name."""
     none, middle = np.zeros((0, 3), int), np.full(3, 0.5)
     whole = {
         "one level": [full(resolution, 0)],
@@ -97,7 +97,7 @@ def shapes(resolution: int) -> dict[str, Pyramid]:
 
 
 def _without_gaps(resolution: int, leaves: list[np.ndarray]) -> Pyramid:
-    """Bricks are full where there is one, and where one is needed below a finer one."""
+    """Return the pyramid with full bricks wherever `leaves` have a cell or a finer level has a brick."""
     filled_leaves, names = [], set()
     for level, cells in enumerate(leaves):
         all_cells = full(resolution, level)
@@ -116,8 +116,8 @@ def _without_gaps(resolution: int, leaves: list[np.ndarray]) -> Pyramid:
 @pytest.mark.parametrize("name", [name for name in shapes(32) if name != "one level"])
 @pytest.mark.parametrize("k", [0, 4])
 def test_a_ramp_is_seamless_where_levels_meet(module: ModuleType, name: str, k: int) -> None:
-    """Density and features that are linear in the place: in base steps of all levels the pictures are those
-    of one level."""
+    """Density and features that are linear in the place give the pictures of one level, if all levels take
+    base steps."""
     one, many = (
         ramp(shapes(32)[which], (1,) * len(shapes(32)[which].levels)) for which in ("one level", name)
     )
@@ -160,7 +160,7 @@ def test_numba_is_numpy_on_many_rays() -> None:
 @pytest.mark.parametrize("contracted", [False, True], ids=["box", "space"])
 @pytest.mark.parametrize("steps", [(1,), (4,), (1, 16), (1, 1, 2), (1, 1, 1, 1, 2, 4, 4, 16)])
 def test_what_is_far_apart_is_jumped_to(steps: tuple[int, ...], contracted: bool) -> None:
-    """Both marches, and the loop that jumps nowhere, on rays that meet something."""
+    """Both marches jump over wide gaps, and agree with the loop that jumps nowhere."""
     scene = sparse_scene(steps, len(steps), contracted)
     rays_o, rays_d = rays(2000, seed=2)
     a, b = (module.march(scene.grid, rays_o, rays_d, 3) for module in (march, march_compiled))
@@ -191,7 +191,7 @@ def test_bounds_do_not_change_a_bit(module: ModuleType) -> None:
 def test_jumping_over_dead_cells_does_not_change_a_bit(
     module: ModuleType, contracted: bool, steps: tuple[int, ...]
 ) -> None:
-    """Steps of a sample, too, begin where they begin without."""
+    """Jumps over dead cells change no bit; larger steps, too, begin where they do without jumps."""
     skipped = 0
     for seed in range(2):
         scene = random_scene(60, 30, steps, seed=seed, contracted=contracted)

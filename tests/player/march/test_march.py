@@ -1,4 +1,4 @@
-"""The two marches against the naive loop, and what must not change a picture."""
+"""Tests of the two marches against the naive loop, and of what must not change a picture."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.player.conftest import DENSITY_RANGE, RESOLUTION, STEP, shells
 from tests.player.march.oracle_march import Scene, bins, march_ray
 from tests.vertex_grids import grid_of, rows_of
 
-# float32: 2^-24 a rounding, some dozen samples of optical depth up to 7; measured 1e-6.
+# float32 rounds by 2^-24, over some dozen samples of optical depth up to 7; measured 1e-6.
 OPACITY = 5e-6
-# s is rounded to 2^-22 of a box of 2 units, the depth too.
+# s and the depth are rounded to 2^-22 in a box of 2 units.
 DEPTH = 5e-6
-# Codes up to 127 and 3 codes a cell at places known to 1e-5 cells; measured 1e-4.
+# Codes are up to 127, change by 3 per cell, and places are known to 1e-5 cells; measured 1e-4.
 FEATURES = 5e-4
 
 BOTH = "The two marches"
@@ -73,7 +73,7 @@ def special_rays() -> tuple[np.ndarray, np.ndarray]:
         ((-3, -1, 0), (1, -0.0, 0)),  # in the lower face
         ((1, -3, 0), (0, 1, 0)),
         ((-3, 0.99, 0.01), (1, 0, 0)),  # grazes the outer shell
-        ((-3, 0.515, 0.01), (1, 0, 0)),  # and the inner
+        ((-3, 0.515, 0.01), (1, 0, 0)),  # grazes the inner shell
         ((-2, -2, 0), (half, half, 0)),
         ((-1, 0, 0), (1, 0, 0)),  # starts on a face
         ((1, 0, 0), (1, 0, 0)),  # leaves from a face
@@ -86,8 +86,8 @@ def special_rays() -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("module", MARCHES)
 @pytest.mark.parametrize("k", [0, 3])
 def test_rays_that_end_earlier_lose_no_light(module: ModuleType, k: int, asset: Asset) -> None:
-    """Those that have not come to the depth at which others end are what they were; the others are opaque,
-    and one that meets the same feature everywhere composites just that."""
+    """Rays that end at a limit of optical depth count as opaque, and composite a feature that is the same
+    everywhere unchanged. Rays that do not reach the limit give the same bytes as without it."""
     rays, limit = random_rays(300, seed=4), np.float32(np.log(10))
     whole, ended = module.march(asset.grid, *rays, k), module.march(asset.grid, *rays, k, None, limit)
     shorter = ended.opacity == 1
@@ -138,8 +138,8 @@ def test_march_is_the_naive_loop(
 @pytest.mark.parametrize("module", MARCHES)
 @pytest.mark.parametrize("k", [0, 5])
 def test_march_through_a_box_of_three_different_edges(module: ModuleType, k: int, scene: Scene) -> None:
-    """Cells that are longer along one axis than along another: every axis has a scale and a corner of its
-    own."""
+    """The march is right where cells are longer along one axis than along another: every axis has a scale
+    and a corner of its own."""
     vertices, codes, features = shells()
     box = np.array([[-1.5, -0.7, -1.0], [1.1, 0.6, 2.5]])
     where = pack_vertices(vertices)[:2]
@@ -165,7 +165,7 @@ def test_the_special_rays_meet_and_miss(scene: Scene) -> None:
 
 
 def test_bins_of_the_scene_fall_into_the_gap(scene: Scene) -> None:
-    """With k = 1 the mean of two shells is between them: the heaviest sample is taken."""
+    """With k = 1 the centroid of samples in two shells is between them: the heaviest sample is taken."""
     rays = [march_ray(scene, o, d, 1) for o, d in zip(*random_rays(150), strict=True)]
     moved = [ray for ray in rays if ray.fetches and len(ray.samples) > 1]
     assert sum(abs(r.fetches[0][0] - bins(r.samples, 1)[0][0]) > 1e-3 for r in moved) > 20
@@ -208,8 +208,8 @@ def test_constant_feature_is_multiplied_by_opacity(module: ModuleType, k: int, a
 
 @pytest.mark.parametrize("module", MARCHES)
 def test_linear_features_give_the_mean_position(module: ModuleType, asset: Asset) -> None:
-    """Where all samples lie in one shell, features / A is linear in the depth: brick borders and offsets
-    show."""
+    """Features that are linear in the place, divided by the opacity, give the mean position of the samples;
+    errors at brick borders and offsets would show."""
     rays_o, rays_d = random_rays(4000, seed=5)
     result = module.march(asset.grid, rays_o, rays_d, 0)
     hits = result.hits
@@ -233,7 +233,8 @@ def test_bounds_do_not_change_a_bit(module: ModuleType, asset: Asset) -> None:
 @pytest.mark.parametrize("kind", [np.int8, np.float32])
 @pytest.mark.parametrize("n_channels", [1, 15, 16, 17, 40])
 def test_numba_is_numpy_in_any_number_of_channels(n_channels: int, kind: type, asset: Asset) -> None:
-    """Channels are added up sixteen at a time, the last rows in memory one by one."""
+    """Both marches agree in any number of channels, which are added sixteen at a time, but one by one for the
+    last rows in memory."""
     features = np.random.default_rng(8).integers(-128, 128, (len(asset.grid.features), n_channels), np.int8)
     features = features.astype(kind)  # the bake measures features before they are codes
     grid = replace(asset.grid, features=features)
@@ -245,8 +246,8 @@ def test_numba_is_numpy_in_any_number_of_channels(n_channels: int, kind: type, a
 
 
 def with_linear_features(grid: SparseGrid, resolution: int) -> SparseGrid:
-    """The grid with features on every vertex of a grid of `resolution`: a linear function of the place, and
-    one that is 50."""
+    """Return the grid with features on every vertex of a grid of `resolution`: linear in the place, and one
+    that is 50."""
     index = np.argwhere(np.ones((resolution + 1,) * 3))
     coords, masks, order = pack_vertices(index)
     place = index[order] * np.float32(120 / resolution) - 60
@@ -258,7 +259,7 @@ def with_linear_features(grid: SparseGrid, resolution: int) -> SparseGrid:
 @pytest.mark.parametrize("resolution", [8, 20, 33, 90])
 @pytest.mark.parametrize("k", [0, 3])
 def test_features_on_a_grid_of_their_own(module: ModuleType, resolution: int, k: int, asset: Asset) -> None:
-    """Coarser, of no simple ratio, or finer than the densities': a linear function stays what it is."""
+    """Linear features are the same on a grid coarser, of no simple ratio, or finer than the densities'."""
     rays = random_rays(1000, seed=9)
     own = module.march(with_linear_features(asset.grid, RESOLUTION), *rays, k)
     other = module.march(with_linear_features(asset.grid, resolution), *rays, k)

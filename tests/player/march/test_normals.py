@@ -1,4 +1,4 @@
-"""Composited normals: the naive loop, a sphere's closed form, and the frame they come in."""
+"""Tests of composited normals against a naive loop and a sphere's closed form, and of their frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def camera(asset: Asset) -> Camera:
 
 
 def naive_gradient(scene: Scene, g: np.ndarray) -> np.ndarray:
-    """Trilinear is linear along each axis: the difference between the two faces of the cell."""
+    """Return the gradient of the code: along each axis, the difference between the cell's two faces, since
+    trilinear interpolation is linear along an axis."""
     cell = [min(max(int(np.floor(x)), 0), scene.resolution - 1) for x in g]
     slopes = []
     for axis in range(3):
@@ -52,8 +53,8 @@ def test_normals_are_the_naive_loop(asset: Asset, scene: Scene, camera: Camera) 
 
 
 def test_a_sphere_has_radial_normals(asset: Asset) -> None:
-    """The gradient alone, a voxel outside the peak of the outer shell. Most cells bend by a degree; a few
-    have a corner on the other side of the peak."""
+    """The gradient, a voxel outside the peak of the outer shell, is radial to a degree or so in most cells. A
+    few cells have a corner on the other side of the peak."""
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     radius = 0.99 + 1.0 * 2 / RESOLUTION
@@ -70,7 +71,7 @@ def test_layers_are_in_the_world_and_do_not_change_the_picture(asset: Asset, cam
         plain, frame = renderer.render(camera), renderer.render(camera, layers=True)
         again = renderer.render(camera.resized(48, 40), layers=True)
     assert plain.features is None
-    # found afterwards, from a renderer that is closed
+    # computed only now, after the renderer was closed
     assert plain.normals.tobytes() == frame.normals.tobytes()
     assert frame.rgb.tobytes() == plain.rgb.tobytes() and frame.depth.tobytes() == plain.depth.tobytes()
     assert frame.features is not None

@@ -13,13 +13,13 @@ from tests.player.page import viewer_page
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """Chromium with WebGL on the processor; one at a time, as Playwright wants it."""
+    """Start Chromium with WebGL on the processor; one at a time, as Playwright requires."""
     with viewer_page.chromium() as browser:
         yield browser
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cores() -> Iterator[None]:
-    """A browser waits for what looks at it, which waits for the browser: together they use every core."""
+    """Let these tests use every core: a browser and its test mostly wait for each other."""
     with every_core():
         yield

@@ -1,4 +1,4 @@
-"""A page that decodes a scene and says what it found, opened from a disk in a browser without a network."""
+"""A page that decodes a scene and tells what it found, opened from a disk in a browser without a network."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ const plain = ({ levels, n_channels, stride, values, firstRows }) => ({
 export const arrangeDensities = (manifest, densities) => ({ densities: plain(densities) });
 export const arrangeFeatures = (manifest, features) => ({ features: plain(features) });
 """
-"""In place of `grid.js`: what is decoded, as it is."""
+"""JavaScript in place of `grid.js` that keeps what is decoded as it is."""
 
 
 def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "") -> bytes:
-    """A page with the data `files` that decodes them; `before` runs first, in the page and in its worker."""
+    """Return a page that decodes the data `files` in it; `before` runs first, in the page and its worker."""
     modules = {**web_files(), "main.js": MAIN, "grid.js": ARRANGED}
     text = before + page_script(modules)
     script = f'<script type="module" id="script">{text}</script>\n'
@@ -70,7 +70,7 @@ def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "")
 
 
 def decoded(browser: Browser, path: Path) -> dict[str, Any]:
-    """What the page at `path` found; it asks for nothing, and says nothing in the console."""
+    """Open the page at `path` and return what it found; check that it requests nothing and logs nothing."""
     context = browser.new_context(offline=True)
     page = context.new_page()
     said: list[str] = []
@@ -87,7 +87,7 @@ def decoded(browser: Browser, path: Path) -> dict[str, Any]:
 
 
 def described(stored: PyramidValues) -> dict[str, Any]:
-    """What the page should find, by the player's own reader."""
+    """Return what the page should find of a grid, by the player's own reader."""
 
     def digest(array: np.ndarray) -> str:
         return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
@@ -103,10 +103,10 @@ def described(stored: PyramidValues) -> dict[str, Any]:
 
 
 def expected(asset: Asset) -> dict[str, Any]:
-    """The densities and features that a page of the asset should find."""
+    """Return the densities and features that a page of the asset should find."""
     return {grid: described(getattr(asset.arrays, grid)) for grid in ("densities", "features")}
 
 
 def without_problem(scene: dict[str, Any]) -> dict[str, Any]:
-    """The densities and features that a page found."""
+    """Return only the densities and features that a page found."""
     return json.loads(json.dumps({grid: scene[grid] for grid in ("densities", "features")}))

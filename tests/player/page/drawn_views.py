@@ -1,4 +1,4 @@
-"""What tests of the viewer ask of the views that it draws with a stub renderer, from an arc of cameras."""
+"""Measures of views that the page's viewer draws with a stub renderer, in a scene of an arc of cameras."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def elevation(view: dict[str, Any]) -> float:
 
 
 def azimuth(one: dict[str, Any], two: dict[str, Any]) -> float:
-    """Radians by which the second camera stands further around the world's up."""
+    """Return the angle, in radians, from the first to the second camera around the world's up."""
     a, b = (back - (back @ UP) * UP for back in (c2w(one)[:3, 2], c2w(two)[:3, 2]))
     return math.atan2(np.cross(a, b) @ UP, a @ b)
 
 
 def pixel(view: dict[str, Any], point: np.ndarray) -> np.ndarray:
-    """[2] place in the picture, pixels from its upper left corner, of a point of the world."""
+    """Return the place [2] of a world point in the picture, in pixels from its upper left corner."""
     x, y, z = np.linalg.inv(c2w(view))[:3] @ [*point, 1]
     return np.array([view["cx"] + view["fx"] * x / -z, view["cy"] - view["fy"] * y / -z])
 

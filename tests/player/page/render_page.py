@@ -64,7 +64,7 @@ globalThis.sources = () => {
 
 
 def render_page(asset: Asset) -> bytes:
-    """A page with a canvas that decodes `asset`."""
+    """Return a page with a canvas that decodes `asset` and draws."""
     script = page_script({**web_files(), "main.js": MAIN})
     head = "<!doctype html><meta charset=utf-8><canvas id=canvas width=64 height=64></canvas>"
     element = f'<script type="module" id="script">{script}</script>\n'
@@ -72,7 +72,7 @@ def render_page(asset: Asset) -> bytes:
 
 
 class RenderPage:
-    """An open page of an asset; it asks for nothing, and says nothing in the console."""
+    """An open page of an asset. `said` collects what it logs, `asked` what it requests besides itself."""
 
     def __init__(self, browser: Browser, asset: Asset, path: Path) -> None:
         path.write_bytes(render_page(asset))
@@ -89,7 +89,7 @@ class RenderPage:
         self.asked = [url for url in self.asked if not url.startswith("blob:") and url != path.as_uri()]
 
     def picture(self, camera: Camera, **settings: Any) -> np.ndarray:
-        """[h, w, 4] uint8, straight alpha."""
+        """Render a picture: [h, w, 4] uint8, straight alpha."""
         found = self.page.evaluate("view => picture(view)", view_of(camera) | settings)
         return np.frombuffer(base64.b64decode(found), np.uint8).reshape(camera.height, camera.width, 4)
 
@@ -101,6 +101,6 @@ class RenderPage:
 
 
 def view_of(camera: Camera) -> dict[str, Any]:
-    """A camera as `vfr.render` takes it."""
+    """Return a camera as `vfr.render` takes it."""
     names = ("width", "height", "fx", "fy", "cx", "cy")
     return {"c2w": camera.c2w.reshape(-1).tolist(), **{name: getattr(camera, name) for name in names}}

@@ -1,4 +1,4 @@
-"""Small assets that the page draws, each with something of its own, and cameras around them."""
+"""Small assets for the page to draw, each with some peculiarity, and cameras around them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ WIDTH, HEIGHT = 60, 44
 
 
 def head_of(n_channels: int, in_8_bits: bool, activation: Activation = "gelu") -> bytes:
-    """A head of random weights whose widths are no multiples of four; in 8 bits and with GELU as it was when
-    encoded features were not rounded."""
+    """Return a head of random weights whose widths are no multiples of four. In 8 bits and with GELU it is
+    written as it was when encoded features were not rounded."""
     weights = random_head(n_channels, 18, n_sh_features=3, activation=activation)
     (first, bias), *more = weights.spatial
-    weights = replace(weights, spatial=((first / np.float32(40), bias), *more))  # of codes up to 127
+    weights = replace(weights, spatial=((first / np.float32(40), bias), *more))  # for codes up to 127
     features, dirs = inputs(500, n_channels)
     ranges = activation_ranges(weights, features * 40, dirs) if in_8_bits else None
     if ranges and activation == "gelu":
@@ -38,7 +38,7 @@ def head_of(n_channels: int, in_8_bits: bool, activation: Activation = "gelu") -
 
 
 def wider(values: PyramidValues, n_channels: int) -> PyramidValues:
-    """The same pyramid with so many channels, mixed from those that it has."""
+    """Return the same pyramid with `n_channels` channels, mixed from its own."""
     mixed = np.random.default_rng(n_channels).normal(0, 0.5, (values.n_channels, n_channels))
     return filled(values.pyramid, [some @ mixed for some in values.values], (-127, 127), np.int8)
 
@@ -49,15 +49,15 @@ def write(folder: Path, manifest: Manifest, arrays: GridArrays, head: bytes) -> 
 
 
 def shells(folder: Path) -> Asset:
-    """Two spherical shells, in a world that is not the model's frame."""
+    """Write an asset of two spherical shells whose world is not the model's frame."""
     return Asset.open(write_shells(folder))
 
 
 def pyramid_asset(
     folder: Path, level_steps: tuple[int, ...], contracted: bool, n_channels: int, sparse: bool = False
 ) -> Asset:
-    """Random pyramids of as many levels as `level_steps` has, with a head of random weights in 8 bits, whose
-    activation is the hard swish where they are `sparse`."""
+    """Write an asset of random pyramids of as many levels as `level_steps` has, with a head of random weights
+    in 8 bits. Its activation is the hard swish if the pyramids are `sparse`."""
     if sparse:
         scene = sparse_scene(level_steps, 3, contracted)
     else:
@@ -77,7 +77,7 @@ def pyramid_asset(
 
 
 def dense(resolution: int, n_channels: int, top: int, kind: type[np.generic], seed: int) -> PyramidValues:
-    """Every vertex of one level stored, with noise."""
+    """Return noise on every vertex of one level."""
     coords, masks, order = pack_vertices(np.argwhere(np.ones((resolution + 1,) * 3, bool)))
     random = np.random.default_rng(seed)
     values = random.uniform(0 if kind == np.uint8 else -top, top, (len(order), n_channels)).astype(kind)
@@ -85,7 +85,7 @@ def dense(resolution: int, n_channels: int, top: int, kind: type[np.generic], se
 
 
 def fog(folder: Path, thickness: float = 2.0, activation: Activation = "gelu") -> Asset:
-    """A box that is full: hundreds of thin samples on a ray, or a few where it is flat."""
+    """Write an asset of a box full of fog: hundreds of thin samples on a ray, or a few in a flat box."""
     box = ((-1.0, -1.0, -thickness / 2), (1.0, 1.0, thickness / 2))
     low = -3.0 - 2 * np.log(thickness / 2)
     manifest = Manifest(
@@ -98,7 +98,7 @@ def fog(folder: Path, thickness: float = 2.0, activation: Activation = "gelu") -
 
 
 def empty(folder: Path, n_channels: int = 4) -> Asset:
-    """Nothing to see: no density anywhere."""
+    """Write an asset without density anywhere."""
     none = Bricks(np.zeros((0, 3), np.uint16), np.zeros((0, 8), np.uint64))
     densities = PyramidValues(Pyramid(24, (none,)), (np.zeros((0, 1), np.uint8),))
     manifest = Manifest(
@@ -114,12 +114,12 @@ def camera(name: str, c2w: np.ndarray, focal: float = 55.0, cx: float | None = N
 
 
 def cameras(asset: Asset) -> dict[str, Camera]:
-    """Cameras outside, inside, far away and along an axis exactly, around the model's box, in the world."""
+    """Return world cameras outside, inside, far from, and exactly along an axis of the model's box."""
     low, high = np.array(asset.manifest.aabb)
     middle, size = (low + high) / 2, float(np.max(high - low))
     along = np.eye(4)
     along[:3, 3] = middle + np.array([0, 0, 1.5 * size])
-    away = 20.0 if asset.manifest.contracted else 374.0  # float32 directions have that much sense there
+    away = 20.0 if asset.manifest.contracted else 374.0  # as far as float32 directions are useful
     far = look_at(tuple(middle + size * away * np.array([0.8, 0.5, 0.3])), tuple(middle))
     found = {
         "outside": camera(

@@ -1,4 +1,4 @@
-"""The page's decoder in a browser: the arrays of the player's reader, bit for bit; what is broken is told."""
+"""Tests of the page's decoder in a browser: the player's arrays bit for bit, and messages for broken data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Files = dict[str, bytes]
 
 
 def write_levels(folder: Path, head: bytes) -> Path:
-    """An asset of levels of different steps, symbols of all sizes among them."""
+    """Write an asset of levels with different steps, with symbols of all sizes among them."""
     densities, features = (
         stored("densities", cells(4, 0.06), 1, STEPS),
         stored("features", cells(3, 0.09), 9, (2, 2, 1)),
@@ -43,14 +43,14 @@ def levels(tmp_path_factory: pytest.TempPathFactory) -> Asset:
 
 
 def run(browser: Browser, folder: Path, files: Files, before: str = "", cut: int | None = None) -> dict:
-    """What a page with the data `files` finds; `cut`: bytes of it that are there."""
+    """Return what a page with the data `files` finds; `cut`: how many bytes of the page are kept."""
     path = folder / "page.html"
     path.write_bytes(decoder_page(files, before)[:cut])
     return decoded(browser, path)
 
 
 def check(browser: Browser, folder: Path, asset: Asset) -> dict:
-    """The page of an asset finds what the player does, after the first part and in the end."""
+    """Check that the asset's page finds what the player does, after the first part and at the end."""
     found = run(browser, folder, scene_files(asset))
     assert found["error"] is None
     first, last = found["scenes"][0], found["scenes"][-1]
@@ -86,7 +86,7 @@ def test_an_asset_of_version_3_is_decoded(chromium: Browser, tmp_path: Path) -> 
 
 
 def test_large_symbols_an_empty_and_a_full_grid(chromium: Browser, tmp_path: Path) -> None:
-    """Noise of all values, in every cell; densities without a brick; a grid of one cell."""
+    """Noise of all values in every cell, densities without a brick, and a grid of one cell are decoded."""
     random = np.random.default_rng(3)
     for resolution in (1, 17):
         n = -(-resolution // 8)
@@ -140,7 +140,7 @@ def test_the_head_is_what_the_player_reads(chromium: Browser, tmp_path: Path, le
 
 
 def set_bytes(files: Files, name: str, data: bytes) -> Files:
-    """The files with another content of one, and its size and checksum in the manifest."""
+    """Return the files with other content in one, whose size and checksum are put into the manifest."""
     manifest = json.loads(files["manifest.json"])
     manifest["files"][name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     return {**files, name: data, "manifest.json": json.dumps(manifest).encode()}
@@ -194,7 +194,7 @@ SECTIONS: list[tuple[str, Callable[[bytearray], object]]] = [
 def test_every_damage_of_a_first_part_is_one_message(
     chromium: Browser, levels: Asset, tmp_path: Path, change: Callable[[bytearray], object]
 ) -> None:
-    """With checksums that fit, so that the decoder itself has to find it."""
+    """Each damage gives one message. Checksums fit, so that the decoder itself has to find the damage."""
     files = scene_files(levels)
     data = bytearray(files["part_0.bin"])
     change(data)

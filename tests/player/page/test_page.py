@@ -1,4 +1,4 @@
-"""The page as it is put together: what is in it survives, what runs in it is named, and it plays."""
+"""Tests of the page as it is put together: its data survives, its policy names its scripts, and it plays."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from tests.player.page import scenes
 
 SECONDS = 120
 MOST_VIEWER = 60_000
-"""Bytes that all but data and poster may take in a page."""
+"""Most bytes of a page without its data and poster."""
 
 
 class Opened(NamedTuple):
     page: Page
     said: list[str]
-    """What the console said, and errors that nobody caught."""
+    """Messages of the console, and errors that nobody caught."""
     asked: list[str]
-    """Addresses that were asked for."""
+    """Addresses that were requested."""
 
 
 @contextmanager
 def opened(
     browser: Browser, address: str, answers: dict[str, tuple[bytes, str]] | None = None
 ) -> Iterator[Opened]:
-    """A page without a network, except for `answers`: content and its type by address."""
+    """Open a page without a network, except for `answers`: content and its type by address."""
     context = browser.new_context(offline=answers is None, viewport={"width": 160, "height": 120})
     found = Opened(context.new_page(), [], [])
     found.page.set_default_timeout(SECONDS * 1000)
@@ -98,7 +98,7 @@ globalThis.read = (length) => {
 
 @pytest.mark.parametrize("charset", ["", "; charset=utf-8", "; charset=windows-1252", "; charset=shift_jis"])
 def test_every_byte_survives_in_a_browser(chromium: Browser, charset: str) -> None:
-    """All pairs of bytes, at all places of a group, whatever charset a server claims."""
+    """All pairs of bytes, at all places of a group, survive whatever charset a server claims."""
     pairs = np.stack(np.meshgrid(np.arange(256), np.arange(256)), axis=-1).astype(np.uint8).tobytes()
     data = b"".join(bytes(n) + pairs for n in range(6)) + b"</script><!--\r\n\r\0"
     script = page_script({**web_files(), "main.js": READ}, "main.js", "main.js")
@@ -166,7 +166,7 @@ def test_a_title_may_hold_what_the_page_fills_in(asset: Asset) -> None:
 
 
 def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
-    """Without what no page needs: the mesh, reports and the settings of the bake."""
+    """A page has the asset's data without what no page needs: the mesh, reports and settings of the bake."""
     files = scene_files(asset)
     assert files["part_0.bin"] == asset.read("part_0.bin")
     assert not {"mesh.ply", "head.onnx"} & set(files)
@@ -178,7 +178,8 @@ def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("n_channels", "most"), [(4, 2**24), (32, 2**24), (33, 2**23), (40, 2**23)])
 def test_rows_that_no_texture_holds_are_refused(n_channels: int, most: int) -> None:
-    """A shader tells 2^24 rows apart, and WebGL 2 promises 256 layers of 256 lines."""
+    """More rows of features are refused than a shader can tell apart (2^24), or than fit into the 256 layers
+    of 256 lines that WebGL 2 guarantees."""
     assert feature_bytes(most, n_channels) >= most * n_channels
     with pytest.raises(FormatError, match=f"expected at most {most} rows of features, got {most + 1}"):
         feature_bytes(most + 1, n_channels)
@@ -191,8 +192,8 @@ def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Pat
 
 
 def test_more_channels_than_browsers_draw_are_refused(chromium: Browser, tmp_path: Path) -> None:
-    """The most that are not refused are drawn: the browser of these tests has the draw buffers that most
-    have."""
+    """The most channels that are allowed are drawn, by a browser with as many draw buffers as most have; one
+    more is refused."""
     path = tmp_path / "scene.html"
     path.write_bytes(page(scenes.empty(tmp_path / "most", MOST_CHANNELS)))
     with opened(chromium, path.as_uri()) as found:
@@ -204,7 +205,7 @@ def test_more_channels_than_browsers_draw_are_refused(chromium: Browser, tmp_pat
 
 
 def test_an_asset_that_lacks_a_part_is_refused(broken_folder: Path, tmp_path: Path) -> None:
-    """The player shows what is there; a page has to hold all of it."""
+    """An asset that lacks a part is refused: the player shows what is there, but a page must be complete."""
     (broken_folder / "part_0.bin").unlink()
     with pytest.raises(FormatError, match=r"part_0\.bin"):
         export_asset(broken_folder, tmp_path / "scene.html")
@@ -272,7 +273,7 @@ def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_
 def test_a_page_that_was_changed_says_so(
     chromium: Browser, asset: Asset, tmp_path: Path, where: bytes
 ) -> None:
-    """One character of the viewer's script, of the scene, or of the head is another one."""
+    """A page says so if one character of the viewer's script, of the scene, or of the head was changed."""
     changed, path = bytearray(page(asset)), tmp_path / "changed.html"
     at = changed.index(where) + 1000
     changed[at] = ord("a" if changed[at] != ord("a") else "b")
@@ -304,7 +305,7 @@ def test_it_begins_in_the_middle_of_the_cameras() -> None:
         ),
         (1.0, 2.0, 3.0),
     )
-    assert np.allclose(rest.c2w, wanted, atol=2e-3)  # up leans a little to the cameras' own
+    assert np.allclose(rest.c2w, wanted, atol=2e-3)  # up leans a little towards the cameras' own
     assert (rest.width, rest.fx, rest.cx, rest.cy) == (60, 50.0, 30.0, 20.0)
     all_around = cameras([30, 120, 210, 300])
     assert np.allclose(rest_camera(all_around).c2w, all_around[0].c2w, atol=1e-4)
@@ -339,6 +340,6 @@ def test_the_poster_shows_what_the_viewer_begins_with(chromium: Browser, tmp_pat
 
 
 def test_an_installed_package_has_the_files_of_the_page() -> None:
-    """Read as text: Python 3.10 has no TOML parser."""
+    """pyproject.toml lists the page's files. It is read as text, because Python 3.10 has no TOML parser."""
     text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
     assert '"player.page" = ["web/*"]' in text

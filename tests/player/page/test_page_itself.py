@@ -1,4 +1,4 @@
-"""The page as it is handed out, opened from a disk: what the viewer shows is what the player renders."""
+"""Tests of the page as it is handed out, opened from a disk: the viewer shows what the player renders."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def file(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def opened(browser: Browser, file: Path, hash_: str = "", **options: Any) -> Iterator[Page]:
-    """The page without a network, when the scene is on the screen; it asks for nothing and says nothing."""
+    """Open the page without a network and wait for the scene; check that it requests and logs nothing."""
     context = browser.new_context(viewport=SIZE, offline=True, **options)  # type: ignore[arg-type]
     page = context.new_page()
     page.set_default_timeout(SECONDS * 1000)
@@ -54,7 +54,7 @@ def opened(browser: Browser, file: Path, hash_: str = "", **options: Any) -> Ite
 
 
 def whole(page: Page) -> np.ndarray:
-    """[h, w, 3] what the canvas shows when all pictures are added up."""
+    """Return what the canvas shows, [h, w, 3], when all pictures are accumulated."""
     width, height = page.evaluate("() => [canvas.clientWidth, canvas.clientHeight]")
     page.wait_for_selector(f"#canvas[data-shown='{width}x{height}'][data-done]")
     data = page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height})
@@ -62,7 +62,7 @@ def whole(page: Page) -> np.ndarray:
 
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
-    """The camera in a window of this size, into which all of its picture fits."""
+    """Return the camera for a window of this size, with all of its picture fitted in."""
     scale = min(width / camera.width, height / camera.height)
     return Camera(
         camera.name, camera.c2w, width, height, camera.fx * scale, camera.fy * scale,
@@ -72,7 +72,7 @@ def fitted(camera: Camera, width: int, height: int) -> Camera:
 
 
 def rendered(asset: Asset, camera: Camera, shape: tuple[int, ...], background: Any = None) -> np.ndarray:
-    """[h, w, 3] mean of nine pictures of the player, each a third of a pixel aside."""
+    """Return the player's picture, [h, w, 3], as the mean of 3 x 3 rays in each pixel."""
     camera = fitted(camera, shape[1], shape[0])
     big = camera.resized(3 * camera.width, 3 * camera.height)
     with Renderer(asset) as renderer:
@@ -81,7 +81,7 @@ def rendered(asset: Asset, camera: Camera, shape: tuple[int, ...], background: A
 
 
 def near(one: np.ndarray, two: np.ndarray) -> bool:
-    """Whether two pictures are the same but for how their pixels were averaged."""
+    """Return whether two pictures are the same but for how their pixels were averaged (PSNR over 32 dB)."""
     return 10 * math.log10(255**2 / max(np.square(one - two).mean(), 1e-9)) > 32
 
 
@@ -160,7 +160,7 @@ def test_a_double_click_looks_at_what_was_hit(chromium: Browser, file: Path, ass
 
 
 def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
-    """In a frame that can reach nothing of the notebook."""
+    """A notebook shows the page below a cell, in a frame that can reach nothing of the notebook."""
     shown = inline(asset, height=300)
     notebook = tmp_path / "notebook.html"
     notebook.write_text(f"<!doctype html><title>Notebook</title><h1>Cell</h1>{shown._repr_html_()}")

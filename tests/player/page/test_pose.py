@@ -1,4 +1,4 @@
-"""The camera's mathematics of the page, by values: against Python's cameras, and closed forms."""
+"""Tests of the page's camera mathematics by values, against Python's cameras and closed forms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def page(chromium: Browser) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def call(page: Page) -> Call:
-    """A function of the page's modules by name, called with what JSON can hold."""
+    """Return a caller of functions of the page's modules, by name and with arguments that JSON can hold."""
 
     def call(name: str, *arguments: Any, module: str = "pose.js") -> Any:
         return page.evaluate(
@@ -40,7 +40,7 @@ def call(page: Page) -> Call:
 
 
 def cameras(eyes: np.ndarray, target: tuple[float, float, float]) -> list[Camera]:
-    """Level cameras of 64 x 48 pixels at [n, 3] places, which look at a point."""
+    """Return level cameras of 64 x 48 pixels at places [n, 3] that look at a point."""
     return [
         Camera(f"./r_{i}", look_at(tuple(eye), target), 64, 48, 60.0, 61.0, 33.0, 23.0)
         for i, eye in enumerate(eyes.tolist())
@@ -58,7 +58,7 @@ def as_json(views: list[Camera]) -> list[dict[str, Any]]:
 
 
 def ring(n: int, first: float, last: float, height: float, radius: float = 4.0) -> np.ndarray:
-    """[n, 3] places on a part of a circle around (1, 2, 3), from angle to angle in degrees."""
+    """Return places [n, 3] on an arc around (1, 2, 3), between two angles in degrees."""
     angles = np.deg2rad(np.linspace(first, last, n))
     return np.stack([1 + radius * np.cos(angles), 2 + radius * np.sin(angles), np.full(n, 3 + height)], -1)
 
@@ -98,7 +98,7 @@ def test_the_first_view_is_level_and_in_the_middle(call: Call, eyes: np.ndarray)
 
 
 def test_the_first_view_of_an_object_and_of_a_capture(call: Call, lego_400: Path, fox: Path) -> None:
-    """The poster's own; for the capture it is among the cameras, in front of what they look at."""
+    """The first view is the poster's; for a capture it is among the cameras, in front of what they see."""
     for path in (lego_400 / "transforms_train.json", fox / "transforms.json"):
         views = read_views(path, (400, 400))
         found = call("restOf", as_json(views))
@@ -118,7 +118,7 @@ def test_the_first_view_of_an_object_and_of_a_capture(call: Call, lego_400: Path
 
 
 def test_poses_hold_training_views_exactly(call: Call) -> None:
-    """Crooked ones and those that look straight down as well."""
+    """Poses hold training views exactly, also those that are tilted or look straight down."""
     random = np.random.default_rng(3)
     views = cameras(RINGS["all around"], (1, 2, 3))
     for view in views[::2]:

@@ -1,4 +1,4 @@
-"""What the page draws, in a browser, against the numpy player's pictures of the same cameras."""
+"""Tests of what the page draws in a browser, against the numpy player's pictures of the same cameras."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ LEVELS = Row(
     "levels (50 dB)", "from inside, from far away, along an axis; k = 0, 1 and 5; transparent",
 )  # fmt: skip
 """Two pictures of 8 bits differ by 50 dB if two thirds of their levels differ by one. Pixels that `FAR_OFF`
-counts are not among them: which ray of these random grids is turned past an edge by a rounding depends on the
-processor, and one such pixel in a picture of 60 x 44 is worth more than all others."""
+counts are left out: rounding turns some rays past an edge of these random grids, which ones depends on the
+processor, and one such pixel in a picture of 60 x 44 outweighs all others."""
 FAR_OFF = Row(
     PAGE, "share of the pixels that are off by more than 3 levels", ALL_ASSETS, 1e-3, "of the pixels",
     "rays along an edge that another rounding takes past it",
@@ -116,7 +116,7 @@ def test_any_background(scene: Scene, background: Any) -> None:
 
 
 def test_layers_are_the_players(scene: Scene) -> None:
-    """Opacity; depth, by where half of it is reached; normals, where there is one clearly."""
+    """Opacity and clear normals are the player's, and there is no depth where the opacity is below 0.4."""
     camera = scene.cameras["outside"]
     frame = scene.player.render(camera)
     opacity = scene.page.picture(camera, layer="opacity")[..., 0]
@@ -132,7 +132,7 @@ def test_layers_are_the_players(scene: Scene) -> None:
 
 
 def test_the_arrays_are_the_players(scene: Scene) -> None:
-    """Distances and slots, the bricks that hold features, and the memory that is foretold."""
+    """The textures hold the player's table, codes and rows of features, and take the memory predicted."""
     found, grid = scene.page.page.evaluate("() => arrays()"), scene.asset.grid
     table = scene.page.array(found["table"], np.uint8).reshape(-1, 4)
     check_table(entries_of(table, found["nSlots"]), grid)
@@ -154,13 +154,13 @@ def test_the_arrays_are_the_players(scene: Scene) -> None:
 
 
 def number_of(place: np.ndarray, count: int) -> np.ndarray:
-    """[n] numbers of bricks at places [n, 3] of a texture of `count` bricks."""
+    """Return the numbers [n] of bricks at places [n, 3] of a texture of `count` bricks."""
     across = max(math.ceil(math.sqrt(count / 25)), 1)
     return place[:, 0] + across * (place[:, 1] + across * place[:, 2])
 
 
 def unblocked(texels: np.ndarray, count: int, brick: tuple[int, int, int]) -> np.ndarray:
-    """[count, x, y, z, 4] the bricks of a texture."""
+    """Return the bricks [count, x, y, z, 4] of a texture."""
     across = max(math.ceil(math.sqrt(count / 25)), 1)
     x, y, z = brick
     split = texels.reshape(-1, z, across, y, across, x, 4)
@@ -168,13 +168,14 @@ def unblocked(texels: np.ndarray, count: int, brick: tuple[int, int, int]) -> np
 
 
 def corners(values: np.ndarray) -> np.ndarray:
-    """[n, 8, 8, 9, 4] of [n, 9, 9, 9]: the values at (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
+    """Return [n, 8, 8, 9, 4] from values [n, 9, 9, 9]: those at (x, y), (x, y + 1), (x + 1, y) and
+    (x + 1, y + 1)."""
     return np.stack([values[:, x : x + 8, y : y + 8] for x, y in ((0, 0), (0, 1), (1, 0), (1, 1))], axis=-1)
 
 
 def corners_of(columns: np.ndarray) -> np.ndarray:
-    """[n, 9, 8, 2, 9] the rows of the vertices (x, y, z) and (x, y + 1, z), -1 for those that are not stored,
-    of texels [n, 9, 8, 1, 4] of columns: see grid.js."""
+    """Return the rows [n, 9, 8, 2, 9] of the vertices (x, y, z) and (x, y + 1, z), -1 for those that are not
+    stored, from texels [n, 9, 8, 1, 4] of columns: see grid.js."""
     split = columns.astype(np.int64).reshape(-1, 9, 8, 2, 2)
     z = np.arange(8)
     own = split[..., :1]
@@ -184,21 +185,21 @@ def corners_of(columns: np.ndarray) -> np.ndarray:
 
 
 def pairs(rows: np.ndarray) -> np.ndarray:
-    """[n, 9, 8, 2, 9] of [n, 9, 9, 9]: the rows of the vertices (x, y, z) and (x, y + 1, z)."""
+    """Return, of rows [n, 9, 9, 9], those of the vertices (x, y, z) and (x, y + 1, z): [n, 9, 8, 2, 9]."""
     return np.stack([rows[:, :, :8], rows[:, :, 1:]], axis=3)
 
 
 def entries_of(table: np.ndarray, count: int) -> np.ndarray:
-    """[n] as the player's table: slot << 3 | level, or minus the distance to the nearest brick and, above it,
-    the level of a dead one."""
+    """Return entries [n] as in the player's table: slot << 3 | level, or minus the distance to the nearest
+    brick with the level of a dead brick in the higher bits."""
     place, kind = table[:, :3].astype(np.int64), table[:, 3].astype(np.int64)
     nowhere = -(kind | place[:, 0] << DISTANCE_BITS)
     return np.where(kind < 32, nowhere, number_of(place, count) << 3 | (kind - 32))
 
 
 def check_table(found: np.ndarray, grid: SparseGrid) -> None:
-    """Entries are those of the player's table: a place has a brick if a cell there is live. Any other tells
-    how far the nearest one is."""
+    """Check that entries are those of the player's table: a place has a brick if a cell there is live, and
+    any other place tells how far the nearest brick is."""
     assert (found == grid.table).all()
     n = grid.n_per_axis
     middles = np.stack(np.meshgrid(*[np.arange(8 * n)] * 3, indexing="ij")).reshape(3, -1) + np.float32(0.5)
@@ -213,7 +214,7 @@ def check_table(found: np.ndarray, grid: SparseGrid) -> None:
 
 
 def test_shaders_are_valid_glsl(scene: Scene, tmp_path: Path) -> None:
-    """By the reference compiler, which complains where a driver lets things pass."""
+    """The reference compiler of GLSL, which is stricter than drivers, accepts all shaders."""
     program = shutil.which("glslangValidator")
     assert program, "expected glslangValidator, got none: make other-programs installs it"
     for number, source in enumerate(scene.page.page.evaluate("() => sources()")):

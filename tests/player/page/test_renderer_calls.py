@@ -1,4 +1,4 @@
-"""What a renderer of the page does beside pictures: depths, sums, a lost context, another scene, errors."""
+"""Tests of the page's renderer beside pictures: depths, sums, a lost context, another scene, errors."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ const lostAndBack = async (canvas, meanwhile) => {
   await restored;
 };
 """
-"""`lostAndBack(canvas, meanwhile)`: the context is lost, and comes back after `meanwhile`."""
+"""JavaScript of `lostAndBack(canvas, meanwhile)`: loses the context, and restores it after `meanwhile`."""
 NEGATED = """
 const { scene } = renderer;
 const negated = { ...scene, grid: { ...scene.grid, features: scene.grid.features.map((x) => -x) } };
 """
-"""`negated`: the scene with other colours."""
+"""JavaScript of `negated`: the scene with negated features, so that its colours differ."""
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def page(chromium: Browser, asset: Asset, tmp_path_factory: pytest.TempPathFacto
 
 
 def canvas(page: RenderPage, view: dict[str, Any], jitters: list[tuple[float, float]]) -> np.ndarray:
-    """What the canvas shows after a picture and some that are added up, [h, w, 4], premultiplied."""
+    """Return what the canvas shows after a picture and some accumulated ones: [h, w, 4], premultiplied."""
     found = np.frombuffer(base64.b64decode(page.page.evaluate(CANVAS, [view, jitters])), np.uint8)
     return found.reshape(view["height"], view["width"], 4)[::-1]
 
@@ -105,7 +105,7 @@ def test_the_canvas_shows_the_picture_upright_and_premultiplied(page: RenderPage
 
 
 def test_pictures_add_up_to_their_mean(page: RenderPage, asset: Asset) -> None:
-    """Each moved by a part of a pixel: as a camera whose principal point is elsewhere."""
+    """Accumulated pictures, each moved by a part of a pixel (by its principal point), show their mean."""
     camera = scenes.cameras(asset)["outside"]
     settings = {"quality": "exact", "background": [0.1, 0.9, 0.4]}
     jitters = [
@@ -203,7 +203,7 @@ def differs(one: np.ndarray, two: np.ndarray) -> bool:
 
 
 def test_another_scene_takes_its_place(page: RenderPage, asset: Asset) -> None:
-    """The same with fewer features: negated, and back again."""
+    """Another scene, with negated features, replaces the shown one, and the first one replaces it again."""
     camera = scenes.cameras(asset)["outside"]
     before = page.picture(camera)
     page.page.evaluate(f"() => {{ {NEGATED} globalThis.first = scene; renderer.replace(negated); }}")

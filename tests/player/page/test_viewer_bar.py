@@ -1,4 +1,4 @@
-"""The page's viewer in a browser: its bar, and the options in its address."""
+"""Tests of the page's viewer in a browser: its bar, and the options in its address."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def distance_between(one: dict[str, Any], two: dict[str, Any]) -> float:
 
 
 def test_a_flight_does_not_begin_backwards(chromium: Browser) -> None:
-    """The time of a frame may lie before the click that it answers."""
+    """A flight does not begin backwards, though a frame's time may be before the click that started it."""
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         before = still(page)
         page.evaluate(
@@ -123,7 +123,8 @@ def test_the_list_knows_the_view_of_the_address(chromium: Browser) -> None:
 
 
 def test_brackets_of_keyboards_that_have_them_behind_other_keys(chromium: Browser) -> None:
-    """AltGr is Ctrl and Alt for some systems, Option is Alt; Ctrl or Cmd and a bracket are the browser's."""
+    """Brackets with AltGr (Ctrl and Alt on some systems) or Option (Alt) work; with Ctrl or Cmd they are the
+    browser's."""
     with opened(chromium, FILES, "#view=0&turn=off", reduced_motion="reduce") as (page, *_):
         for held, view in (("ctrlKey altKey", 1), ("altKey", 2), ("ctrlKey", 2), ("metaKey", 2)):
             page.evaluate(

@@ -1,4 +1,4 @@
-"""The page's viewer in a browser: mouse, fingers and keys."""
+"""Tests of the page's viewer in a browser: mouse, fingers and keys."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_wheel_goes_nearer(chromium: Browser) -> None:
 
 
 def hit_at(view: dict[str, Any], x: float, y: float) -> np.ndarray:
-    """[3] the point that is 3 units away at a pixel of a view, as the renderer of these tests says."""
+    """Return the point [3] at a pixel of a view, 3 units away, as the stub renderer of these tests has it."""
     ray = c2w(view)[:3, :3] @ [(x - view["cx"]) / view["fx"], (view["cy"] - y) / view["fy"], -1]
     return c2w(view)[:3, 3] + 3 * ray / np.linalg.norm(ray)
 
@@ -120,7 +120,7 @@ def test_flying_by_mouse(chromium: Browser) -> None:
 
 
 def fingers(page: Page) -> Callable[..., None]:
-    """touch(kind, *places): what fingers do, as the screen reports it."""
+    """Return touch(kind, *places), which reports to the page what fingers do on the screen."""
     client = page.context.new_cdp_session(page)
 
     def touch(kind: str, *places: tuple[float, float]) -> None:
@@ -170,7 +170,7 @@ def test_keys_turn_zoom_and_fly(chromium: Browser) -> None:
         page.keyboard.press("Home")
         assert np.allclose(c2w(still(page)), c2w(before), atol=1e-9)
         assert elevation(pressed("ArrowUp")) > elevation(before) + 0.03
-        near = pressed("+")  # farther than a tap goes where a busy machine lets the key up late
+        near = pressed("+")  # more than one tap's zoom if a busy machine lets the key up late
         assert distance(near) < 0.97 * distance(before)
         assert distance(pressed("-")) > 1.03 * distance(near)
         at = c2w(pressed("Home"))
@@ -221,7 +221,7 @@ def test_everything_works_by_keyboard_alone(chromium: Browser) -> None:
             assert still(page)["layer"] == layer == page.locator("#layer").input_value()
         page.keyboard.press("?")
         assert page.locator("#card").is_visible()
-        page.keyboard.press("ArrowRight")  # not for the scene
+        page.keyboard.press("ArrowRight")  # the card is open: not for the scene
         page.keyboard.press("Escape")
         assert not page.locator("#card").is_visible()
         before = still(page)

@@ -1,4 +1,4 @@
-"""The page's viewer in a browser: what it draws when, and where it cannot draw."""
+"""Tests of the page's viewer in a browser: what it draws when, and what happens where it cannot draw."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_pictures_are_smaller_while_the_camera_moves(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off", viewport={"width": 1200, "height": 900}) as (page, *_):
         still(page)
         page.evaluate("() => { globalThis.rate = 3e6; }")
-        drag(page, 30, 0)  # it finds out how fast the device is now
+        drag(page, 30, 0)  # the viewer finds out how fast the device is now
         still(page)
         n = page.evaluate("() => drawn.length")
         drag(page, 100, 0)
@@ -134,7 +134,7 @@ def test_the_poster_is_there_before_the_scene_is(chromium: Browser) -> None:
 
 
 def loader_of_parts(first: str = "{}") -> str:
-    """A loader that yields a scene whose grid is `first`, and, after `go()`, a finer one."""
+    """Return a loader that yields a scene whose grid is `first` and, after `go()`, a finer scene."""
     loader = stub_loader(as_json(VIEWS))
     scene = loader[loader.index("yield") :].partition(";")[0]
     begun = scene.replace('"grid": {}', f'"grid": {first}')

@@ -1,4 +1,4 @@
-"""The page in a browser, with a renderer that writes down what it is asked to draw."""
+"""The page in a browser, with a renderer that records what it is asked to draw."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from player.page.page import web_files
 
 HERE = Path(__file__).parent
 ADDRESS = "http://localhost/scene/index.html"
-"""Answered within the browser: nothing leaves it."""
+"""Address of the page. It is answered within the browser: nothing leaves it."""
 SECONDS = 60.0
-"""Patience with a busy machine; nothing waits that long in vain."""
+"""Longest wait for a busy machine, in seconds; a test that passes never waits that long."""
 CHROMIUM = [
     "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
     "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -53,7 +53,7 @@ TYPES = {
 
 
 def stub_loader(cameras: list[dict[str, Any]], fails: str = "") -> str:
-    """A loader of a scene with these cameras and nothing to draw; or one that says why it has none."""
+    """Return a loader of a scene with these cameras and nothing to draw, or one that raises `fails`."""
     import json
 
     manifest = {"background": [1, 1, 1]}
@@ -68,7 +68,7 @@ def stub_loader(cameras: list[dict[str, Any]], fails: str = "") -> str:
 
 
 def page_files(loader: str, poster: bytes = b"") -> dict[str, bytes]:
-    """The page's files with the stub renderer and a loader of one's own."""
+    """Return the page's files with the stub renderer and this loader."""
     files = web_files()
     html = files["index.html"]
     parts = {
@@ -95,14 +95,14 @@ def page_files(loader: str, poster: bytes = b"") -> dict[str, bytes]:
 class Opened(NamedTuple):
     page: Page
     said: list[str]
-    """What the console said, and errors that nobody caught."""
+    """Messages of the console, and errors that nobody caught."""
     missing: list[str]
-    """Addresses that were asked for and are none of the page's files."""
+    """Requested addresses that are none of the page's files."""
 
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A browser with WebGL on the processor."""
+    """Start a browser with WebGL on the processor."""
     names = ("chromium", "chromium-browser", "google-chrome")
     path = next(filter(None, map(shutil.which, names)), None)
     if path is None:
@@ -117,9 +117,9 @@ def chromium() -> Iterator[Browser]:
 def opened(
     browser: Browser, files: Mapping[str, bytes], hash_: str = "", wait: bool = True, **options: Any
 ) -> Iterator[Opened]:
-    """The page in a tab of its own, which said nothing and asked for nothing but its files when it is closed.
+    """Open the page in a new tab; at the end, check that it logged nothing and requested only its files.
 
-    `wait`: until the first whole picture is on the screen. `options`: those of a browser's context.
+    `wait`: wait until the first whole picture is on the screen. `options`: options of a browser's context.
     """
     options = {"viewport": {"width": 640, "height": 480}, "reduced_motion": "no-preference", **options}
     context = browser.new_context(**options)
@@ -150,7 +150,7 @@ def opened(
 
 
 def wait_for(page: Page, what: Callable[[], object]) -> None:
-    """Wait until it is so."""
+    """Wait until `what()` is true."""
     end = time.monotonic() + SECONDS
     while not what():
         assert time.monotonic() < end, "waited in vain"
@@ -158,7 +158,7 @@ def wait_for(page: Page, what: Callable[[], object]) -> None:
 
 
 def still(page: Page) -> dict[str, Any]:
-    """The view of the last picture, when the camera stands still and all pictures of it are added up."""
+    """Return the view of the last picture, once the camera stands still and all pictures are accumulated."""
     page.evaluate("() => { globalThis.n = -1; }")
     page.wait_for_function(
         """() => {
@@ -172,5 +172,5 @@ def still(page: Page) -> dict[str, Any]:
 
 
 def c2w(view: dict[str, Any]) -> np.ndarray:
-    """[4, 4] camera of a view."""
+    """Return the camera matrix [4, 4] of a view."""
     return np.reshape(view["c2w"], (4, 4))

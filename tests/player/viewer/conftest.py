@@ -1,4 +1,4 @@
-"""What the tests of the viewer share: they do not keep to a share of the cores."""
+"""Fixture of the viewer's tests: they may use every core."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from tests.cores import every_core
 
 @pytest.fixture(scope="module", autouse=True)
 def cores() -> Iterator[None]:
-    """A browser waits for what looks at it, which waits for the browser: together they use every core."""
+    """Let these tests use every core: a browser and its test mostly wait for each other."""
     with every_core():
         yield

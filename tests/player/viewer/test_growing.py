@@ -1,4 +1,4 @@
-"""A viewer that opens at the first part and sharpens as the others come."""
+"""Tests of a viewer that opens at the first part and sharpens as the others come."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_renderer_goes_on_with_more_parts_and_keeps_pictures_that_have_begun(f
 
 
 def test_it_shows_what_there_is_and_tells_of_every_part(folder: Path) -> None:
-    """The reader of parts is stopped before each: what is seen meanwhile is what there is."""
+    """The picture shows the parts that were read so far. The reader is stopped before each part."""
     n = len(Asset.open(folder).manifest.parts)
     may_go_on, seen, said = threading.Semaphore(0), [], []
 

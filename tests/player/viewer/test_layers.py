@@ -1,4 +1,4 @@
-"""What a layer of a frame looks like: its colours, and what is spread over them."""
+"""Tests of how layers of a frame look: their colours, and the values that are spread over them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_colours_are_viridis() -> None:
 
 
 def test_depth_is_spread_between_the_hundredths_at_its_ends() -> None:
-    """Of 201 depths 0, 1, ..., 200 these are 2 and 198; what is nearest is yellow, what is farthest blue."""
+    """Depth is spread between its 1st and 99th percentile (here 2 and 198), yellow (near) to blue (far)."""
     depth = np.arange(201, dtype=np.float32)[None]
     opacity, zeros = np.ones_like(depth), np.zeros_like(depth)
     frame = Frame(np.zeros((1, 201, 3), np.float32), opacity, depth, zeros, (1.0, 1.0, 1.0))

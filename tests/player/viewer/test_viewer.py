@@ -1,4 +1,4 @@
-"""The viewer: its parts, what it says when it cannot open, and a real browser that looks at it."""
+"""Tests of the viewer: its parts, its messages when it cannot open, and its look in a real browser."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WINDOW = {"width": 900, "height": 500}
 
 @pytest.mark.parametrize("rate", [2e4, 1e6, 1e9])
 def test_pace_finds_the_size_that_the_time_allows(rate: float) -> None:
-    """A machine of `rate` pixels a second with 5 ms a picture on top."""
+    """The pace finds the right size on a machine of `rate` pixels a second plus 5 ms per picture."""
     pace = Pace()
     for _ in range(40):
         width, height = pace.moving(1000, 800)
@@ -59,8 +59,8 @@ def test_one_hiccup_halves_the_picture_at_most() -> None:
 
 @pytest.mark.parametrize("rate", [6e4, 1e6, 1e9])
 def test_the_sharp_picture_is_there_within_a_second(rate: float) -> None:
-    """After the camera has stood still for long enough, of any window, on a machine that has a picture of
-    LEAST pixels ready in the time that a picture may take."""
+    """The sharp picture of any window is there within a second after the camera has stopped, on a machine
+    that renders LEAST pixels in the time that a picture may take."""
     pace = Pace()
     for size in ((1000, 800), (3000, 2000), (70, 50)):
         for _ in range(40):
@@ -130,7 +130,7 @@ def test_a_port_that_is_taken() -> None:
 
 
 def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Said at once: the server itself would look for a port without end."""
+    """An address of another machine is refused at once; the server itself would try ports without end."""
     assert cli.main([str(shells_folder), "--host", "192.0.2.1", "--port", "8080"]) == 1
     assert "viewer: --port 8080 at 192.0.2.1: expected a free port, got: " in capsys.readouterr().err
     assert cli.main([str(shells_folder), "--background", "transparent"]) == 1
@@ -138,7 +138,7 @@ def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.Captu
 
 
 def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.CaptureFixture[str]) -> None:
-    """One asset or several, as long as the block runs; nothing is printed."""
+    """`serve` serves one asset or several while its block runs, and prints nothing."""
     for assets in (asset, [asset, asset]):
         with serve(assets, ServeSettings(march="numpy")) as address:
             with urllib.request.urlopen(address) as page:
@@ -172,7 +172,7 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
-# Every size that the viewer states, in order: what is between two looks at the page is not missed.
+# Records every size that the viewer states, in order, also those between two looks at the page.
 WATCH = """() => {
   const input = [...document.querySelectorAll('input:disabled')].find(i => /^\\d+x\\d+, /.test(i.value));
   window.sizes = [];
@@ -205,13 +205,13 @@ def opened(browser: Browser, server: Server) -> Page:
 
 
 def sizes(page: Page) -> list[int]:
-    """Pixels of each picture that was shown since the last look; the present one remains."""
+    """Return the pixels of each picture since the last call. The present one is returned again next time."""
     found = page.evaluate("() => window.sizes.splice(0, window.sizes.length - 1).concat(window.sizes)")
     return [width * height for width, height in found]
 
 
 def settle(page: Page) -> np.ndarray:
-    """The part of the page that no control covers, when it has stayed as it is for a second."""
+    """Return the part of the page that no control covers, once it has not changed for a second."""
     before, since = shot(page), time.monotonic()
     end = time.monotonic() + SECONDS
     while time.monotonic() - since < 1:
@@ -241,7 +241,7 @@ def choose(page: Page, option: str, dropdown: int = 0) -> None:
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """Share of the pixels that differ clearly."""
+    """Return the share of the pixels that differ clearly."""
     return float((np.abs(after - before).max(axis=-1) > 24).mean())
 
 
@@ -255,7 +255,7 @@ def test_a_drag_changes_the_picture_and_standing_still_sharpens_it(browser: Brow
     seen = sizes(page)
     assert changed(before, after) > 0.05
     assert min(seen) < whole / 2, "smaller pictures while it moved"
-    # not the same: viser itself takes fewer pixels of the screen when the browser is slow
+    # not the same size: viser itself uses fewer pixels of the screen when the browser is slow
     assert seen[-1] > 2 * min(seen) and seen[-1] >= 0.4 * whole, "and a large one in the end"
     with page.expect_download() as download:
         page.get_by_role("button", name="Screenshot").click()
@@ -310,7 +310,7 @@ def test_two_clients_and_one_that_vanishes(browser: Browser, server: Server) -> 
     assert changed(first, second) > 0.05
     assert changed(first, settle(one)) < 0.01, "each has a camera and controls of its own"
     drag(two, 60)  # it is in the middle of rendering when it goes
-    two.goto("about:blank")  # without a goodbye
+    two.goto("about:blank")  # without a closing message
     two.close()
     drag(one, 150)
     assert changed(first, settle(one)) > 0.05

@@ -1,4 +1,4 @@
-"""Who is let in to the viewer, and what it makes of what it is told, over real connections."""
+"""Tests of who is let in to the viewer, and how it treats messages, over real connections."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_websocket_of_this_page_is_let_in_through_a_tunnel(server: Server) -> 
 
 
 def test_which_names_an_address_answers_to() -> None:
-    """Where others may look, any address is let in, and of names only those that are ours."""
+    """A viewer that others may open answers to any IP address, but only to this machine's own names."""
     for host in ("0.0.0.0", "::", "192.0.2.1"):
         guard = Guard(host, "1.1.1")
         for name in ("localhost", "192.0.2.1", "2001:db8::1", socket.gethostname().lower()):
@@ -119,20 +119,20 @@ def test_which_names_an_address_answers_to() -> None:
 def test_a_viser_that_cannot_be_guarded_serves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port("127.0.0.1", None)
     original = guard.websockets_server.serve
-    with monkeypatch.context() as patched:  # a viser that has taken `serve` before
+    with monkeypatch.context() as patched:  # a viser that imported `serve` earlier
         patched.setattr(viser.infra._infra.websockets.asyncio, "server", type("", (), {"serve": original}))
         with pytest.raises(MissingExtraError, match=r"a viser whose connections can be checked"):
             guarded_server("127.0.0.1", port)
     assert guard.websockets_server.serve is original
     assert free_port("127.0.0.1", port) == port
-    with monkeypatch.context() as patched:  # a viser that speaks otherwise
+    with monkeypatch.context() as patched:  # a viser with other messages
         patched.setattr(guard, "CAMERA_FIELDS", (*messages.CAMERA_FIELDS, "roll"))
         with pytest.raises(MissingExtraError, match=r"pip install viser==1\.1\.1"):
             guarded_server("127.0.0.1", port)
 
 
 def test_a_client_cannot_open_a_way_in_from_the_internet(server: Server) -> None:
-    """The tunnel would be announced on the terminal, and to the client."""
+    """A client cannot open a tunnel, which would be announced on the terminal and to the client."""
     with Client(server) as client:
         client.move()
         client.picture()
@@ -179,7 +179,7 @@ BAD_CAMERAS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_camera_that_is_none_is_ignored(first: bool, server: Server) -> None:
-    """Whether it is the first that a client tells, or one among others: the next one is heeded."""
+    """An invalid camera is ignored, whether it is a client's first or a later one; the next one is used."""
     with Client(server) as client:
         if not first:
             client.move()
@@ -226,7 +226,7 @@ def test_a_flood_of_cameras_ends_with_the_newest(server: Server) -> None:
 
 
 def test_of_many_clicks_one_screenshot_at_a_time(server: Server) -> None:
-    """A client that clicks and never reads makes nothing pile up."""
+    """Screenshots are made one at a time: a client that clicks and never reads makes nothing pile up."""
     with Client(server) as client:
         client.move(image_width=800, image_height=800)
         client.picture()
@@ -258,7 +258,7 @@ def test_messages_that_are_none(server: Server) -> None:
 
 @pytest.mark.parametrize("what", ["long", "fragments", "pings", "bomb", "not a frame"])
 def test_a_client_that_overdoes_it_is_dropped(what: str, server: Server) -> None:
-    """A browser does none of this."""
+    """A client that sends too much, or no frames, as no browser does, is dropped."""
     with Client(server) as client:
         client.move()
         client.picture()
@@ -270,7 +270,7 @@ def test_a_client_that_overdoes_it_is_dropped(what: str, server: Server) -> None
             raw.sendall(b"\x02\x80" + mask + (b"\x00\x80" + mask) * 200)
         elif what == "pings":
             raw.sendall((b"\x89\x80" + mask) * 200)
-        elif what == "bomb":  # compressed, as permessage-deflate does it, which is not spoken here
+        elif what == "bomb":  # marked as compressed, which the server does not support
             raw.sendall(b"\xc2\xfe" + struct.pack(">H", 1000) + mask + b"\0" * 1000)
         else:
             raw.sendall(bytes(range(256)) * 4)
@@ -282,7 +282,7 @@ def test_a_client_that_overdoes_it_is_dropped(what: str, server: Server) -> None
 
 
 def test_hundreds_of_clients(server: Server) -> None:
-    """Those over the limit are told so; when the others are gone, there is room again."""
+    """Clients over the limit are refused with a message; when the others are gone, there is room again."""
     inside: list[Client] = []
     refused = 0
     for _ in range(200):
@@ -293,12 +293,12 @@ def test_hundreds_of_clients(server: Server) -> None:
             assert error.response.status_code == 503 and b"close one" in (error.response.body or b"")
     assert len(inside) == MOST_CLIENTS and refused == 200 - MOST_CLIENTS
     for client in inside:
-        client.socket.socket.close()  # without a goodbye
+        client.socket.socket.close()  # without a closing message
     _still_serves_soon(server)
 
 
 def test_half_open_connections(server: Server) -> None:
-    """Those that say nothing, or half a request, are as many as they may be, and then go."""
+    """Connections that send nothing or half a request are limited in number, and closed after some time."""
     sockets = []
     for index in range(2 * MOST_SOCKETS):
         half = socket.create_connection(("127.0.0.1", server.port), SECONDS)

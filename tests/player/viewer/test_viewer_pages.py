@@ -1,4 +1,4 @@
-"""Pages beside the viewer: made once, sent to many at a time, and to nobody who is not let in."""
+"""Tests of pages beside the viewer: made once, sent to many at a time, and only to those let in."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BODY = np.random.default_rng(0).bytes(8 << 20)
 
 @contextmanager
 def serving(*makers: Callable[[], bytes]) -> Iterator[int]:
-    """The port of a server with these pages."""
+    """Run a server with these pages; yield its port."""
     served = pages.Pages(makers)
     server = guarded_server("127.0.0.1", free_port("127.0.0.1", None), "", served)
     try:
@@ -63,7 +63,7 @@ def test_twenty_visitors_get_a_page_that_is_made_once() -> None:
 
 
 def test_slow_visitors_take_no_memory() -> None:
-    """Twenty who ask for 40 MB and take nothing: naively that were 800 MB."""
+    """Twenty visitors who request 40 MB and read nothing take little memory; naively it would be 800 MB."""
 
     def resident_mb() -> float:
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
@@ -120,7 +120,7 @@ def test_the_page_of_each_asset_and_one_that_has_none() -> None:
 
 @pytest.mark.parametrize("error", [FormatError("part_1.bin: cut short"), MemoryError()], ids=["503", "bug"])
 def test_a_page_that_could_not_be_made_is_tried_again(error: Exception) -> None:
-    """The asset was still being copied, for example."""
+    """A page that could not be made, for example while its asset was being copied, is tried again."""
     n_made = []
 
     def make() -> bytes:
@@ -186,7 +186,7 @@ def test_a_server_that_stops_waits_for_nobody() -> None:
 
 
 def test_the_viewer_has_a_link_to_the_page(shells_folder: Path, tmp_path: Path) -> None:
-    """Opened from it, the page plays on the browser's own WebGL."""
+    """The viewer links to the page, which then plays on the browser's own WebGL."""
     server = Server(tmp_path / "errors.txt", shells_folder)
     with chromium() as browser:
         viewer = browser.new_page()

@@ -22,7 +22,7 @@ from websockets.typing import Origin, Subprotocol
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SECONDS = 120.0
-"""Patience with a busy machine; nothing waits that long in vain."""
+"""Longest wait for a busy machine, in seconds; a test that passes never waits that long."""
 
 SPOKEN = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -41,13 +41,13 @@ CAMERA: dict[str, Any] = {
 
 
 class Server:
-    """`vfr-play ASSET ...` as a process."""
+    """A process of `vfr-play ASSET ...`, which serves the viewer."""
 
     def __init__(self, errors: Path, *arguments: str | Path, program: str = "") -> None:
-        """`program`: what to run before, in the process."""
+        """Start the process; `program` is Python code that it runs first."""
         environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
         self.errors = errors
-        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell has it for what runs behind
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell sets it for background jobs
             signal.signal(signal.SIGINT, signal.default_int_handler)
         code = f"{program}\nimport sys\nfrom player.app.cli import main\nsys.exit(main())"
         start = ["-c", code] if program else ["-m", "player"]
@@ -66,7 +66,7 @@ class Server:
         self.address, self.port = found[0], int(found[1])
 
     def stop(self) -> int:
-        """End it, by Ctrl-C; the exit code."""
+        """End the process by Ctrl-C; return its exit code."""
         self.process.send_signal(signal.SIGINT)
         code = self.process.wait(SECONDS)
         assert self.process.stdout is not None
@@ -74,13 +74,13 @@ class Server:
         return code
 
     def resident_mb(self) -> float:
-        """Memory that it holds now (Linux)."""
+        """Return the memory, in MB, that the process holds now (Linux)."""
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * 4096 / 1e6
 
 
 def get(server: Server, headers: dict[str, str], path: str = "/") -> tuple[int, str]:
-    """Status and text of what the server answers to a request with these headers alone."""
+    """Return the status and text of the server's answer to a request with these headers alone."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=SECONDS)
     connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
     for name, value in headers.items():
@@ -95,7 +95,7 @@ def get(server: Server, headers: dict[str, str], path: str = "/") -> tuple[int, 
 def opened(
     server: Server, host: str | None = None, origin: str | None = "", **options: Any
 ) -> ClientConnection:
-    """A WebSocket as a page of the server opens it; `host` and `origin` as they are told."""
+    """Open a WebSocket as a page of the server does, which claims this `host` and `origin`."""
     name = host or f"127.0.0.1:{server.port}"
     given = f"http://{name}" if origin == "" else origin
     return connect(
@@ -107,7 +107,7 @@ def opened(
 
 
 def decoded(batch: bytes | str) -> list[dict[str, Any]]:
-    """The messages in what the server sends at a time."""
+    """Return the messages in one batch of the server."""
     assert isinstance(batch, bytes)
     size, packed = int.from_bytes(batch[:8], "little"), int.from_bytes(batch[8:16], "little")
     inner = zstandard.ZstdDecompressor().decompress(batch[16 : 16 + packed], max_output_size=size)
@@ -115,12 +115,12 @@ def decoded(batch: bytes | str) -> list[dict[str, Any]]:
 
 
 class Client:
-    """What a page does, as far as a test wants it."""
+    """A client that does what a page does, as far as tests need it."""
 
     def __init__(self, server: Server, **options: Any) -> None:
         self.socket = opened(server, **options)
         self.controls: dict[str, str] = {}
-        """The names of controls on the wire, by their labels."""
+        """The ids of controls in messages, by their labels."""
 
     def __enter__(self) -> Client:
         return self
@@ -132,15 +132,15 @@ class Client:
         self.socket.send(msgspec.msgpack.encode(message))
 
     def move(self, **changes: Any) -> None:
-        """Tell the camera, with some fields as given."""
+        """Send the camera `CAMERA`, with these fields changed."""
         self.send(CAMERA | changes)
 
     def set(self, label: str, value: Any) -> None:
-        """Set a control."""
+        """Set the control that has this label."""
         self.send({"type": "GuiUpdateMessage", "uuid": self.controls[label], "updates": {"value": value}})
 
     def messages(self, seconds: float = SECONDS) -> Iterator[dict[str, Any]]:
-        """What the server says, until it has said nothing for some time."""
+        """Yield the server's messages, until it has sent nothing for `seconds`."""
         while True:
             try:
                 batch = self.socket.recv(seconds)
@@ -154,14 +154,14 @@ class Client:
             yield from batch
 
     def picture(self) -> bytes:
-        """The next picture, JPEG."""
+        """Return the next picture, a JPEG."""
         for message in self.messages():
             if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                 return message["rgb_data"]
         raise AssertionError("no picture")
 
     def sizes(self, last: Callable[[int, int], object]) -> list[tuple[int, int]]:
-        """Sizes of the pictures that come, up to one that is the last."""
+        """Return the sizes of the pictures that come, up to the first for which `last` is true."""
         sizes = []
         for message in self.messages():
             state = message["updates"].get("value") if message["type"] == "GuiUpdateMessage" else None

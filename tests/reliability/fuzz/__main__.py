@@ -1,15 +1,17 @@
-"""Broken inputs to every reader: nothing but a VfrError, in bounded time and memory, inside the folder.
+"""Give broken inputs to every reader: each has to be read, or refused with a VfrError, in bounded time and
+memory.
 
     python -m tests.reliability.fuzz --inputs 100000 --seed 0
 
-Input i of a seed is always the same one. Each is given LIMIT_SECONDS, and all of them together ROOM bytes
-more than the process had before; files opened outside the work folder, programs started and connections are
-failures. Arrays of assets are broken unpacked and vouched for by the manifest, heads by their structure too,
-and what is read is played (`tests.reliability.fuzz.assets`, `heads`, `data`).
+Input i of a seed is always the same. Each may take LIMIT_SECONDS, and all of them together may take ROOM
+bytes more memory than the process had before. It is a failure to open a file outside the work folder, to
+start a program or to connect to anything. Arrays of assets are broken while they are unpacked, and get their
+checksums in the manifest; heads are also broken in their structure. What can be read is played
+(`tests.reliability.fuzz.assets`, `heads`, `data`).
 
-The inputs are read by processes of their own (`worker`): one that crashes or hangs is a failure that
-names its input, and the next goes on behind it. Where `strace` is installed it shows what native code opens
-as well; without it, only what Python opens is seen, and the result says so.
+Processes of their own (`worker`) read the inputs: an input that makes one crash or hang is named as a
+failure, and a new process goes on with the next input. If `strace` is installed, it also shows which files
+native code opens; without it only files that Python opens are seen, and the result says so.
 """
 
 from __future__ import annotations
@@ -35,11 +37,11 @@ from tests.reliability.fuzz.worker import COUNTS, INDEX, LIMIT_SECONDS, MARK, SL
 STATE_WORDS = 256
 TRACED = "open,openat,openat2,creat,execve,execveat,connect"
 START_SECONDS = 600.0
-"""A worker that has not begun by then hangs: its first use of a kernel compiles it."""
+"""Seconds after which a worker that has not begun counts as hanging; it compiles kernels at first use."""
 
 
 class Worker:
-    """One process at a time, and another behind the input that ended it."""
+    """Reads inputs in one process at a time; after an input that ends it, another process takes over."""
 
     def __init__(self, work: Path, seed: int, first: int, step: int, n_inputs: int, names: list[str]) -> None:
         self.failures: list[dict[str, Any]] = []
@@ -57,7 +59,7 @@ class Worker:
         return self._thread.is_alive()
 
     def targets(self) -> list[str]:
-        """Names, as soon as a worker has told them."""
+        """Return the names of the targets, once a worker has written them."""
         told = [*self._work.glob("targets.json"), *self._work.glob("from_*/targets.json")]
         return json.loads(told[0].read_text()) if told else []
 
@@ -83,7 +85,7 @@ class Worker:
             first = at + self._step
 
     def _one(self, folder: Path, first: int) -> str | None:
-        """Run a worker from input `first` on; how it ended, None if well."""
+        """Run a worker from input `first` on, and return how it ended; None if it ended well."""
         arguments = [folder, self._seed, first, self._step, self._n_inputs, *self._names]
         command = [sys.executable, "-m", "tests.reliability.fuzz.worker", *map(str, arguments)]
         trace = None
@@ -104,7 +106,7 @@ class Worker:
         errors: list[str] = []
         listener = threading.Thread(target=lambda: errors.extend(process.stderr or []), daemon=True)
         listener.start()
-        for line in process.stdout:  # one by one: they are looked at meanwhile
+        for line in process.stdout:  # line by line, because they are read while it runs
             if line.startswith("{"):
                 self.failures.append(json.loads(line))
         code = process.wait()
@@ -128,7 +130,7 @@ class Worker:
                 return
 
     def _read_trace(self, folder: Path) -> None:
-        """Between two marks: every name that was opened, and what it led to."""
+        """Check every file name that is opened between two marks, and the path that it leads to."""
         index, call = None, re.compile(r'(\w+)\(.*?(?:"((?:[^"\\]|\\.)*)")?.*?(?:= \d+<(.*)>)?$')
         with (folder / "trace").open(errors="replace") as lines:
             for line in lines:
@@ -149,8 +151,8 @@ class Worker:
 def fuzz(
     n_inputs: int, seed: int, names: list[str] | None = None, jobs: int = 1, progress: Path | None = None
 ) -> dict[str, Any]:
-    """Give `n_inputs` to the readers in turn; what became of them. `progress` is a file that is kept up to
-    date meanwhile."""
+    """Give `n_inputs` to the readers in turn, and return what became of them. `progress` is a file that is
+    kept up to date meanwhile."""
     begin = time.monotonic()
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(prefix="vfr-fuzz-", dir=memory if memory.is_dir() else None) as folder:

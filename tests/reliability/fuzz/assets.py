@@ -1,7 +1,8 @@
-"""Broken assets: their arrays unpacked, changed, packed again and vouched for by the manifest, so that what
-lies behind zlib and the checksums is reached; and files that are none.
+"""Broken assets. Their arrays are unpacked, changed, packed again and given their checksums in the manifest,
+so that the code behind zlib and the checksums is reached. There are also assets with things that are no
+files.
 
-What is read is played: both marches, the head, the pixels.
+What can be read is played: with both marches, the head and the pixels.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from tests.version_3 import pack_codes, pack_masks, write_version_3
 
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19
-"""Cells of the asset that is broken: three bricks an axis, the last of them not full."""
+"""Cells per axis of the asset that is broken: three bricks, of which the last is not full."""
 MARCHES: tuple[March, ...] = ("numpy", "numba") if available() else ("numpy",)
 
 
 def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
-    """A ball and a wall, as small as they can be, in version 3.1."""
+    """Write a ball and a wall, as small as they can be, in version 3.1."""
     from player.asset.manifest import Manifest
 
     axis = np.arange(RESOLUTION + 1)
@@ -63,7 +64,7 @@ def whole_asset(folder: Path, head: bytes, mesh: bytes, cameras: bytes) -> Path:
 
 
 class BrokenAsset:
-    """A copy of an asset in which some files are something else, until the next input."""
+    """A copy of an asset in which some files are broken until the next input."""
 
     def __init__(self, whole: Path, folder: Path) -> None:
         self.folder = Path(shutil.copytree(whole, folder))
@@ -77,14 +78,14 @@ class BrokenAsset:
 
     @property
     def version(self) -> str:
-        """What tells its targets from those of the other version."""
+        """Return the suffix that tells this version's targets from those of the other version."""
         return "" if self.manifest["version"][0] == 3 else " of version 4"
 
     def bytes_of(self, name: str) -> bytes:
         return self._whole[name]
 
     def restore(self) -> None:
-        """Make every file the whole one again."""
+        """Restore every changed file."""
         for name in self._changed:
             path = self.folder / name
             if path.is_dir() and not path.is_symlink():
@@ -95,12 +96,12 @@ class BrokenAsset:
         self._changed.clear()
 
     def place(self, name: str) -> Path:
-        """The path of a file that will be something else."""
+        """Return the path of a file that is going to be changed."""
         self._changed.add(name)
         return self.folder / name
 
     def write(self, files: dict[str, bytes], manifest: dict[str, Any] | None = None) -> None:
-        """Files, and a manifest with their sizes and checksums."""
+        """Write files, and a manifest with their sizes and checksums."""
         document = dict(self.manifest if manifest is None else manifest)
         entries = dict(document["files"]) if isinstance(document.get("files"), dict) else {}
         for name, data in files.items():
@@ -109,14 +110,14 @@ class BrokenAsset:
         self.place("manifest.json").write_text(json.dumps(document | {"files": entries}))
 
     def read(self) -> None:
-        """Open, describe and play it."""
+        """Open, describe and play the asset."""
         asset = Asset.open(self.folder, verify=True)
         assert all(line.isprintable() for line in page(self.folder, asset.manifest, facts(asset)))
         play(asset)
 
 
 def play(asset: Asset) -> None:
-    """A small picture by every march. Raises AssertionError for what is no picture."""
+    """Render a small picture with every march. Raises AssertionError if it is no picture."""
     for march in MARCHES:
         with Renderer(asset, 1, march) as renderer:
             for n_fetches in (None, 0):
@@ -129,7 +130,7 @@ def play(asset: Asset) -> None:
 
 
 def _rows(array: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Broken bytes of an array, as many whole rows as there are."""
+    """Return broken bytes of an array, as whole rows, as many as the bytes hold."""
     data = broken_bytes(array.tobytes(), random)
     row = int(np.prod(array.shape[1:], dtype=int)) * array.itemsize
     return np.frombuffer(data[: len(data) // row * row], array.dtype).reshape(-1, *array.shape[1:])
@@ -140,7 +141,7 @@ def _starts(masks: np.ndarray) -> np.ndarray:
 
 
 def _with_bricks(arrays: Arrays, names: tuple[str, str, str], order: np.ndarray) -> Arrays:
-    """The bricks of `order`, each with its rows: counts agree with one another."""
+    """Return the bricks of `order`, each with its rows, so that all counts agree."""
     coords, masks, codes = (arrays[name] for name in names)
     starts = _starts(masks)
     order = order[(order < len(coords)) & (order < len(masks))]
@@ -154,18 +155,18 @@ def _with_bricks(arrays: Arrays, names: tuple[str, str, str], order: np.ndarray)
 
 
 def _moved(arrays: Arrays, names: tuple[str, str, str], random: np.random.Generator) -> Arrays:
-    """Some bricks elsewhere, or beyond the grid, or at the ends of what 16 bits hold; sorted or not."""
+    """Move some bricks to other places, beyond the grid, or to the ends of 16 bits; sorted or not."""
     coords = arrays[names[0]].astype(np.int64)
     some = random.random(len(coords)) < random.choice([0.05, 0.5, 1.0])
     places = [0, 1, 2] if random.random() < 0.5 else [0, 1, 2, 3, 4, 255, 256, 32767, 32768, 65535]
     coords[some] = random.choice(places, (int(some.sum()), 3))
     arrays = arrays | {names[0]: coords.astype(np.uint16)}
-    _, order = np.unique(coords, axis=0, return_index=True)  # sorted, each once
+    _, order = np.unique(coords, axis=0, return_index=True)  # sorted, each place once
     return _with_bricks(arrays, names, order) if random.random() < 0.7 else arrays
 
 
 def _other_masks(arrays: Arrays, names: tuple[str, str, str], random: np.random.Generator) -> Arrays:
-    """Other vertices: as many (the codes agree), or more or fewer with codes that agree or do not."""
+    """Change masks to as many vertices, or more or fewer, with a number of codes that fits or does not."""
     masks, codes = arrays[names[1]].copy(), arrays[names[2]]
     brick = int(random.integers(0, max(len(masks), 1)))
     if not len(masks):
@@ -207,7 +208,7 @@ def _structure(arrays: Arrays, names: tuple[str, str, str], random: np.random.Ge
 
 
 def _packed(name: str, array: np.ndarray, random: np.random.Generator) -> bytes:
-    """The bytes of an array's file, by any level of zlib, or with something else behind or in front."""
+    """Return the bytes of an array's file: packed at any level of zlib, or with data added, or unchanged."""
     if name.endswith("coords"):
         file = io.BytesIO()
         np.save(file, np.ascontiguousarray(array))
@@ -230,7 +231,7 @@ def _packed(name: str, array: np.ndarray, random: np.random.Generator) -> bytes:
 
 
 def other_settings(document: dict[str, Any], random: np.random.Generator) -> dict[str, Any]:
-    """Values that the specification allows, but that are not what the arrays were made with."""
+    """Change settings to values that the specification allows, but that do not fit the arrays."""
     choices: dict[str, tuple[Any, ...]] = {
         "resolution": (1, 7, 8, 15, 16, 18, 20, 23, 24, 100, 400),
         "feature_resolution": (1, 7, 8, 16, 18, 20, 23, 24, 100, 400),
@@ -260,7 +261,7 @@ def other_settings(document: dict[str, Any], random: np.random.Generator) -> dic
 
 
 def _target_of_array(asset: BrokenAsset, name: str) -> Target:
-    """One array: its values, its structure, its packed bytes, and with all that other settings."""
+    """Return a target that breaks an array: values, structure or packed bytes, with other settings too."""
     names = ("brick_coords", "brick_masks", "density")
     if name.startswith("feature"):
         names = ("feature_coords", "feature_masks", "features")
@@ -291,7 +292,7 @@ def _target_of_array(asset: BrokenAsset, name: str) -> Target:
 
 
 def special_files(asset: BrokenAsset) -> Target:
-    """A link, a pipe, a device, a socket, a folder or a terabyte in place of any file."""
+    """Return a target that puts a link, pipe, device, socket, folder or a terabyte in place of a file."""
 
     def prepare(random: np.random.Generator) -> None:
         asset.restore()
@@ -339,7 +340,7 @@ def special_files(asset: BrokenAsset) -> Target:
 
 
 def broken_manifest(asset: BrokenAsset) -> Target:
-    """Values, and the structure: keys that are renamed, repeated, in another order, nested."""
+    """Return a target that breaks the manifest: values, and keys that are renamed, repeated or reordered."""
     data = asset.bytes_of("manifest.json")
 
     def prepare(random: np.random.Generator) -> None:
@@ -389,7 +390,7 @@ def _mesh(asset: BrokenAsset) -> Target:
 
 
 def asset_targets(asset: BrokenAsset) -> list[Target]:
-    """All of them; they share one folder."""
+    """Return all targets of an asset; they share one folder."""
     assert bricks_per_axis(RESOLUTION) == 3
     makers: list[Callable[[BrokenAsset], Target]] = [broken_manifest, special_files, _mesh]
     return [*(make(asset) for make in makers), *(_target_of_array(asset, name) for name in PLACES)]

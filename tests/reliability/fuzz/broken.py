@@ -1,4 +1,4 @@
-"""Broken inputs out of whole ones: bytes and JSON, by a random generator that is given."""
+"""Breaks valid inputs, bytes and JSON, with a given random generator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STRANGE: tuple[Any, ...] = (
 
 
 def broken_bytes(data: bytes, random: np.random.Generator) -> bytes:
-    """One to four changes: bits, words, cuts, repeats, insertions."""
+    """Return the bytes with one to four changes: bits, words, cuts, repeats, insertions."""
     out = bytearray(data)
     for _ in range(int(random.integers(1, 5))):
         at = int(random.integers(0, len(out) + 1))
@@ -43,7 +43,7 @@ def broken_bytes(data: bytes, random: np.random.Generator) -> bytes:
 
 
 def broken_json(data: bytes, random: np.random.Generator) -> bytes:
-    """One to three values replaced, removed or repeated; now and then its bytes instead."""
+    """Return JSON with one to three values replaced, removed or repeated, or sometimes broken bytes."""
     if random.random() < 0.25:
         return broken_bytes(data, random)
     document = json.loads(data)
@@ -55,7 +55,7 @@ def broken_json(data: bytes, random: np.random.Generator) -> bytes:
 
 
 def broken_value(value: Any, random: np.random.Generator) -> Any:
-    """A copy in which something, somewhere, is something else."""
+    """Return a copy in which some value, at any depth, is replaced, removed or repeated."""
     value = copy.deepcopy(value)
     keys = (
         list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []

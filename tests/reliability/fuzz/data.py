@@ -27,7 +27,7 @@ def _json(path: Path, data: bytes) -> Break:
 
 
 def camera_targets(work: Path) -> list[Target]:
-    """transforms.json, camera_path.json, and a box to crop to."""
+    """Return targets that break a transforms.json, a camera_path.json, and a box to crop to."""
     views, path, box = work / "transforms.json", work / "camera_path.json", work / "box.json"
     frames = [
         {"camera_to_world": look_at((7, 2 + i, 5), (1, 2, 3)).reshape(-1).tolist(), "fov": 50}
@@ -44,7 +44,7 @@ def camera_targets(work: Path) -> list[Target]:
 
 
 def _count(data: bytes, at: int, random: np.random.Generator) -> bytes:
-    """Another number of things, which agrees with the length or does not."""
+    """Replace a count by another number, which may or may not fit the length of the data."""
     (n,) = struct.unpack_from("<Q", data, at)
     n = int(
         random.choice([0, 1, 2, max(n - 1, 0), n + 1, 2**32, 2**60, 2**64 - 1], p=[0.1, 0.1] + [0.8 / 6] * 6)
@@ -53,7 +53,7 @@ def _count(data: bytes, at: int, random: np.random.Generator) -> bytes:
 
 
 def colmap_targets(work: Path) -> list[Target]:
-    """Models of COLMAP, binary and text."""
+    """Return targets that break COLMAP models, binary and text."""
     binary, text = work / "binary", work / "text"
     binary.mkdir()
     text.mkdir()
@@ -94,7 +94,7 @@ def colmap_targets(work: Path) -> list[Target]:
 
 
 def picture_target(work: Path) -> Target:
-    """Frames that exist, which a run that goes on looks at."""
+    """Return a target that breaks existing frames, which `--resume` looks at."""
     path = work / "frame.png"
     pixels = np.random.default_rng(0).integers(0, 255, (9, 7, 3)).astype(np.uint8)
     wholes = (png_bytes(pixels, "abc"), webp_bytes(pixels, "abc"))
@@ -110,7 +110,7 @@ def picture_target(work: Path) -> Target:
 
 
 def model_target(work: Path) -> Target:
-    """A trained model."""
+    """Return a target that breaks a trained model."""
     import torch
 
     from vfr_bake.config import FieldConfig

@@ -1,4 +1,4 @@
-"""Broken heads: the bytes of the file, and its structure, by the package `onnx` and by fields of protobuf
+"""Broken heads: in the bytes of the file, in the structure by the package `onnx`, and with fields of protobuf
 that no package writes."""
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _names(graph: Any) -> list[str]:
 
 
 def _rename(model: Any, random: np.random.Generator) -> None:
-    """A name that is taken, or that nothing has, for an input or an output of a node, or of the graph."""
+    """Give an input or output of a node or of the graph another name: one in use, or one that nothing has."""
     graph, node = model.graph, _pick(model.graph.node, random)
     match int(random.integers(0, 5)):
         case 0 | 1 if len(node.output):
@@ -69,7 +69,7 @@ def _rename(model: Any, random: np.random.Generator) -> None:
 
 
 def _more(model: Any, random: np.random.Generator) -> None:
-    """A node, a tensor, a port or an opset again, or one fewer."""
+    """Repeat or remove a node, a tensor, a port or an opset."""
     graph = model.graph
     items = _pick([graph.node, graph.initializer, graph.input, graph.output, model.opset_import], random)
     if not len(items):
@@ -90,7 +90,7 @@ def _reorder(model: Any, random: np.random.Generator) -> None:
 
 
 def _dims(model: Any, random: np.random.Generator) -> None:
-    """Other dimensions of a tensor: its numbers agree with them, or do not."""
+    """Change the dimensions of a tensor; its numbers are changed to fit, or not."""
     tensor = _pick(model.graph.initializer, random)
     dims = list(tensor.dims) or [1]
     match int(random.integers(0, 5)):
@@ -114,7 +114,7 @@ def _dims(model: Any, random: np.random.Generator) -> None:
 
 
 def _numbers(model: Any, random: np.random.Generator) -> None:
-    """Numbers of a tensor: NaN, huge, tiny, another type, another field, none."""
+    """Change the numbers of a tensor: NaN, huge or tiny ones, another type, another field, none."""
     tensor = _pick(model.graph.initializer, random)
     match int(random.integers(0, 6)):
         case 0:
@@ -160,7 +160,7 @@ def _attribute(model: Any, random: np.random.Generator) -> None:
 
 
 def _graphs(model: Any, random: np.random.Generator) -> None:
-    """What has no place in a head: a graph in a node, functions, sparse tensors, numbers in other files."""
+    """Add what a head may not have: a graph in a node, functions, sparse tensors, numbers in other files."""
     graph = model.graph
     match int(random.integers(0, 5)):
         case 0:
@@ -223,7 +223,7 @@ CHANGES: tuple[Change, ...] = (
 
 
 def _varint(value: int, spare: int = 0) -> bytes:
-    """A number of protobuf, with `spare` bytes more than it takes."""
+    """Return a number in protobuf's form, with `spare` bytes more than needed."""
     out = bytearray()
     while value >= 128 or spare > 0:
         out.append(value & 127 | 128)
@@ -242,7 +242,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _fields(data: bytes) -> list[tuple[int, int, bytes]]:
-    """Number, wire type and value of each field of a whole message."""
+    """Return the number, wire type and value of each field of a whole message."""
     found, at = [], 0
     while at < len(data):
         key, at = _read_varint(data, at)
@@ -268,8 +268,8 @@ def _joined(fields: list[tuple[int, int, bytes]], random: np.random.Generator | 
 
 
 def _unusual(data: bytes, random: np.random.Generator, depth: int = 0) -> bytes:
-    """The same message, or nearly: singular fields twice, unknown fields, long numbers, another order; in it,
-    or in a message in it."""
+    """Return nearly the same message: with singular fields twice, unknown fields, long numbers or another
+    order, in itself or in a message within it."""
     fields = _fields(data)
     if not fields:
         return data
@@ -279,7 +279,7 @@ def _unusual(data: bytes, random: np.random.Generator, depth: int = 0) -> bytes:
         try:
             fields[index] = (number, wire, _unusual(value, random, depth + 1))
             return _joined(fields)
-        except IndexError:  # text, and no message
+        except IndexError:  # text, not a message
             pass
     match int(random.integers(0, 7)):
         case 0:
@@ -300,7 +300,7 @@ def _unusual(data: bytes, random: np.random.Generator, depth: int = 0) -> bytes:
 
 
 def broken_head(model: bytes, random: np.random.Generator) -> bytes:
-    """A head that is not one, or one that only looks as if it were none."""
+    """Return a broken head, or a valid head in an unusual form."""
     share = random.random()
     if share < 0.15:
         return broken_bytes(model, random)
@@ -308,7 +308,7 @@ def broken_head(model: bytes, random: np.random.Generator) -> bytes:
         for _ in range(int(random.integers(1, 4))):
             try:
                 model = _unusual(model, random)
-            except IndexError:  # it is none any more
+            except IndexError:  # no message any more
                 return model
         return model
     changed = onnx.ModelProto.FromString(model)
@@ -321,7 +321,7 @@ def broken_head(model: bytes, random: np.random.Generator) -> bytes:
 
 
 def head_targets(work: Path, small: bytes) -> list[Target]:
-    """Heads in float32 and in 8 bits, run by onnxruntime and compiled; `small` is one of few operators."""
+    """Return targets for float32 and 8-bit heads, by onnxruntime and compiled; `small` has few operators."""
     path = work / "head.onnx"
     random = np.random.default_rng(0)
     features = np.concatenate([np.zeros((1, N_CHANNELS)), random.normal(0, 50, (4, N_CHANNELS))])
@@ -345,7 +345,7 @@ def head_targets(work: Path, small: bytes) -> list[Target]:
     for name, whole in wholes.items():
         for compiled in (False, True) if available() else (False,):
             path.write_bytes(whole)
-            read(compiled)  # numba loads what it has compiled, once
+            read(compiled)  # numba loads compiled code once
             kind = f"{name}, {'compiled' if compiled else 'onnxruntime'}"
             found.append(Target(kind, partial(prepare, whole), partial(read, compiled)))
     return found

@@ -1,5 +1,5 @@
-"""Broken parts of assets of version 4: their bytes, their lengths, what the manifest says of their sections,
-parts in place of others and in another order. What is left is played, and described."""
+"""Broken parts of assets of version 4: their bytes, their lengths, the manifest's description of their
+sections, and parts in place of others or in another order. What can be read is played and described."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.reliability.fuzz.targets import Target
 
 
 def whole_parts(folder: Path, old: Path) -> Path:
-    """The asset of version 3 in `old` as version 4, with coarser levels."""
+    """Write the asset of version 3 in `old` as version 4, with coarser levels."""
     from vfr_bake.baking.convert import with_coarser_levels
 
     asset = Asset.open(old)
@@ -31,14 +31,14 @@ def whole_parts(folder: Path, old: Path) -> Path:
     rest = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
     write_asset(folder, manifest, arrays, *rest)
     opened = Asset.open(folder)
-    play(opened)  # what is compiled is read now, and not while an input is watched
+    play(opened)  # loads compiled code now, not while an input is watched
     space = replace(opened.manifest, contracted=True, aabb=((-2.0,) * 3, (2.0,) * 3), step=0.05)
     play(replace(opened, manifest=space))
     return folder
 
 
 def _numbers(document: dict[str, Any], random: np.random.Generator) -> None:
-    """Other numbers of sections: near to the right ones, or anything."""
+    """Change numbers of sections to numbers near the right ones, or to anything."""
     sections = [section for part in document["parts"] for section in part["sections"]]
     for _ in range(int(random.integers(1, 3))):
         section = sections[random.integers(0, len(sections))]
@@ -50,7 +50,7 @@ def _numbers(document: dict[str, Any], random: np.random.Generator) -> None:
 
 
 def _order(document: dict[str, Any], random: np.random.Generator) -> None:
-    """Parts or sections in another order, twice, or not there."""
+    """Reorder, repeat or remove parts or sections."""
     parts = document["parts"]
     some = parts if random.random() < 0.3 else parts[random.integers(0, len(parts))]["sections"]
     match int(random.integers(0, 3)):
@@ -70,7 +70,7 @@ def _parts(asset: BrokenAsset) -> Target:
         name = names[random.integers(0, len(names))]
         data, document = asset.bytes_of(name), copy.deepcopy(asset.manifest)
         kind = int(random.integers(0, 7))
-        if kind == 0:  # as the manifest knows nothing of
+        if kind == 0:  # unknown to the manifest
             asset.place(name).write_bytes(broken_bytes(data, random))
             return
         if kind == 1:
@@ -99,7 +99,7 @@ def _parts(asset: BrokenAsset) -> Target:
 
 
 def _lax(asset: BrokenAsset) -> Target:
-    """The same as a player opens them: what is there plays."""
+    """Return a target with the same inputs that plays what can be read, as a player does."""
     made = _parts(asset)
 
     def read() -> None:
@@ -112,5 +112,5 @@ def _lax(asset: BrokenAsset) -> Target:
 
 
 def parts_targets(asset: BrokenAsset) -> list[Target]:
-    """All of them; they share one folder."""
+    """Return all targets of the parts; they share one folder."""
     return [_parts(asset), _lax(asset), broken_manifest(asset), special_files(asset)]

@@ -1,4 +1,4 @@
-"""Broken sections of the entropy coder: what levels of a pyramid store, and their bricks and cells."""
+"""Broken sections of the entropy coder: the symbols of a pyramid's levels, and their bricks and cells."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.reliability.fuzz.broken import broken_bytes
 from tests.reliability.fuzz.targets import Target
 
 HEADER = struct.Struct("<III")
-"""Lanes, bytes of the tables, words."""
+"""Header of a section: numbers of lanes, of bytes of the tables, and of words."""
 
 
 def _bricks(cells: np.ndarray) -> Bricks:
@@ -29,7 +29,7 @@ def _bricks(cells: np.ndarray) -> Bricks:
 
 
 def broken_section(data: bytes, random: np.random.Generator) -> bytes:
-    """A section with another header, with tables that are broken before they are packed, or just broken."""
+    """Return a section with another header, with tables broken before packing, or with broken bytes."""
     change = random.random()
     if len(data) < HEADER.size or change < 0.3:
         return broken_bytes(data, random)
@@ -48,7 +48,7 @@ def broken_section(data: bytes, random: np.random.Generator) -> bytes:
 
 
 def _by_both(read: Callable[[], np.ndarray]) -> None:
-    """Decode in compiled code and in numpy, which must say the same."""
+    """Decode with compiled code and with numpy, which must give the same result."""
     found: list[object] = []
     for compiled in (True, False) if available() else (False,):
         with patch.object(coder, "_twin", coder._twin if compiled else lambda: arrays):
@@ -63,7 +63,7 @@ def _by_both(read: Callable[[], np.ndarray]) -> None:
 
 
 def section_targets() -> list[Target]:
-    """Symbols and structures of a ball on two levels."""
+    """Return targets that break the symbols and structures of a ball on two levels."""
     cells = np.argwhere(np.ones((20, 20, 20)))
     away = np.linalg.norm((cells + 0.5) / 10 - 1, axis=1)
     fine, coarse = cells[(away < 0.8) & (cells[:, 0] < 8)], np.argwhere(np.ones((10, 10, 10)))
@@ -84,7 +84,7 @@ def section_targets() -> list[Target]:
         data = structures[level]
         if random.random() < 0.3:
             data = broken_bytes(data, random)
-        else:  # one of its sections, whose length agrees
+        else:  # one of its sections, with its length
             parts, at = [], 0
             while at < len(data):
                 (length,) = struct.unpack_from("<I", data, at)

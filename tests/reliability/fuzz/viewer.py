@@ -1,10 +1,10 @@
-"""Broken messages to the viewer over real WebSockets: it goes on to serve, in bounded memory.
+"""Send broken messages to the viewer over real WebSockets: it has to go on serving, in bounded memory.
 
     python -m tests.reliability.fuzz.viewer --inputs 100000 --seed 0
 
-Message i of a seed is always the same one, but for the names of controls, which the server draws. N_CLIENTS
-send them side by side; after every batch a client of good manners wants a picture. Traces of errors on the
-terminal, and files opened under a name that a message has, are failures.
+Message i of a seed is always the same, except for the names of controls, which the server draws. N_CLIENTS
+clients send messages side by side; after every batch a client that behaves asks for a picture. It is a
+failure if errors appear on the terminal, or if a file is opened under a name from a message.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from tests.reliability.fuzz.broken import broken_bytes
 N_CLIENTS = 6
 BATCH = 3000
 ROOM_MB = 700.0
-"""What the server may hold more than after the first batch: a whole picture of 3840 x 2160 takes half."""
+"""MB by which the server may grow after the first batch; a picture of 3840 x 2160 takes half of it."""
 MARK = "vfr-fuzz-name"
-"""Part of every file name in a message."""
+"""Part of every file name in the messages."""
 
 WATCH = f"""
 import sys
@@ -69,12 +69,12 @@ PROPERTIES = ("value", "update_cb", "removed", "sync_cb", "props", "gui_api", "i
 
 
 def odd(draw: random.Random) -> Any:
-    """A value that a field may not expect."""
+    """Return a value that a field may not expect."""
     return draw.choice(NUMBERS if draw.random() < 0.6 else OTHERS)
 
 
 def message(draw: random.Random, controls: list[str]) -> bytes | str:
-    """One message: a camera or a control, broken in values or structure, or anything at all."""
+    """Return a message: a camera or a control with broken values or structure, or any other data."""
     kind = draw.random()
     if kind < 0.35:
         camera = json.loads(json.dumps(CAMERA))
@@ -115,7 +115,7 @@ def _restructured(draw: random.Random, sent: dict[str, Any]) -> Any:
 
 
 async def attack(server: Server, numbers: list[int], seed: int, counts: Counter[str]) -> None:
-    """Send these messages of the seed, on new connections where the server drops one."""
+    """Send these messages of the seed, on a new connection whenever the server drops one."""
     left = list(numbers)
     while left:
         try:
@@ -127,7 +127,7 @@ async def attack(server: Server, numbers: list[int], seed: int, counts: Counter[
                 await _talk(client, left, seed, counts)
         except ConnectionClosed:
             counts["dropped"] += 1
-        except (InvalidHandshake, OSError):  # no room yet: the server has not noticed who is gone
+        except (InvalidHandshake, OSError):  # no room until the server notices who is gone
             await asyncio.sleep(0.2)
 
 
@@ -162,7 +162,7 @@ async def _talk(client: ClientConnection, left: list[int], seed: int, counts: Co
 
 
 def fuzz(n_inputs: int, seed: int) -> dict[str, Any]:
-    """Send `n_inputs` messages, in batches; what became of the server."""
+    """Send `n_inputs` messages in batches, and return what became of the server."""
     begin = time.monotonic()
     counts: Counter[str] = Counter()
     failures: list[str] = []

@@ -1,9 +1,9 @@
-"""The process that is given the inputs: it may crash, and what it was at is known.
+"""Process that reads the inputs. It may crash; its state then shows at which input.
 
     python -m tests.reliability.fuzz.worker WORK SEED FIRST STEP N NAMES...
 
-Reads the inputs FIRST, FIRST + STEP, ... below N. Writes to WORK/state where it is, and what became of the
-inputs before, and a line of JSON to stdout for each failure.
+Reads the inputs FIRST, FIRST + STEP, ... below N. Writes to WORK/state which input it is at and what became
+of the earlier ones, and a line of JSON to stdout for each failure.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ from tests.reliability.fuzz.targets import Target, written
 LIMIT_SECONDS = 20.0
 ROOM = 3 << 30
 N_FIRST = 12
-"""Inputs that each reader is given before anybody watches."""
+"""Number of inputs that each reader gets before the watch begins."""
 MARK = "/vfr-fuzz-input/"
-"""What is opened, and not there, before and behind each input: a trace of the system calls shows it."""
+"""Path of no file that is opened before and after each input, to mark the input in a trace of calls."""
 INDEX, SLOWEST_US, COUNTS = 0, 1, 2
-"""Places in the state: the input, microseconds of the slowest, then for each target refused and read."""
+"""Places in the state: the current input, microseconds of the slowest one, then the numbers of refused and of
+read inputs for each target."""
 
 
 class SlowError(BaseException):
-    """An input took longer than LIMIT_SECONDS; not an Exception, so that no reader swallows it."""
+    """Raised if an input takes longer than LIMIT_SECONDS; not an Exception, so that no reader catches it."""
 
 
 class Watch:
-    """What is opened and started by Python while a reader works."""
+    """Notes the files that Python opens and the programs that it starts while a reader works."""
 
     def __init__(self, inside: Path) -> None:
         self.wrong: list[str] = []
@@ -75,14 +76,14 @@ SYSTEM = ("/lib", "/usr/lib", "/etc/ld.so", "/etc/localtime", "/sys/", "/proc/se
 
 
 def allowed(name: str, inside: str) -> bool:
-    """Whether a reader may open a file of this name: what is installed, what the system has, the work
-    folder."""
+    """Return whether a reader may open a file of this name: one of an installed package, of the system, or in
+    the work folder."""
     name = re.sub(r"^/proc/\d+/", "/proc/self/", name)
     return not name.startswith("/") or name.startswith((inside, *INSTALLED, *SYSTEM))
 
 
 def targets(work: Path) -> list[Target]:
-    """All of them, with their files in `work`."""
+    """Return all targets, with their files in `work`."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     mesh = TriangleMesh(
         corners, np.array([[0, 1, 2]], np.int32), np.eye(3, dtype=np.float32), np.full((3, 4), 255, np.uint8)
@@ -102,7 +103,7 @@ def targets(work: Path) -> list[Target]:
 
 
 def outcome(target: Target) -> str:
-    """ "refused" by a VfrError of one line that names each place once, "read", or what went wrong."""
+    """Return "refused" for a VfrError of one line that names each place once, "read", or what is wrong."""
     signal.setitimer(signal.ITIMER_REAL, LIMIT_SECONDS)
     try:
         target.read()
@@ -121,7 +122,7 @@ def outcome(target: Target) -> str:
 
 
 def said_twice(message: str) -> bool:
-    """Whether a file or a field is named twice in *where: what: expected, got*.
+    """Return whether a file or a field is named twice in a message *where: what: expected, got*.
 
     >>> said_twice("out/head.onnx: expected a graph, got: head.onnx: expected a message")
     True
@@ -148,7 +149,7 @@ def _mark(text: str) -> None:
 
 
 def main(work: Path, seed: int, first: int, step: int, n_inputs: int, names: list[str]) -> None:
-    """Read them all."""
+    """Read all inputs of this worker."""
     chosen = [target for target in targets(work) if not names or target.name in names]
     written(work / "targets.part", json.dumps([target.name for target in chosen]).encode()).replace(
         work / "targets.json"
@@ -156,7 +157,7 @@ def main(work: Path, seed: int, first: int, step: int, n_inputs: int, names: lis
     state = np.memmap(work / "state", np.int64, "r+")
     watch = Watch(work)
     signal.signal(signal.SIGALRM, _too_slow)
-    for target in chosen:  # what is imported or compiled when first used is so now
+    for target in chosen:  # imports and compiles what is needed at first use
         for index in range(N_FIRST):
             target.prepare(np.random.default_rng([index]))
             outcome(target)

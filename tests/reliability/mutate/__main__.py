@@ -1,12 +1,13 @@
-"""How many small mistakes the tests find: one is made at a time, in a copy, and its folder's tests run.
+"""Count how many small mistakes the tests find: one at a time is made in a copy, and its folder's tests are
+run.
 
     nice python -m tests.reliability.mutate --count 60 --seed 0 --results mutations.json
 
 Sites are drawn uniformly (`tests.reliability.mutate.sites`); equal seeds draw equal sites of equal code. A
-mutation is killed when a test fails or never ends; the tests of the file itself come first, then those that
-import it, then whatever reaches it. Mutations that change nothing that could be told from outside are listed
-with the reason in `equivalent.json`, and others are drawn in their place. What the results hold already is
-not run again.
+mutation is killed if a test fails or never ends. The tests of the file itself run first, then those that
+import it, then all others that reach it. Mutations whose effect nobody could see from outside are listed with
+the reason in `equivalent.json`, and others are drawn in their place. Mutations that are in the results
+already are not run again.
 """
 
 from __future__ import annotations
@@ -37,24 +38,24 @@ from tests.reliability.mutate.sites import Site, sites_of
 REPOSITORY = Path(__file__).resolve().parents[3]
 PACKAGES = ("player", "exporters", "vfr_bake", "tests")
 FOLDERS = ("player", "vfr_bake/baking", "exporters", "vfr_bake/kernels")
-"""Whose sites are drawn; each meets the tests of its package, and those that concern every package."""
+"""Folders whose sites are drawn; each is tested by its package's tests, and by those for every package."""
 TESTS = {"player": "tests/player", "vfr_bake": "tests/vfr_bake", "exporters": "tests/exporters"}
 EVERYWHERE = ("tests/numerics", "tests/reliability")
 LAST = ("test_viewer", "test_other_programs", "test_reliability", "test_cluster")
-"""Long tests, which start browsers and other programs, and so reach what they do not import."""
+"""Long tests that start browsers and other programs, and so reach files that they do not import."""
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
 BATCHES = (2, 5)
-"""So many of the files of tests are run before others are collected, which takes longer than these do."""
+"""Numbers of test files that are run first, because collecting the others takes longer than these take."""
 IMPORTED = ("torch", "scipy.special", "onnx", "onnxruntime", "PIL.Image", "trimesh", "mpmath")
-"""What many tests import: once here, and not in the process of every mutation, which is forked."""
+"""Packages that many tests import, imported once here; the process of a mutation is a fork of this one."""
 BROKEN = 99
 """Exit code of a child in which pytest itself did not run."""
 STALLED_SECONDS = 200.0
-"""A test that takes longer has no end: the mistake was found."""
+"""Seconds after which a test counts as endless, so that the mistake counts as found."""
 
 
 class Imports:
-    """Which files of the repository import which, functions' own imports included."""
+    """Which files of the repository import which, including imports inside functions."""
 
     def __init__(self, root: Path) -> None:
         paths = [
@@ -77,7 +78,7 @@ class Imports:
         return [*found, *({fixtures} & self.files - {file})]
 
     def distances(self, file: str) -> dict[str, int]:
-        """How far every file that reaches `file` by its imports is from it; 0 is the file itself."""
+        """Return the number of imports between `file` and each file that reaches it; 0 for `file` itself."""
         found = {file: 0}
         edge = {file}
         while edge:
@@ -89,7 +90,7 @@ class Imports:
 
 
 def files_of_tests(imports: Imports, file: str) -> list[str]:
-    """The tests that a mutation of `file` meets, the likeliest to fail first; its own examples lead."""
+    """Return the tests for a mutation of `file`, the likeliest to fail first; its own examples lead."""
     distances = imports.distances(file)
     folders = (TESTS[file.split("/")[0]], *EVERYWHERE)
     reaching = [
@@ -129,7 +130,7 @@ class Copy:
         self.imports = Imports(self.root)
 
     def run(self, site: Site, limit: float) -> dict[str, Any]:
-        """What became of the tests with the change."""
+        """Run the tests with the change, and return the outcome."""
         path = self.root / site.path
         whole, stat = path.read_bytes(), path.stat()
         stale = {Path(file).stem for file in self.imports.distances(site.path)}
@@ -153,7 +154,7 @@ class Copy:
         return {"name": site.name, "line": site.line, **outcome}
 
     def failing(self, reasons: set[str]) -> list[str]:
-        """Which of the tests that killed something fail without any change."""
+        """Return which of the tests that killed a mutation also fail without a change."""
         wrong = []
         with tempfile.TemporaryDirectory(dir=self._kept.parent, ignore_cleanup_errors=True) as folder:
             for reason in sorted(reasons):
@@ -165,7 +166,7 @@ class Copy:
         return wrong
 
     def _keep(self, compiled: Path, stale: set[str]) -> None:
-        """What numba compiled of files that the change does not reach holds for the next one."""
+        """Keep for the next run what numba compiled of files that the change does not reach."""
         for path in compiled.rglob("*.nb?"):
             target = self._kept / path.relative_to(compiled)
             if path.name.split(".")[0] not in stale and not target.exists():
@@ -175,7 +176,7 @@ class Copy:
                 path.replace(target)
 
     def _outcome(self, tests: list[str], compiled: Path, folder: Path, limit: float) -> dict[str, Any]:
-        """Run the likeliest tests, then the others, and say what came of them."""
+        """Run the likeliest tests, then the others, and return the outcome."""
         begin = time.monotonic()
         end, by = begin + limit, None
         for first, last in itertools.pairwise((0, *BATCHES, len(tests))):
@@ -187,7 +188,7 @@ class Copy:
         return {"killed": by is not None, "by": by, "left": left, "seconds": seconds}
 
     def _pytest(self, tests: list[str], compiled: Path, folder: Path, end: float) -> str | None:
-        """What failed; None if nothing did before `end`."""
+        """Return what failed; None if nothing failed before `end`."""
         said = folder / "said.txt"
         arguments = ["-x", "-q", "--tb=line", "-p", "no:cacheprovider", "--basetemp", str(folder / "pytest")]
         child = os.fork()
@@ -220,7 +221,7 @@ class Copy:
         return (failed or ["a crash"])[0] if code else None
 
     def _begin_child(self, said: Path, compiled: Path) -> None:
-        """Make this process one that was started in the copy: nothing of the repository is imported yet."""
+        """Make this process like one started in the copy, with nothing of the repository imported yet."""
         os.setsid()
         os.chdir(self.root)
         output = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
@@ -239,7 +240,7 @@ class Copy:
 
 
 def drawn_sites(seed: int) -> list[Site]:
-    """All sites in the order in which they are drawn: changes of one place count as one site."""
+    """Return all sites in the order in which they are drawn. All changes of one place count as one site."""
     places: dict[tuple[str, int, int], Site] = {}
     for folder in FOLDERS:
         for path in sorted((REPOSITORY / folder).rglob("*.py")):
@@ -252,7 +253,7 @@ def drawn_sites(seed: int) -> list[Site]:
 
 
 def is_compiled(site: Site) -> bool:
-    """Whether numba compiles the file anew: those take longest, and are run last."""
+    """Return whether numba compiles the file anew. Such sites take longest, and are run last."""
     text = (REPOSITORY / site.path).read_text(encoding="utf-8")
     return any(
         word in text for word in ("import njit", "player.compiling", "player.compiled.lanes", "llvmlite")

@@ -1,8 +1,8 @@
-"""Places of a source file where a small change should make a test fail, and the change itself.
+"""Places in a source file where a small change should make a test fail, and the change itself.
 
 A site is an operator, a comparison, a number, the border of a slice or a range, a choice between `min` and
-`max`, or what a function returns. Text is none: docstrings, annotations, messages of errors, f-strings,
-decorators, `__all__`; nor are settings that change speed alone.
+`max`, or the value that a function returns. Text is no site: docstrings, annotations, error messages,
+f-strings, decorators, `__all__`. Neither are settings that only change speed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SWAPS = {
     "ceil": "floor", "any": "all", "all": "any", "argmin": "argmax", "argmax": "argmin",
 }  # fmt: skip
 SPEED = {"strict", "cache", "nogil", "parallel", "daemon", "copy", "stacklevel", "chunksize"}
-"""Keyword arguments that change no result."""
+"""Keyword arguments that do not change results."""
 TEXT_CALLS = {"progress", "print", "add_argument", "warn"}
 """Calls whose arguments are shown to people."""
 
@@ -38,33 +38,33 @@ class Site:
 
     path: str
     scope: str
-    """The function or class around it, `<module>` outside of all."""
+    """The function or class around the change; `<module>` outside all of them."""
     line: int
     start: int
     end: int
-    """Bytes of the source that are replaced."""
+    """Start and end of the bytes of the source that are replaced."""
     old: str
     new: str
     number: int
-    """Which one it is among equal changes in the same scope, from 0."""
+    """Number of this site among equal changes in the same scope, from 0."""
 
     @property
     def name(self) -> str:
-        """What the change is called in results; it does not hang on line numbers."""
+        """Return the name of the change in the results. It does not depend on line numbers."""
         again = f" #{self.number}" if self.number else ""
         return f"{self.path}: {self.scope}: {self.old} -> {self.new}{again}"
 
     def rank(self, seed: int) -> str:
-        """Sites in the order of their ranks are drawn at random; others' changes move none."""
+        """Return a random rank by which sites are drawn; changes of other sites do not move it."""
         return hashlib.sha256(f"{seed} {self.name}".encode()).hexdigest()
 
     def applied(self, source: bytes) -> bytes:
-        """The source with the change."""
+        """Return the source with the change."""
         return source[: self.start] + self.new.encode() + source[self.end :]
 
 
 def sites_of(path: str, source: bytes) -> list[Site]:
-    """All sites of a file, in its order."""
+    """Return all sites of a file, in its order."""
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -81,7 +81,7 @@ def sites_of(path: str, source: bytes) -> list[Site]:
 
 
 def _changes(tree: ast.AST, scope: str = "<module>") -> Iterator[tuple[str, ast.expr | ast.stmt, str]]:
-    """(scope, node, what stands in its place) of every change below `tree`."""
+    """Yield (scope, node, replacement) for every change below `tree`."""
     for node in _below(tree):
         inner = scope
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -92,7 +92,7 @@ def _changes(tree: ast.AST, scope: str = "<module>") -> Iterator[tuple[str, ast.
 
 
 def _below(node: ast.AST) -> Iterator[ast.AST]:
-    """Children that are no text."""
+    """Yield the children that are not text."""
     skipped: list[ast.AST | None] = []
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         skipped += [*node.decorator_list, node.returns]
@@ -118,7 +118,7 @@ def _is_for_types_or_main(test: ast.expr) -> bool:
 
 
 def _is_text_name(target: ast.expr) -> bool:
-    """`__all__`, and aliases of types such as `Bounds = tuple[...]`."""
+    """Return whether a target is `__all__` or an alias of a type, such as `Bounds = tuple[...]`."""
     return isinstance(target, ast.Name) and (
         target.id == "__all__" or (target.id[0].isupper() and not target.id.isupper())
     )
@@ -133,7 +133,7 @@ def _is_text_call(node: ast.AST) -> bool:
 
 
 def _of_node(node: ast.expr | ast.stmt) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
-    """The changes of one node: what is replaced, and by what."""
+    """Yield the changes of one node: what is replaced, and its replacement."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
         for op in COMPARISONS.get(type(node.ops[0]), ()):
             yield node, _text(ast.Compare(node.left, [op()], node.comparators))

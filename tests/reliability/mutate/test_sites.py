@@ -1,4 +1,4 @@
-"""Which small changes `mutate` may make: of what is computed, and never of text."""
+"""The small changes that `mutate` makes: in what is computed, and never in text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small trained scene, which the tests of the bake share."""
+"""Small trained model that the tests of the bake share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
 
 
-@pytest.fixture(scope="session")  # files of other folders may be run between two of this one
+@pytest.fixture(scope="session")  # files of other folders may run between two of this one
 def model() -> Model:
     scene = demo.demo_scene(size=64, n_train=24, n_test=2)
     field = FieldOptions(n_levels=8, max_resolution=96, log2_table_size=15, head_width=32, density_width=16)

@@ -1,7 +1,7 @@
-"""Three scenes in closed form that ask for different bakes: a matte ball, a glossy one, and fog with wires.
+"""Three scenes in closed form that ask for different bakes: a matte ball, a glossy ball, and fog with wires.
 
-Letters: `o` [3] and `d` [n, 3] rays in the scene's own frame, t distances along them; the frame is that of
-the built-in scene, so that its cameras fit.
+Letters: `o` [3] and `d` [n, 3] are rays in the scene's own frame, and t distances along them. The frame is
+that of the built-in scene, so that its cameras fit.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from vfr_bake.training.trainer import Trainer
 BALL = np.array([0.0, 0.0, -0.35])
 RADIUS = 0.6
 FOG = 1.3
-"""Optical depth of a unit of way."""
+"""Optical depth of the fog for each unit of length."""
 WIRE = 0.03
 WIRES = ((-0.25, 0), (0.0, 1), (0.25, 0))
-"""Where a wire crosses the ball's middle, and the axis that it follows."""
+"""For each wire, where it crosses the ball's middle, and the axis that it follows."""
 
 
 def chord(o: np.ndarray, d: np.ndarray, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """t at which rays enter and leave a ball; equal where they miss it."""
+    """Return the t at which rays enter and leave a ball; both are equal for rays that miss it."""
     middle = -((o - centre) * d).sum(axis=-1)
     apart = ((o - centre + middle[:, None] * d) ** 2).sum(axis=-1)
     half = np.sqrt(np.maximum(radius**2 - apart, 0))
@@ -35,7 +35,7 @@ def chord(o: np.ndarray, d: np.ndarray, centre: np.ndarray, radius: float) -> tu
 
 
 def ball(o: np.ndarray, d: np.ndarray, glossy: bool) -> np.ndarray:
-    """Premultiplied colour and opacity [n, 4]."""
+    """Return the premultiplied colour and opacity [n, 4] of a ball."""
     near, far = chord(o, d, BALL, RADIUS)
     n = (o + near[:, None] * d - BALL) / RADIUS
     if glossy:
@@ -47,7 +47,7 @@ def ball(o: np.ndarray, d: np.ndarray, glossy: bool) -> np.ndarray:
 
 
 def fog_and_wires(o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """The same of a ball of even fog with dark wires in it."""
+    """Return the premultiplied colour and opacity [n, 4] of a ball of even fog with dark wires in it."""
     near, far = chord(o, d, BALL, RADIUS)
     end, is_wire = far.copy(), np.zeros(len(d), bool)
     for place, axis in WIRES:
@@ -65,7 +65,7 @@ def fog_and_wires(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def picture(kind: str, camera: Camera) -> np.ndarray:
-    """[height, width, 4] uint8, straight alpha; four rays a pixel."""
+    """Return a picture [height, width, 4] uint8 with straight alpha, from four rays a pixel."""
     total = np.zeros((camera.height * camera.width, 4))
     for dx, dy in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
         shifted = Camera(
@@ -80,7 +80,7 @@ def picture(kind: str, camera: Camera) -> np.ndarray:
 
 
 def analytic_scene(kind: str, size: int, n_train: int) -> Scene:
-    """One of "matte", "glossy" and "fog", in the model frame."""
+    """Return the scene "matte", "glossy" or "fog" in the model frame."""
 
     def views(cameras: list[Camera]) -> PosedImages:
         return PosedImages(cameras, [picture(kind, camera) for camera in cameras])
@@ -90,7 +90,7 @@ def analytic_scene(kind: str, size: int, n_train: int) -> Scene:
 
 
 def trained(scene: Scene, config: TrainConfig) -> Model:
-    """What `vfr-train` would have written, without a file in between."""
+    """Return the model that `vfr-train` would write, without a file in between."""
     trainer = Trainer(scene, config)
     trainer.field.head.products = torch.float32  # the same model on any machine
     for _ in trainer.run():

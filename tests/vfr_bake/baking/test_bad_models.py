@@ -1,4 +1,4 @@
-"""Models that cannot be baked well: a clear error that leaves nothing, or a measured fallback."""
+"""Models that cannot be baked well: a clear error that leaves no files, or a measured fallback."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vfr_bake.training.trainer import Trainer
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
@@ -69,8 +69,8 @@ def test_a_grid_becomes_coarser_where_the_bytes_do_not_hold_it(
 
 
 def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
-    """All cameras within a thousandth of the box, looking where they looked: the grid is as fine as it may
-    be, and what they see from there is what is stored."""
+    """If all cameras are within a thousandth of the box, looking as before, the grid is as fine as it may be,
+    and what these cameras see is stored."""
     middle = demo.CENTRE + demo.SCALE * np.array([0.0, 0.0, 0.3])  # above the ball, with the plate in view
     cameras = []
     for camera in model.cameras:

@@ -1,4 +1,4 @@
-"""The bake piece by piece, and whole on a small trained scene."""
+"""The bake, in pieces, and as a whole on a small trained scene."""
 
 from __future__ import annotations
 
@@ -69,19 +69,19 @@ FINE: dict[str, Any] = {
 
 
 def quiet(stage: str, done: int, of: int) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 @pytest.fixture(scope="module")
 def fine(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BakeResult]:
-    """The asset of FINE, and what was told of it."""
+    """The asset that is baked with FINE, and the result of its bake."""
     folder = tmp_path_factory.mktemp("fine") / "asset"
     return folder, bake(model, folder, BakeConfig(**FINE), quiet)
 
 
 @pytest.fixture(scope="module")
 def default_sizes(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An asset whose grids are as fine as the preset has them."""
+    """An asset whose grids are as fine as its preset makes them."""
     folder = tmp_path_factory.mktemp("default") / "asset"
     bake(model, folder, BakeConfig(mesh_resolution=96, refine_steps=0, check_views=1), quiet)
     return folder
@@ -147,7 +147,7 @@ def test_every_corner_of_a_visible_cell_is_stored() -> None:
 
 
 def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, fine: tuple[Path, BakeResult]) -> None:
-    # Cells a third of a pixel wide: one ray a pixel would miss most of them.
+    # A cell is a third of a pixel wide, so that one ray a pixel would miss most cells.
     camera, in_model = model.cameras[3], model.model_cameras()[3]
     large = camera.resized(256, 256)
     played = render(Asset.open(fine[0]), large, n_fetches=0)
@@ -173,8 +173,7 @@ def test_folded_head_equals_the_head() -> None:
 
 
 class OneFetchEach(TrainingRays):
-    """Rays of one fetch each, with the weight 1: the first vertices of a grid of 16 cells, one after the
-    other."""
+    """Rays of one fetch each, with weight 1: the first vertices of a grid of 16 cells, in their order."""
 
     def fetches(self, some: np.ndarray) -> Fetches:
         n = len(self)
@@ -191,7 +190,7 @@ def training_rays_of(dirs: np.ndarray, wanted: np.ndarray) -> TrainingRays:
 
 
 def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vfr_bake.baking.refinement.HEAD_BATCH", BATCH)  # to meet the same rays
+    monkeypatch.setattr("vfr_bake.baking.refinement.HEAD_BATCH", BATCH)  # to have the same rays
     torch.manual_seed(0)
     head = Head(FieldConfig(n_levels=6, head_width=24))
     weights = fold_head(head, head.first_weights() * 0.02)
@@ -199,7 +198,7 @@ def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.Monk
     dirs = torch.nn.functional.normalize(torch.randn(4000, 3), dim=-1)
     with torch.no_grad():
         wanted = FoldedHead(weights)(codes, dirs).numpy()
-    # What the bake might do to the features: a bias and a loss of contrast that the head can undo.
+    # Damage of a kind that a bake may do to features, and that the head can undo: a bias and less contrast.
     baked = latent((codes * 0.8 + 10).numpy().round())
     training_rays = training_rays_of(dirs.numpy(), wanted)
     stored = Stored(weights, baked, np.full(4000, 255, np.float32))
@@ -254,7 +253,7 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     work = _Bake(model, config, quiet)
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
-    # What a few steps of training leave decides whether 8 bits lose anything at all: here they always do.
+    # Whether 8 bits lose anything depends on the few steps of training, so a loss is set here.
     monkeypatch.setattr(work.held_out, "lost", lambda before, after: Loss(0.2, 0.0))
     monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)
     monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", -np.inf)  # 8 bits are tried
@@ -301,7 +300,7 @@ def test_a_round_takes_fewer_steps_where_there_is_no_time(monkeypatch: pytest.Mo
     taken = []
     for step in steps:
         taken.append(steps.falling(step))
-        now += 0.25 if step < N_WARM - 1 else 2**-9  # something may be compiled in the first ones
+        now += 0.25 if step < N_WARM - 1 else 2**-9  # the first steps may compile something
     assert N_WARM + N_TIMED < len(taken) == steps.n == 256 and told[-1] == (256, 256)
     assert taken[0] == 1 and taken[-1] < 0.01 and (np.diff(taken) < 0).all(), "it falls to 0 all the same"
     assert len(list(Steps(100, lambda *_: None))) == 100
@@ -320,15 +319,13 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, n_fetche
     found = player_fetches(grid, rays_o, rays_d, n_fetches)
     assert np.array_equal(found.hits, played.hits) and len(found.hits) > 100
     np.testing.assert_allclose(found.opacity, played.opacity[found.hits], rtol=1e-6)  # compiled, and in numpy
-    merged = (
-        found.lengths == 0
-    )  # several samples, of which there is none in a ray that has no more than are fetched
+    merged = found.lengths == 0  # for several samples; a ray with at most n_fetches samples has none
     assert (found.lengths[~merged] == grid.step).all() and merged.any() == (n_fetches > 0)
     nothing = np.zeros_like(rays_o)
     teacher = TeacherRays(rays_o, rays_d, nothing, nothing[:, 0])
     training_rays = collect_training_rays(teacher, grid, n_fetches)
     composed, opacity = training_rays.composed(latent(grid.features))
-    # float32 sums of up to 127 in another order
+    # float32 sums of up to 127, in another order
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=1e-3)
     assert np.array_equal(opacity, found.opacity)
 
@@ -372,7 +369,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
     names.remove("files")
     assert names == ["grid", "rank", "codes", "small head", *refined][: len(names)] and len(names) >= 7
     for name, size in said["bytes"].items():
-        if name != "manifest.json":  # it lists the reports, which are written after it was counted
+        if name != "manifest.json":  # lists the reports, which are written after it is counted
             assert (tmp_path / "asset" / name).stat().st_size == size
     assert sum(said["bytes"].values()) <= result.n_bytes
     assert said["asked"]["n_channels"] == PRESETS["fast"].n_channels and "channels" in said["left_out"]
@@ -431,7 +428,7 @@ def test_views_between_lie_between(model: Model) -> None:
 
 
 def test_views_between_come_near_to_what_lies_halfway_on_a_walk(model: Model) -> None:
-    # As held-out views of a capture do: every eighth view of a walk around something.
+    # As held-out views of a capture, which are every eighth view of a walk around something.
     walk = replace(model, cameras=orbit(model.cameras, 36))
     halfway = [
         camera.c2w[:3, 3] for camera in replace(walk, cameras=orbit(model.cameras, 72)).model_cameras()

@@ -1,4 +1,4 @@
-"""Time and memory: what a bake is told to keep to, and what it says beforehand."""
+"""Time and memory: limits that a bake keeps to, and what it expects beforehand."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def _compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is expected does not depend on what ran before the tests."""
+    """Take compiled code as present, so that the expected time does not depend on earlier runs."""
     monkeypatch.setattr("vfr_bake.baking.plan.is_compiled", lambda: True)
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def took(width: int, k: int) -> float:
-    """A machine that needs 1 ms for each unit of the head's width and 10 for each lookup."""
+    """Return the ms of a machine that takes 1 ms for each unit of head width, and 10 ms a lookup."""
     return (width or 256) + 10 * (k or 40)
 
 
@@ -98,7 +98,7 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
 ) -> None:
     with pytest.raises(TrainingError, match=r"800 x 800 in at most 0\.001 ms, got"):
         bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), quiet)
-    # The files are measured again: what takes longer than it did before refinement is refused as well.
+    # The files are measured again, so that what takes longer than before refinement is refused as well.
     times = iter([1.0, 1.0, 9.0])
     monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda *_: next(times))
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
@@ -120,7 +120,7 @@ def test_less_memory_means_fewer_rays(model: Model) -> None:
     plans = [make_plan(model, BakeConfig(resolution=48, max_memory=size)) for size in sizes]
     rays = [plan.n_rays(n_cells) for plan in plans]
     assert rays[0] < rays[1] < rays[2] == N_RAYS
-    assert plans[1].n_rays(1.2 * n_cells) < rays[1]  # the more cells, the less room
+    assert plans[1].n_rays(1.2 * n_cells) < rays[1]  # more cells leave less room for rays
     assert all(plan.n_bytes <= size * 1e9 for plan, size in zip(plans, sizes, strict=True))
 
 
@@ -148,7 +148,7 @@ def test_few_steps_are_given_no_more_rays_than_they_draw(model: Model) -> None:
 def test_what_was_refined_is_gone_when_the_mesh_is_made(
     model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Lego's would take a gigabyte of the four while the asset is played and meshed."""
+    """What was refined is freed before the mesh is made: for lego it would take a gigabyte of the four."""
     alive = []
 
     def held() -> list[str]:
@@ -169,7 +169,8 @@ def test_what_was_refined_is_gone_when_the_mesh_is_made(
 def test_a_grid_that_memory_limits_is_not_refused(
     preset: Preset, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The limit is one of the features' grid, whose resolution is rounded from that of the densities."""
+    """A grid limited by memory is not refused. Memory limits the features' grid, whose resolution is rounded
+    from that of the densities."""
     monkeypatch.setattr("vfr_bake.baking.plan.FEWEST_RAYS", 1)
     wanted = make_plan(model, BakeConfig(preset=preset)).resolutions
     for n_cells in np.linspace(10, wanted.features - 1, 80):
@@ -188,7 +189,7 @@ def test_a_mesh_that_takes_too_much_memory_is_left_out(model: Model, tmp_path: P
 
 
 def test_without_refinement_the_head_stays_the_models_own() -> None:
-    """A smaller one would not have learned anything."""
+    """Without refinement the model's own head is kept, as a smaller one would not have learned anything."""
     assert BakeConfig(refine_steps=0).choice().head_width == 0
     with pytest.raises(ConfigError, match="head_width: expected 0 with --refine-steps 0"):
         BakeConfig(refine_steps=0, head_width=32)
@@ -198,9 +199,9 @@ def test_without_refinement_the_head_stays_the_models_own() -> None:
 def test_the_expected_time_follows_from_that_of_the_models_own_rays(
     steps: int, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a clock of the test's own, which moves on while the teacher answers. The first answer, which may
-    wait for a compiler, does not count; what follows is in proportion, up to the preset's minutes. The rays
-    that are timed are not those that were read into the cache before."""
+    """The expected time is in proportion to the time of the teacher's second answer, by a clock that moves
+    only while it answers. The first answer does not count, because it may wait for a compiler. The rays that
+    are timed are not those that were read into the cache before."""
 
     def expected(*answers: float) -> float:
         left, now = list(answers), 0.0
@@ -229,7 +230,7 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
 def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the same clock: 1 second for each of the teacher's rays."""
+    """More vertices are expected to take longer to choose from, by a clock of 1 second a teacher's ray."""
     now = 0.0
 
     def answer(model: Model, views: object, n_rays: int, *_: object) -> SimpleNamespace:
@@ -274,7 +275,7 @@ def test_more_work_is_expected_to_take_longer(model: Model) -> None:
         config = BakeConfig(**(SMALL | settings))
         return expected_seconds(model, config, make_plan(model, config))
 
-    # Ten times the least difference in work: what the machine's noise does to a rate is far less.
+    # This is ten times the least difference in work; noise of the machine changes a rate by far less.
     assert seconds(refine_steps=1_000_000) > 10 * seconds()
 
 
@@ -295,7 +296,7 @@ def test_the_mesh_is_at_most_a_tenth_of_the_asset(
 
 
 def test_a_grid_is_as_coarse_as_a_page_of_it_has_to_be(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Roughly: shells have more bricks for their cells than the fog of a capture."""
+    """A grid is about as coarse as its page has to be; shells have more bricks for cells than fog has."""
 
     def page_mb_of(allowed: float) -> float:
         monkeypatch.setitem(PRESETS, "balanced", replace(PRESETS["balanced"], page_mb=allowed))

@@ -1,4 +1,4 @@
-"""What a scene does not need is left out: three scenes that need different things."""
+"""What a scene does not need is left out, for three scenes that need different things."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_MB = 1.0
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def trained_scene(kind: str) -> Model:
@@ -45,7 +45,7 @@ def models() -> dict[str, Model]:
 
 @pytest.fixture(scope="module")
 def chosen(models: dict[str, Model], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
-    """Report and manifest of each scene's bake."""
+    """The report and manifest of each scene's bake."""
     found = {}
     for kind, model in models.items():
         folder = tmp_path_factory.mktemp(kind) / "asset"
@@ -71,7 +71,8 @@ def test_fog_takes_more_lookups_than_a_surface(chosen: dict[str, dict]) -> None:
 def test_lookups_are_enough_for_pixels_not_to_stand_out(
     n_specks: int, k: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """20,000 pixels, of which n_specks are far off with fewer than 8 lookups; the mean sees none of them."""
+    """Lookups are enough for no pixel to stand out: of 20,000 pixels, n_specks are far off with fewer than 8
+    lookups, while the mean error shows none of them."""
 
     class Seen:
         def look(self, name: str, grid: Any, head: Any, n_fetches: int) -> Any:
@@ -102,7 +103,7 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
 def test_longer_steps_keep_to_the_loss_that_was_asked_for(
     max_loss_db: float | None, steps: tuple[int, ...]
 ) -> None:
-    """Steps of 2 lose 0.01 dB more than the 0.48 that are lost anyway, those of 4 lose 0.03."""
+    """Steps are as long as the loss allows: 0.48 dB are lost anyway, 0.01 more by steps of 2, 0.03 by 4."""
 
     @dataclass
     class Grid:
@@ -122,7 +123,7 @@ def test_longer_steps_keep_to_the_loss_that_was_asked_for(
 
 
 def test_the_fewest_channels_that_lose_little_are_found_by_halving(models: dict[str, Model]) -> None:
-    """Each number that is tried takes the model's own head on all that is held out."""
+    """Halving finds the fewest channels that lose little, as a trial takes the head on all held-out rays."""
     work = _Bake(models["matte"], BakeConfig(check_views=1), quiet)
     teacher = render_teacher(work.model, work.model.model_cameras(), 2000, 0, quiet)
     for fewest in (1, 6, 15, 99):

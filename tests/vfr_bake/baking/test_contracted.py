@@ -1,4 +1,4 @@
-"""The bake of an unbounded scene: which cells, and whole on a small one."""
+"""The bake of an unbounded scene: which cells are stored, and a whole bake of a small scene."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ OPAQUE = np.array([0, 0, 0, 255], np.uint8)
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def photographs(views: PosedImages) -> PosedImages:
-    """The views before a blue wall without end, as a camera would have them: no pixel shows nothing."""
+    """Return the views as photographed in front of an endless blue wall: no pixel is transparent."""
     wall = np.array([60, 90, 160, 255])
     share = [image[..., 3:] / 255 for image in views.images]
     mixed = [image * a + wall * (1 - a) for image, a in zip(views.images, share, strict=True)]
@@ -57,8 +57,8 @@ def model() -> Model:
     capture = replace(capture, train=photographs(capture.train), test=photographs(capture.test))
     scene = build_scene(capture, "unbounded")
     field = FieldOptions(n_levels=6, max_resolution=128, log2_table_size=14, head_width=32)
-    # So few steps have to find the middle of the scene: none of it may learn more slowly, and fog has to go
-    # five times faster than in a training of thousands of steps.
+    # So few steps have to find the middle of the scene, so none of it may learn more slowly; and fog has to
+    # vanish five times faster than in a training of thousands of steps.
     config = TrainConfig(
         device="cpu",
         field=field,
@@ -79,8 +79,8 @@ def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_cells_are_where_intervals_weigh() -> None:
-    """Two rays along x from the middle: one with a short heavy interval inside and a thin one, one with a
-    long interval from 2 to 500, whose cells share its weight."""
+    """Cells with a heavy interval are marked. One ray along x from the middle has a short heavy interval
+    inside and a thin one. The other has a long interval from 2 to 500, whose cells share its weight."""
     rays_o = np.zeros((2, 3), np.float32)
     rays_d = np.float32([[1, 0, 0], [-1, 0, 0]])
     t_mid, deltas = np.float32([0.55, 0.8, 251]), np.float32([0.01, 0.01, 498])
@@ -92,14 +92,14 @@ def test_cells_are_where_intervals_weigh() -> None:
         assert set(np.argwhere(visible)[:, 1]) <= {16}, "y and z stay in the middle"
         return sorted(np.argwhere(visible)[:, 0].tolist())
 
-    # 0.55 is in cell (0.55 + 2) * 8; contracted, -2 to -500 is -1.5 to -1.998: cells 4 to 0
+    # 0.55 is in cell (0.55 + 2) * 8; contracted, -2 to -500 is -1.5 to -1.998, which is cells 4 to 0
     assert marked(0.05) == [0, 1, 2, 3, 20]
     assert marked(0.0005) == [0, 1, 2, 3, 20, 22]
     assert marked(0.95) == []
 
 
 def test_cells_of_every_ray_are_marked() -> None:
-    """Rays along x, one in each row of cells, with one heavy interval each in the cell of their number."""
+    """Rays along x, one in each row of cells, each mark the cell in which their one heavy interval lies."""
     n = 12
     rays_o = np.zeros((n, 3), np.float32)
     rays_o[:, 1] = (np.arange(n) - 8 + 0.5) / 16
@@ -133,8 +133,8 @@ def test_many_views_take_no_more_rays_than_there_is_time_for(
 
 
 def depth_at_the_mean_angle(model: Model, asset: Asset, camera: Camera) -> np.ndarray:
-    """[n] the model's depth as the player states it: t where the angle is the mean over the weights
-    (`player.march.contracted`). In a fog it is nearer than the mean t."""
+    """Return the model's depth [n] as the player defines it: t where the angle is the mean over the weights
+    (`player.march.contracted`). In fog it is nearer than the mean t."""
     rays_o, rays_d = camera.rays()
     rays = enter_space(asset.grid, rays_o, rays_d)
     samples = model.sampler.sample_all(model.field, rays_o, rays_d)
@@ -158,7 +158,7 @@ def test_the_asset_plays_what_the_model_shows(model: Model, folder: Path) -> Non
 
 
 def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
-    """Before refinement, which looks at colours alone."""
+    """Depth is the model's own before refinement, which only looks at colours."""
     bake(model, tmp_path / "asset", replace(SETTINGS, refine_steps=0), quiet)
     asset, camera = Asset.open(tmp_path / "asset"), model.model_cameras()[2]
     frame = render(asset, model.cameras[2], n_fetches=0)
@@ -173,7 +173,7 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("k", [0, 4])
 def test_a_training_ray_composes_what_the_player_composes(model: Model, k: int) -> None:
-    """In the grid of one level that refinement learns from."""
+    """In the grid of one level that refinement learns from, a training ray composes what the player does."""
     work = _Bake(model, SETTINGS, quiet)
     layout, n_rays = work._cells()
     stored, *_ = work._store(layout, n_rays)
@@ -188,7 +188,7 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, k: int) 
     composed, opacity = training_rays.composed(grid.features.astype(np.float32))
     np.testing.assert_allclose(composed, played.features, rtol=0, atol=5e-3)
     np.testing.assert_allclose(opacity, played.opacity[played.hits], rtol=0, atol=1e-6)
-    if k == 0:  # the ways of the samples are what makes their weights
+    if k == 0:  # the lengths of samples make their weights
         fetches = training_rays.fetches(np.arange(len(training_rays)))
         codes = layout.finest(stored.density, stored.features).densities.values[0][:, 0].astype(np.float32)
         code = (fetches.densities.shares * codes[fetches.densities.rows]).sum(axis=1)

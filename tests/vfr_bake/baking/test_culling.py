@@ -1,4 +1,4 @@
-"""Which cells are stored, and that what is left out is measured in sum, not sample by sample."""
+"""Which cells are stored. What is left out is measured by its sum along rays, not sample by sample."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from vfr_bake.training.model_file import Model
 
 
 def stored(model: Model, resolution: int, floor: float) -> np.ndarray:
-    """[resolution, resolution, resolution] bool: what a floor keeps."""
+    """Return the cells that a floor keeps, [resolution, resolution, resolution] bool."""
     marks = marked_cells(model, resolution, (floor,), quiet)
     weighty = close_gaps(marks[..., 0].view(bool))
     return weighty | beside(weighty) & occupied_cells(model, resolution)
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def fog(model: Model, logit: float) -> Model:
-    """`model` with one thin density everywhere, seen by the same cameras; its colours stay."""
+    """Return `model` with one thin density everywhere, seen by the same cameras; its colours stay."""
     from copy import deepcopy
 
     field = deepcopy(model.field)
@@ -66,7 +66,7 @@ def test_gaps_of_one_cell_are_closed_and_nothing_grows() -> None:
 
 
 def test_cells_beside_those_that_weigh_something_are_stored_where_matter_may_be(model: Model) -> None:
-    """So that a surface which refinement moves has no holes."""
+    """Cells beside those with weight are stored where matter may be, so that refinement leaves no holes."""
     held, floor = occupied_cells(model, 64), 0.1
     weighty = close_gaps(marked_cells(model, 64, (floor,), quiet)[..., 0].view(bool))
     visible = cull(model, 64, HeldOut(model, 1), floor, 0.0, quiet).visible
@@ -86,7 +86,7 @@ def test_a_low_floor_marks_more(model: Model) -> None:
 
 
 def volume(folder: Path) -> float:
-    """How many cells of the finest level the live ones of all levels are."""
+    """Return the volume of the live cells of all levels, in cells of the finest level."""
     grid = Asset.open(folder).grid
     live = np.unpackbits(grid.live).reshape(-1, 512).sum(axis=1)
     return float((live * 8.0**grid.slot_levels).sum())
@@ -109,7 +109,7 @@ def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
 def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Against a sum in float64 over the model's own samples, those in cells below the floor left out."""
+    """The loss of a floor is that in a float64 sum over the model's samples, less those below the floor."""
     model = replace(model, witnesses=None)
     held_out, floor = HeldOut(model, 1), 0.1
     monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", LIMITS._replace(opaque_depth=np.float32(1e9)))
@@ -138,12 +138,12 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
 
     expected = loss(visible) - loss(occupied_cells(model, 96))
     assert expected > 0.05, "a floor this high loses something"
-    # Gaps that were closed may lie where the model's samples are not, and a march stops at 99.9 %.
+    # Closed gaps may lie where the model has no samples, and a march stops at 99.9 %.
     assert cells.lost[floor] == pytest.approx(expected, rel=0.05)
 
 
 def test_the_highest_floor_that_loses_little_is_taken(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    floors = (0.6, 0.3, 0.1, 0.01)  # those that are tried lose next to nothing of so small a model
+    floors = (0.6, 0.3, 0.1, 0.01)  # any of FLOORS would lose next to nothing in so small a model
     monkeypatch.setattr("vfr_bake.baking.cells.FLOORS", floors)
     held_out = HeldOut(replace(model, witnesses=None), 1)
     losses = {floor: cull(model, 64, held_out, floor, 0.0, quiet).lost[floor] for floor in floors}
@@ -156,7 +156,7 @@ def test_the_highest_floor_that_loses_little_is_taken(model: Model, monkeypatch:
 
 
 def test_with_witnesses_a_floor_must_not_lose_more_even_by_chance(model: Model) -> None:
-    """The first floor is taken whose loss is below what is allowed by more than its standard error."""
+    """The first floor is taken whose loss is below the limit by more than its standard error."""
     held_out = HeldOut(model, 1)
     everything = cull(model, 64, held_out, None, -9.0, quiet)
     assert everything.floor == 0 and list(everything.lost) == list(FLOORS), "no floor gains 9 dB"
@@ -169,7 +169,7 @@ def test_with_witnesses_a_floor_must_not_lose_more_even_by_chance(model: Model) 
 
 
 def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path: Path) -> None:
-    """Thin weights everywhere: one sample weighs less than any floor, the sum along a ray is the picture."""
+    """A fog is stored: each sample weighs less than any floor, but their sum along a ray is the picture."""
     thin = fog(model, -2)
     small: dict[str, Any] = {
         "resolution": 32,

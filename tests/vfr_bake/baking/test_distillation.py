@@ -1,5 +1,5 @@
-"""What a bake learns from: rays through photographs, and training rays out of teacher rays, of which those
-that meet nothing are left out, and none at all is an error."""
+"""What a bake learns from: rays through photographs, and training rays made of teacher rays. Teacher rays
+that meet nothing are left out, and it is an error if none is left."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from vfr_bake.training.captures.picture_colours import PictureColours
 from vfr_bake.training.model_file import Model
 
 ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
-"""Where rays along x begin that meet the box, and that pass it."""
+"""Origins of rays along x: of rays that meet the box, and of rays that pass it."""
 DARKER = 0.2
-"""Share of the colours that the model has learned which photographs show here."""
+"""Factor of the photographs' colours here, relative to those that the model has learned."""
 
 
 def quiet(done: int, of: int) -> None:
@@ -56,8 +56,8 @@ def test_rays_that_meet_nothing_teach_nothing(n_rays: int) -> None:
 def test_training_rays_are_those_that_meet_something(
     n_fetches: int, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In their order, however many rays are looked at together; the fog's one feature composes to its own
-    value times the opacity."""
+    """Training rays are the teacher rays that meet something, in order, however many are marched at once. The
+    fog's one feature composes to its own value times the opacity."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", at_once)
     rays = teacher_rays([PAST, ALONG, PAST, PAST, ALONG, ALONG])
     grid = fog(0.1)
@@ -75,7 +75,7 @@ def test_training_rays_are_those_that_meet_something(
 
 
 def test_kept_samples_are_those_that_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every ray has the same fetches either way, in any order; where samples are too many none are kept."""
+    """Kept samples give all rays the same fetches as new ones, in any order; too many are not kept."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 2)
     grid, rays = fog(0.1), teacher_rays([ALONG, (-0.5, 0.3, 0.2), PAST, ALONG])  # the second begins inside
     training_rays = collect_training_rays(rays, grid, 0, grid.rows)
@@ -92,7 +92,7 @@ def test_kept_samples_are_those_that_are_found_anew(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rays through fog have hundreds: theirs would take more memory than the grid."""
+    """Samples of all rays are not held at once: rays through fog have hundreds, more memory than the grid."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 100)
     monkeypatch.setattr("player.compiled.samples.MOST_AT_ONCE", 1)
     rays, grid = teacher_rays([ALONG] * 3000), fog(0.1)
@@ -115,7 +115,7 @@ def test_some_rays_are_spread_evenly() -> None:
 
 
 def test_an_asset_shows_what_the_photographs_show(model: Model, tmp_path: Path) -> None:
-    """Their colours are darker here than those that the model has learned."""
+    """An asset shows the photographs' colours, which are darker here than what the model has learned."""
     assert model.witnesses is not None and model.training_pixels is not None
     other = replace(
         model,

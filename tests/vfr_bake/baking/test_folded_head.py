@@ -1,4 +1,4 @@
-"""The head that is tuned is the head that is exported, in float32 and in 8 bits."""
+"""The head that is tuned equals the head that is exported, in float32 and in 8 bits."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_the_trainable_head_is_the_exported_one(eight: bool, activation: Activat
     data = head_onnx(weights, ranges)
     (rgb,) = onnxruntime.InferenceSession(data).run(None, {"features": codes, "dirs": dirs})
     off = np.abs(runner(weights, ranges)(codes, dirs) - np.asarray(rgb))
-    if eight:  # a sum that ends beside a level, in another order of additions: seldom
+    if eight:  # seldom, a sum near the border of two levels is added in another order
         assert (off < 1e-4).mean() > 0.98 and off.max() < 0.02
     else:
         assert off.max() < 2e-6
@@ -54,7 +54,7 @@ def test_the_trainable_head_is_the_exported_one(eight: bool, activation: Activat
 
 
 def test_refinement_gets_back_what_8_bits_lose() -> None:
-    """Ranges twice too wide, so that there is something to get back."""
+    """Refinement gets back what 8 bits lose. Ranges are twice too wide, so that something is lost."""
     weights = folded()
     codes, dirs = inputs(4000)
     codes = codes.round()

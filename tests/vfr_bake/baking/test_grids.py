@@ -1,4 +1,4 @@
-"""Which vertices of the two grids are stored, and that what is left out is empty."""
+"""Which vertices of the two grids are stored; what is left out is empty."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COARSE = 40
 
 
 def quiet(done: int, of: int) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 @pytest.mark.parametrize(("n", "resolution"), [(4, 4), (4, 8), (5, 8), (7, 25), (8, 7)])
@@ -69,7 +69,7 @@ def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
 
 
 def test_vertices_are_put_in_order_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All at once, the 35 million of a room took 5 GB."""
+    """Vertices are sorted slab by slab: all at once, the 35 million of a room took 5 GB."""
     monkeypatch.setattr("vfr_bake.baking.grids.SLAB", 8)
     cells = np.random.default_rng(0).random((10, 10, 10)) < 0.6
     tracemalloc.start()

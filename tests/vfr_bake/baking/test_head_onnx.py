@@ -1,6 +1,6 @@
-"""`vfr-export out/ head.onnx` against torch, on random and extreme inputs, in float32 and in 8 bits.
+"""`vfr-export out/ head.onnx` compared with torch on random and extreme inputs, in float32 and in 8 bits.
 
-The float head is held against the trained module itself in float64, the 8-bit head against torch's own fake
+The float head is compared with the trained module in float64, the 8-bit head with torch's own fake
 quantisation of the same layers.
 """
 
@@ -45,7 +45,7 @@ INT8_COST = Row(
 
 N_CHANNELS = 16
 SCALE = 0.02
-"""The step of the codes, which is folded into the first layer as the bake folds it."""
+"""Step of the codes, which is folded into the first layer as in a bake."""
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def weights(head: Head) -> HeadWeights:
 
 @pytest.fixture(scope="module")
 def asset(weights: HeadWeights, tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    """A complete asset whose channels are as many as the head's; only the head is of interest."""
+    """A complete asset with as many channels as the head has; only its head is used."""
     opened = Asset.open(block.write_block(tmp_path_factory.mktemp("head") / "asset"))
     manifest = dataclasses.replace(opened.manifest, n_channels=N_CHANNELS)
     return dataclasses.replace(opened, manifest=manifest)
@@ -77,7 +77,7 @@ def exported(asset: Asset, folder: Path, data: bytes, decode: bool) -> onnxrunti
 
 
 def answers(session: onnxruntime.InferenceSession) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Label, features, dirs and the rgb of the file, for every input that it takes."""
+    """Return label, features, dirs and the file's rgb for every input that it takes."""
     found = []
     names = {port.name for port in session.get_inputs()}
     for label, features, codes, k_weights, dirs in comparisons(N_CHANNELS):
@@ -93,8 +93,9 @@ def answers(session: onnxruntime.InferenceSession) -> list[tuple[str, np.ndarray
 def test_float32_is_the_trained_head(
     decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
 ) -> None:
-    """2e-6: float32 sums of 256 products, a quarter of which passes the sigmoid. Where features are so large
-    that logits of hundreds cancel, 2^-24 of the largest activation remains; beyond, the sigmoid is 0 or 1."""
+    """The exported float32 head is the trained one within 2e-6: sums of 256 float32 products, of which a
+    quarter passes the sigmoid. If features are so large that logits of hundreds cancel, 2^-24 of the largest
+    activation remains; beyond that the sigmoid is 0 or 1."""
     labels = set()
     for label, features, dirs, rgb in answers(exported(asset, tmp_path, head_onnx(weights), decode)):
         with torch.no_grad():
@@ -112,9 +113,9 @@ def test_float32_is_the_trained_head(
 def test_int8_is_torch_s_quantisation(
     decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
 ) -> None:
-    """An activation in the middle between two levels may go either way, and moves a colour by a level of one
-    of 256 activations; two or three of them together, 5e-3. Against the float head, eight bits cost 0.01 in
-    the root mean square."""
+    """The exported 8-bit head is torch's quantisation within 5e-3: an activation in the middle of two levels
+    may go either way, which moves a colour by a level of one of 256 activations, and there may be two or
+    three of them. Compared with the float head, 8 bits cost 0.01 in the root mean square."""
     random = np.random.default_rng(1)
     seen = random.normal(0, 40, (4000, N_CHANNELS))
     dirs = random.normal(size=(4000, 3))
@@ -135,7 +136,7 @@ def test_int8_is_torch_s_quantisation(
 def quantised(
     weights: HeadWeights, ranges: tuple[Range, ...], features: torch.Tensor, dirs: torch.Tensor
 ) -> torch.Tensor:
-    """The head with the rounding of `exporters.head.onnx_head`, done by torch."""
+    """Return the rgb of the head with the rounding of `exporters.head.onnx_head`, done by torch."""
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.tensor(array, dtype=torch.float32)

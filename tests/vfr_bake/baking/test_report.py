@@ -31,7 +31,7 @@ def report(**changes: object) -> BakeReport:
 
 
 class Tags(HTMLParser):
-    """Counts tags, and fails where one closes that is not open."""
+    """Parser that counts tags, and fails at the end of a tag that is not open."""
 
     def __init__(self) -> None:
         super().__init__()

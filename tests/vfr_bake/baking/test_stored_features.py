@@ -1,4 +1,4 @@
-"""What moves stored codes: gradients against torch, and steps that do not depend on how work is shared."""
+"""Steps of stored codes: gradients compared with torch, and the same result for any number of parts."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from vfr_bake.kernels.stored_features import (
 
 
 def latents(values: np.ndarray) -> np.ndarray:
-    """`values` [n_vertices, n_channels] as a table of latent features."""
+    """Return `values` [n_vertices, n_channels] as a table of latent features."""
     found = table(*values.shape)
     found[:] = values
     return found
 
 
 def with_padding(gradient: np.ndarray) -> np.ndarray:
-    """`gradient` [n, n_channels] with columns of 0 up to whole registers."""
+    """Return `gradient` [n, n_channels] with columns of 0 up to whole registers."""
     return np.pad(gradient, ((0, 0), (0, padded(gradient.shape[1]) - gradient.shape[1])))
 
 
 @pytest.mark.parametrize("n", [1, 40, BLOCK, BLOCK + 1])
 def test_density_gradient_is_that_of_the_composite(n: int) -> None:
-    # Against torch, on whole codes. Adagrad that has seen very steep slopes moves by rate * gradient / 1e15.
+    # Compared with torch, on whole codes. After very steep slopes, Adagrad moves by rate * gradient / 1e15.
     random = np.random.default_rng(0)
     n_vertices, n_densities, k = 200, 300, 6
 
@@ -113,7 +113,7 @@ def test_interpolated_features_compose_as_the_codes_do(n_channels: int) -> None:
 
 @pytest.mark.parametrize("n_channels", [1, 12, CHANNELS, 22])
 def test_a_step_moves_the_channels_of_its_rows_alone(n_channels: int) -> None:
-    # Row 1 of three; what is behind a row in memory is another's, or another thread's.
+    # Row 1 of three; what is behind a row in memory belongs to another row, or to another thread.
     start = np.arange(3 * n_channels).reshape(3, n_channels).astype(np.int16)
     moved, steep = latents(start), np.ones(3, np.float32)
     rows, shares = np.ones((1, 8), np.int32), np.eye(1, 8, dtype=np.float32)
@@ -126,8 +126,9 @@ def test_a_step_moves_the_channels_of_its_rows_alone(n_channels: int) -> None:
 
 
 def test_steps_of_the_features_are_adagrad() -> None:
-    """Against a loop in float64, fetch after fetch: steps that stay inside -127..127, and that leave it. No
-    move is rounded by a whole part of a code, and on average over many numbers of a step by nothing."""
+    """Steps of features are Adagrad's of a float64 loop, fetch after fetch, whether they stay inside
+    -127..127 or leave it. No step is rounded by a whole part of a code, and the mean rounding over many
+    numbers of a step is 0."""
     random = np.random.default_rng(3)
     starts = np.array([0, 2, 3, 7])
     rows = random.integers(0, 12, (7, 8)).astype(np.int32)

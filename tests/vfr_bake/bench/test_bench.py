@@ -1,4 +1,4 @@
-"""`vfr-bench` on the analytic asset, whose photographs are its own pictures with every sample fetched."""
+"""`vfr-bench` on the analytic asset. The photographs are its own pictures, with all samples fetched."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def data(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A field that has learned nothing, in the asset's frame."""
+    """A model file with an untrained field in the asset's frame."""
     asset = Asset.open(shells_folder)
     field = VfrField(FieldConfig(n_levels=2, max_resolution=16, log2_table_size=10, head_width=8))
     grid = OccupancyGrid(8, step=0.2, seed=0)
@@ -98,7 +98,8 @@ def test_every_setting_has_its_figures(results: tuple[dict, str], shells_folder:
 
 @pytest.mark.parametrize("contracted", [False, True], ids=["object", "unbounded"])
 def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, shells_folder: Path) -> None:
-    """A preset takes fewer steps for an unbounded scene: those are its own, and an object's would not be."""
+    """The command that bakes again names only settings that differ from the preset's own. The preset's number
+    of refinement steps is another one for an unbounded scene than for an object."""
     asset = Asset.open(shells_folder)
 
     def command(config: BakeConfig) -> str:
@@ -127,14 +128,15 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
     ],
 )
 def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Path) -> None:
-    """What an asset remembers is free in its form."""
+    """Recorded settings that no bake has written, which may have any form, give no command."""
     asset = Asset.open(shells_folder)
     manifest = replace(asset.manifest, provenance={"bake": remembered})
     assert bake_command("out", replace(asset, manifest=manifest)) == ""
 
 
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
-    """The photographs are the asset's own pictures: nothing is lost with every sample, more with fewer."""
+    """With every sample fetched nothing is lost, because the photographs are the asset's own pictures; with
+    fewer fetches more is lost."""
     rows = {row["n_fetches"]: row["scores"] for row in results[0]["settings"] if row["quality"] == "exact"}
     assert rows[0]["psnr"] is None and rows[0]["ssim"] == 1 and rows[0]["loss_db"] == 0
     assert rows[1]["psnr"] < rows[2]["psnr"] < rows[5]["psnr"] < MAX_PSNR
@@ -237,7 +239,7 @@ def test_what_nothing_reaches_is_said() -> None:
 
 
 def test_lookups_are_told_from_the_march() -> None:
-    """Frames of views with very different marches: 2 us a fetch are found all the same."""
+    """The time of a fetch, 2 us here, is found although the views' marches take very different times."""
     random = np.random.default_rng(0)
     rounds = [
         {
@@ -280,7 +282,7 @@ def test_worst_pixels_are_those_that_were_spoiled(shells_folder: Path) -> None:
     frames = [render(asset, camera, 5, march="numpy") for camera in cameras]
     wanted = [frame.rgb.copy() for frame in frames]
     wanted[1][20, 24] += 0.5
-    wanted[1][21, 24] += 0.4  # beside the worst: does not count again
+    wanted[1][21, 24] += 0.4  # next to the worst pixel: not counted again
     wanted[0][3, 2] += 0.25
     first, second, *_ = worst = worst_pixels(asset, cameras, wanted, [frame.rgb for frame in frames])
     assert (first.view, first.column, first.row) == (cameras[1].name, 24, 20)
@@ -299,8 +301,8 @@ def test_worst_pixels_are_those_that_were_spoiled(shells_folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def walls(tmp_path_factory: pytest.TempPathFactory) -> Asset:
-    """An unbounded scene in closed form: a wall all around, 8 model units from the middle, and little in
-    front of it. A model unit is 2 world units."""
+    """An unbounded scene in closed form: a wall all around, 8 model units from the centre, with almost
+    nothing in front of it. A model unit is 2 world units."""
 
     def log_sigma(points: np.ndarray) -> np.ndarray:
         return np.where(np.linalg.norm(points, axis=-1) > 8, 8.0, -12.0)
@@ -323,7 +325,7 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Asset:
 
 
 def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> None:
-    """The ray is the player's: as opaque as its frame, heaviest where the wall is."""
+    """A worst pixel's ray is the player's: as opaque as in the frame, with its largest weight at the wall."""
     camera = Camera("a", np.eye(4), 24, 20, 20.0, 20.0, 12.0, 10.0)
     frame = render(walls, camera, march="numpy")
     wanted = frame.rgb.copy()
@@ -333,7 +335,8 @@ def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> 
     assert worst.opacity == pytest.approx(frame.opacity[5, 7], abs=1e-6) and worst.opacity > 0.9
     assert worst.n_density_samples == frame.n_density_samples[5, 7]
     heaviest, _ = worst.weights[0]
-    # A cell is 1/12 in contracted space, there 1/r^2 of a unit of the way: 64/12 model units at 8.
+    # A cell is 1/12 wide in contracted space. At distance r a model unit has the length 1/r^2 there, so that
+    # a cell at r = 8 is 64/12 model units deep.
     assert heaviest == pytest.approx(2 * 8, abs=2 * 64 / 12)
     assert min(t for t, _ in worst.weights) <= frame.depth[5, 7] <= max(t for t, _ in worst.weights)
 
@@ -342,7 +345,8 @@ def test_worst_pixels_of_an_unbounded_scene_see_beyond_the_box(walls: Asset) -> 
 def test_exposure_is_fitted_on_left_halves_where_training_learned_it(
     exposure: bool, shells_folder: Path, data: Path
 ) -> None:
-    """Photographs that are the played pictures through a gain and an offset."""
+    """Exposure is fitted on the left halves of pictures if training learned exposure. Here the photographs
+    are the played pictures with a gain and an offset."""
     asset = Asset.open(shells_folder)
     trained = {"trained": {"effects": {"exposure": exposure}}}
     asset = replace(asset, manifest=replace(asset.manifest, provenance=trained))

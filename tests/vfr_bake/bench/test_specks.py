@@ -1,4 +1,4 @@
-"""Specks of synthetic pictures: what counts, and what does not."""
+"""Specks in synthetic pictures: which pixels count as specks, and which do not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vfr_bake.bench.specks import speck_mask
 
 
 def median_by_hand(picture: np.ndarray, y: int, x: int, channel: int) -> float:
-    """The fifth of the nine values around a pixel, in order; the nearest pixel stands for one outside."""
+    """Return the median of the nine values around a pixel; the nearest pixel stands for one outside."""
     height, width = picture.shape[:2]
     nine = [
         picture[min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1), channel]
@@ -39,7 +39,7 @@ def test_specks_count_where_they_are_and_in_any_channel() -> None:
     places = [(0, 0), (19, 29), (5, 7), (5, 20)]
     for number, (y, x) in enumerate(places):
         picture[y, x, number % 3] += 0.101
-    # a corner repeats itself to four of nine
+    # at a corner the repeated border shows the corner's own pixel in four of the nine places
     assert {tuple(place) for place in np.argwhere(speck_mask(picture, wanted)).tolist()} == set(places)
     assert not speck_mask(picture, wanted, 0.11).any(), "below the threshold"
     assert not speck_mask(wanted, picture).any(), "what is missing in the picture is calm there"
@@ -52,10 +52,10 @@ def test_wires_highlights_edges_and_patches_do_not_count() -> None:
     wanted[10:, 8:] = 0.3  # edges and a corner
     assert not speck_mask(wanted, wanted).any()
     shifted = wanted.copy()
-    shifted[9:, 7:] = 0.3  # edges a pixel further, which are wrong but no specks, but for their corner
+    shifted[9:, 7:] = 0.3  # edges moved by a pixel: wrong, but no specks except at their corner
     assert np.argwhere(speck_mask(shifted, wanted)[6:, 7:]).tolist() == [[3, 0]]
     broken = wanted.copy()
-    broken[10, 5] = 1  # a hole in the wire: the median of the nine is white there, as it is
+    broken[10, 5] = 1  # a hole in the wire: white, as is the median of the nine pixels there
     assert not speck_mask(broken, wanted)[10, 5]
     patch = wanted.copy()
     patch[14:18, 13:17] = 0.9

@@ -1,4 +1,4 @@
-"""The scene's box: against geometry that is known."""
+"""The scene's box, for geometry with a known box."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vfr_bake.data.files.pictures import read_picture
 
 
 def sphere_masks(cameras: list[Camera], centre: np.ndarray, radius: float) -> np.ndarray:
-    """[n, height, width] uint8 silhouettes of a sphere, in closed form."""
+    """Return silhouettes [n, height, width] uint8 of a sphere, in closed form."""
     masks = []
     for camera in cameras:
         rays_o, rays_d = camera.rays()
@@ -43,8 +43,8 @@ def test_a_spheres_silhouettes_give_its_box(radius: float):
     ball = np.array([0.55, -0.3, 0.1])
     centre, half = scene_box(cameras, sphere_masks(cameras, ball, radius))
     assert (np.abs(centre - ball) + radius < half).all()
-    # Two passes: the first cell is 1/32 of 1.19; block, growth and margin are at most 6 of the second's
-    # cells.
+    # There are two passes. The first one's cells are 1/32 of 1.19; block, growth and margin are at most 6
+    # cells of the second.
     assert half < 1.3 * radius + 0.15
 
 
@@ -85,5 +85,5 @@ def test_lego(lego_400: Path):
     centre, half = scene_box(cameras, alphas)
     low, high = np.array([-0.64, -1.15, -0.55]), np.array([0.64, 1.15, 1.04])  # the published model's box
     assert (centre - half < low).all() and (centre + half > high).all()
-    assert half < 1.35  # the cameras alone say 1.45
+    assert half < 1.35  # by the cameras alone it is 1.45
     assert scene_box(cameras)[1] > 1.4

@@ -1,4 +1,4 @@
-"""COLMAP models: written by hand here, read back; a real one; and files that were cut short."""
+"""COLMAP models: one that is written here by hand, a real one, and files that are cut short."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LENSES = {
 
 
 def write_model(folder: Path, cameras: list[Camera], lenses: dict = LENSES, size: int = SIZE) -> Path:
-    """A COLMAP model of `cameras`, with the lenses in turn, and their pictures."""
+    """Write a COLMAP model of `cameras`, which take the lenses in turn, and their pictures."""
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     (folder / "images").mkdir()
@@ -88,7 +88,7 @@ def test_the_real_capture(can: Path) -> None:
 
 
 def test_points_fall_on_what_was_seen_of_them(can: Path) -> None:
-    """Projected through our cameras the real model's points land where COLMAP saw them."""
+    """The real model's points, projected by the cameras that are read, fall where COLMAP saw them."""
     reconstruction = pycolmap.Reconstruction(str(can / "sparse/0"))
     lenses = read_cameras(can / "sparse/0/cameras.bin")
     ours = {image.name: image for image in read_images(can / "sparse/0/images.bin")}

@@ -1,4 +1,4 @@
-"""The built-in scene is what it says: geometry, alpha, distance, and a look that depends on the view."""
+"""The built-in scene: its geometry, alpha and distances are right, and its look depends on the view."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_distance_to_the_ball_is_that_of_a_sphere():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    # Its outer half, near by: nothing else is as near.
+    # Points near the ball's outer half, where no other part of the scene is as near.
     directions = directions[(directions[:, 0] < -0.2) & (directions[:, 2] > 0)]
     assert len(directions) > 30
     for distance in (0, 0.03, 0.06):
@@ -60,7 +60,7 @@ def test_distance_to_the_wire_and_through_the_hole():
 
 
 def test_distance_is_a_distance():
-    """It never grows faster than one walks, inside or outside."""
+    """The distance never changes by more than the way between two points, inside or outside."""
     rng = np.random.default_rng(1)
     a = rng.uniform(AABB[0] - 0.3, AABB[1] + 0.3, (4000, 3))
     b = a + rng.normal(scale=0.05, size=a.shape)
@@ -68,7 +68,7 @@ def test_distance_is_a_distance():
 
 
 def test_outside_distance_is_exact():
-    """From an outside point there is a surface point at that distance, down the gradient."""
+    """From a point outside, the surface lies at the given distance down the gradient."""
     rng = np.random.default_rng(2)
     points = rng.uniform(AABB[0] - 0.2, AABB[1] + 0.2, (3000, 3))
     points = points[signed_distance(points) > 0.01]
@@ -77,7 +77,7 @@ def test_outside_distance_is_exact():
     gradient = np.stack([signed_distance(points + o) - signed_distance(points - o) for o in offsets], axis=-1)
     gradient /= 2 * h
     length = np.linalg.norm(gradient, axis=-1)
-    smooth = np.abs(length - 1) < 1e-3  # not where two solids are equally near
+    smooth = np.abs(length - 1) < 1e-3  # not between two solids that are equally near
     assert smooth.mean() > 0.98
     feet = points[smooth] - signed_distance(points[smooth])[:, None] * gradient[smooth]
     np.testing.assert_allclose(signed_distance(feet), 0, atol=1e-5)
@@ -119,7 +119,7 @@ def test_every_hit_is_on_the_surface_and_every_miss_is_a_miss():
         hit = np.isfinite(distance.ravel())
         points = rays_o[hit] + distance.ravel()[hit, None] * rays_d[hit]
         assert np.abs(signed_distance(points)).max() < 2e-4
-        # Walk along each ray by the distance function itself, in float64: before the hit nothing is touched.
+        # Walk along each ray by the distance function, in float64: before the hit nothing is touched.
         t = np.full(len(rays_o), 1.0)
         nearest = np.full(len(rays_o), np.inf)
         for _ in range(80):
@@ -141,11 +141,11 @@ def test_one_sees_through_the_hole():
         HOLE_CENTRE + 2.5 * axis + np.array([0, 0, -0.02]), HOLE_CENTRE + np.array([0, 0, 0.02]), 61, 20
     )
     alpha = trace(far)[0][..., 3]
-    assert alpha[20:41, 20:41].min() == 0  # nothing behind it there
+    assert alpha[20:41, 20:41].min() == 0  # nothing is behind the hole there
 
 
 def test_the_wire_is_thin_and_seen():
-    # Near its right foot, where nothing is behind it, it leans by 10 degrees.
+    # Near its right foot, with nothing behind it, the wire leans by 10 degrees.
     along = 0.86 * np.cos(np.deg2rad(10))
     place = [along * np.cos(-0.06), 0.07 + along * np.sin(-0.06), -0.6 + 0.86 * np.sin(np.deg2rad(10))]
     place = CENTRE + SCALE * np.array(place)
@@ -158,7 +158,7 @@ def test_the_wire_is_thin_and_seen():
 
 
 def test_the_highlight_moves_with_the_view():
-    """The ball's brightest point is another point of the ball from another side, a matt one's would stay."""
+    """The ball's brightest point is another one from another side, which it would not be on a matt ball."""
     brightest = []
     for side in (-0.8, 0.8):
         camera = looking(
@@ -177,7 +177,7 @@ def test_the_highlight_moves_with_the_view():
 
 
 def test_edges_are_smooth_and_the_rest_is_right(monkeypatch: pytest.MonkeyPatch):
-    """Sampling only rough pixels 2 x 2 times is sampling all so, within what counts as smooth."""
+    """Sampling only rough pixels 2 x 2 times gives what sampling all of them gives, but for smooth detail."""
     camera = demo_cameras(40, 9)[5]
     some = trace(camera)[0]
     monkeypatch.setattr(module, "_rough", lambda rgba: np.ones(rgba.shape[:2], bool))
@@ -205,7 +205,7 @@ def test_cameras_see_all_of_it_and_some_from_below():
         column = camera.cx - camera.fx * local[:, 0] / local[:, 2]
         row = camera.cy + camera.fy * local[:, 1] / local[:, 2]
         spill = max(-column.min(), column.max() - 64, -row.min(), row.max() - 64)
-        assert spill < 5  # a corner of the box, which the scene itself does not fill
+        assert spill < 5  # only a corner of the box, which is empty
         below += camera.c2w[2, 3] < AABB[0, 2]
     assert 2 <= below <= 16
     for camera in cameras[::9]:
@@ -241,7 +241,7 @@ def test_the_word_demo_loads_it(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_asset_that_comes_with_the_player_shows_it():
-    """The view is between those that it was trained on; one pixel moved is 26 dB, an empty picture 10."""
+    """The demo asset shows a view between its training views; a pixel off is 26 dB, an empty picture 10."""
     camera = demo_cameras(256, 16, phase=0.5)[6]
     asset = Asset.open(DEMO)
     rgba, _ = trace(camera)

@@ -1,4 +1,4 @@
-"""Features of pictures, matches between them, and the cameras that files tell of."""
+"""Features of pictures, the matches between them, and the cameras that the files describe."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vfr_bake.data.files.looks import sensor_of
 
 
 def test_features_follow_the_picture_to_its_own_pixels(monkeypatch: pytest.MonkeyPatch):
-    """A point found in the reduced picture is where it is found in the whole one."""
+    """Features that are found in a reduced picture lie where they are found in the whole one."""
     rgba = np.dstack([textured(3, 640, 480), np.full((480, 640), 255, np.uint8)])
     whole = find_features(rgba)
     monkeypatch.setattr("vfr_bake.data.features.MAX_SIDE", 320)
@@ -24,7 +24,7 @@ def test_features_follow_the_picture_to_its_own_pixels(monkeypatch: pytest.Monke
     off = whole.points[pairs[:, 0]] - reduced.points[pairs[:, 1]]
     assert (
         len(pairs) > 50 and np.abs(np.median(off, axis=0)).max() < 0.15
-    )  # half a pixel too many shows as 0.5
+    )  # an error of half a pixel would be 0.5
 
 
 def test_nothing_is_found_where_a_picture_is_transparent():
@@ -52,7 +52,7 @@ def test_match_is_what_loops_say():
 
 
 def test_a_walk_is_closed_without_all_pairs():
-    """Sixty pictures of a strip that goes round: picture 59 overlaps picture 0."""
+    """The last of sixty pictures around a closed strip is matched with the first, without all pairs."""
     strip = textured(5, 1600, 120)
     strip = np.concatenate([strip, strip[:, :200]], axis=1)
     views = [strip[:, start : start + 160] for start in np.linspace(0, 1600, 60, endpoint=False).astype(int)]

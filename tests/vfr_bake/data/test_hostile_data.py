@@ -1,5 +1,5 @@
-"""Data sets that hold what is no file, or far more than it seems: one line, at once; links are as good as
-files."""
+"""Data sets with things that are no files, or are far larger than they seem, are refused in one line at once.
+Links are as good as files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vfr_bake.data.files.pictures import read_picture
 
 
 def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:
-    """The beginning of a picture that is as large as its header says."""
+    """Return the beginning of a picture whose header states this size."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -50,7 +50,7 @@ def large_16_bit(path: Path) -> None:
 
 
 def postscript(path: Path) -> None:
-    """Pillow would start Ghostscript to read it."""
+    """Write a PostScript file, for which Pillow would start Ghostscript."""
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n")
 
 

@@ -1,4 +1,4 @@
-"""Features and matches on disk: what was written comes back, and what is broken does not."""
+"""Features and matches that are kept on the disk are read again, except broken ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def same(a: Found | None, b: Found) -> bool:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two pictures, one without a feature, and their matches."""
+    """A folder with two pictures' features, of which one has none, and with their matches."""
     kept = KeptMatches(tmp_path)
     kept.keep_look(A, made(0, 7))
     kept.keep_look(B, made(1, 0))

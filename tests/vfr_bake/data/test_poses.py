@@ -1,4 +1,4 @@
-"""Cameras estimated from pictures alone: against known cameras, and everything that can be missing."""
+"""Cameras estimated from pictures alone, compared with known cameras, and everything that can be missing."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def quiet(stage: str, done: int, of: int) -> None:
 
 
 def centres(model: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Camera centres [3] and rotations [3, 3], world to camera, by the names of the pictures."""
+    """Return camera centres [3] and rotations [3, 3], world to camera, by the names of the pictures."""
     images = [image for image in pycolmap.Reconstruction(model).images.values() if image.has_pose]
     rotations = {image.name: image.cam_from_world().rotation.matrix() for image in images}
     return {image.name: image.projection_center() for image in images}, rotations
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale and rotation [3, 3] that bring the points `a` [n, 3] nearest to `b` (Umeyama, PAMI 1991)."""
+    """Return scale and rotation [3, 3] that bring points `a` [n, 3] nearest to `b` (Umeyama, PAMI 1991)."""
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1, 1, np.linalg.det(u @ vt)])
@@ -53,7 +53,7 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixture[str]):
-    """From points without noise, seen by cameras whose centre is believed 6 pixels off."""
+    """The principal point of a camera is found silently, from exact points, if it is given 6 pixels off."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 24
     options.num_points3D = 200
@@ -71,7 +71,7 @@ def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixtur
 def can(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, poses.PoseReport, list[tuple[str, int, int]]]:
-    """Ten neighbouring pictures of the can at half their size, in the folder itself, with cameras."""
+    """A folder with ten neighbouring pictures of the can, at half their size, and with estimated cameras."""
     folder = tmp_path_factory.mktemp("can")
     for path in sorted((real_pictures("can") / "images").iterdir())[:N_CAN]:
         with Image.open(path) as file:
@@ -89,9 +89,9 @@ def test_the_cameras_are_those_that_are_known(can):
     a, b = (np.array([c[name] for name in names]) for c in (found, given))
     scale, rotation = similarity(a, b)
     off = np.linalg.norm(scale * (a - a.mean(axis=0)) @ rotation.T - (b - b.mean(axis=0)), axis=1)
-    # The given cameras are themselves an estimate, each with its own focal length, which vary by 2 %.
+    # The given cameras are an estimate too, with a focal length each; these vary by 2 %.
     assert np.sqrt((off**2).mean()) < 0.01 * np.ptp(b, axis=0).max()
-    # Turned onto each other by themselves: the centres lie on a short arc and hardly tell a turn about it.
+    # Rotations are aligned by themselves: the centres lie on a short arc, and hardly say how it is turned.
     turns = [found_rotations[name].T @ given_rotations[name] for name in names]
     u, _, vt = np.linalg.svd(sum(turns))
     for turn in turns:
@@ -213,12 +213,12 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
     )
     monkeypatch.setattr(mapping, "match", lambda a, b: matched.append(1) or match(a, b))
     assert estimate_cameras(photos, quiet).n_registered == 6
-    assert (len(looked), len(matched)) == (1, 5)  # only what the new picture brings
+    assert (len(looked), len(matched)) == (1, 5)  # only those of the new picture
     assert not list(kept.rglob("*.bin"))
 
 
 def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, monkeypatch):
-    """`os.access` answers as it does to anyone but root."""
+    """A read-only folder is refused at once; `os.access` is replaced, as it allows root everything."""
     photos = save(tmp_path / "photos", [textured(seed) for seed in range(3)])
     monkeypatch.setattr("os.access", lambda path, mode: Path(path) != photos)
     stages: list[str] = []
@@ -310,7 +310,7 @@ def test_three_pictures_must_all_find_their_place(can, tmp_path: Path):
 
 
 def test_a_handful_is_placed_by_another_attempt(can, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Three attempts find nothing, and the fourth finds all."""
+    """A handful of pictures is placed by the fourth attempt if the first three find nothing."""
     attempts = []
 
     def map_pictures(*arguments):
@@ -336,7 +336,7 @@ def test_pictures_that_have_nothing_in_common(tmp_path: Path):
 
 
 def test_pictures_of_two_places_are_told_of(can, tmp_path: Path):
-    """Five of the can, and five of a wall that is photographed in passing."""
+    """Two places are named: five pictures of the can, and five of a wall that the camera passes."""
     wall = textured(9, 1200, 300)
     for index, path in enumerate(sorted(can[0].glob("*.jpg"))[:5]):
         shutil.copy(path, tmp_path / f"a_{index}.jpg")
@@ -364,7 +364,7 @@ def test_bursts_and_copies_are_left_out(can, tmp_path: Path):
 
 
 def test_up_is_z_and_masks_hide_what_they_hide(can, tmp_path: Path):
-    """Pictures on their side, as a camera stores them that is held upright, with a part of each masked."""
+    """In pictures stored on their side, with a masked part each, up is z and no feature is masked."""
     (tmp_path / "masks").mkdir()
     for path in sorted(can[0].glob("*.jpg")):
         exif = Image.Exif()
@@ -404,7 +404,7 @@ def test_without_pycolmap_it_says_what_to_install(tmp_path: Path, monkeypatch: p
 
 
 def test_of_groups_that_have_nothing_in_common_the_largest_is_taken_and_said(can, tmp_path: Path):
-    """Eight of the can, and four of a wall that stands in two planes."""
+    """The largest group is taken and others are named: eight of the can, and four of a wall in two planes."""
     photos = first_pictures(can, tmp_path, 8)
     wall = textured(9, 1600, 300)
     for index in range(4):

@@ -1,4 +1,4 @@
-"""The frame that everything works in: [-1, 1]³, and back."""
+"""The model frame, [-1, 1]³, in which everything works, and the way back to the world."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_model_frame_does_not_know_the_unit(scale: float):
     ]
     one, two = build_scene(Capture("a", train, test)), build_scene(Capture("a", *scaled))
     for a, b in zip(one.train.cameras, two.train.cameras, strict=True):
-        np.testing.assert_allclose(a.c2w, b.c2w, atol=1e-5)  # float32 hull grids may differ by their rounding
+        np.testing.assert_allclose(a.c2w, b.c2w, atol=1e-5)  # float32 hull grids may differ by rounding
     np.testing.assert_allclose(
         two.world_from_model, similarity @ one.world_from_model, rtol=1e-5, atol=1e-5 * scale
     )
@@ -65,7 +65,7 @@ def test_pictures_must_fit_their_cameras():
 
 
 def opaque(views: PosedImages, colour: list[int] | None) -> PosedImages:
-    """The views over a colour, or over a sky full of detail."""
+    """Return the views over a colour, or over a sky full of detail if there is none."""
     random = np.random.default_rng(0)
     images = []
     for image in views.images:

@@ -1,4 +1,4 @@
-"""Blurred pictures: found among sharp ones, whatever the subject, and none where all are alike."""
+"""Blurred pictures are found among sharp ones, whatever the subject, and none where all are alike."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def out_of_focus(image: np.ndarray, radius: float) -> np.ndarray:
 
 
 def shaken(image: np.ndarray, n: int, axis: int) -> np.ndarray:
-    """Moved by `n` pixels while it was taken."""
+    """Return a picture as if it moved by `n` pixels during the exposure."""
     moved = [np.roll(image.astype(np.float64), shift, axis) for shift in range(n)]
     return np.mean(moved, axis=0).astype(np.uint8)
 
@@ -48,7 +48,7 @@ def test_more_blur_is_more(views: PosedImages) -> None:
 
 
 def test_large_pictures_are_measured_at_one_size(views: PosedImages) -> None:
-    """Where one pixel has become 16 by 16, what is measured is the 512 pixels that are left."""
+    """Large pictures are measured as if 512 pixels wide: repeating pixels 4 x 4 times changes nothing."""
     small = np.asarray(Image.fromarray(views.images[0]).resize((512, 512), Image.Resampling.BICUBIC))
     large = small.repeat(4, axis=0).repeat(4, axis=1)
     assert blur(large) == pytest.approx(blur(small), abs=1e-4)

@@ -1,4 +1,4 @@
-"""Folders of pictures: what is read, what is refused, and lenses made straight."""
+"""Folders with a transforms.json: what is read, what is refused, and the distortion of lenses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np
 
 
 def make_folder(folder: Path, n: int, name: str = "transforms.json", stem: str = "r_", **top: Any) -> Path:
-    """`n` views around the demo's place, RGBA; blender form unless `top` says more."""
+    """Write `n` views around the demo scene as RGBA, in Blender's form unless `top` adds more keys."""
     folder.mkdir(exist_ok=True)
     frames = []
     for index, camera in enumerate(demo_cameras(8, n)):
@@ -89,7 +89,7 @@ def test_opaque_pictures_have_no_alpha(tmp_path: Path):
 
 
 def test_lego(lego_400: Path, tmp_path: Path):
-    """The first views of the real data set; its numbers are read by another program."""
+    """The first views of lego are read right; the expected pixels are read by OpenCV."""
     for split, n in (("train", 6), ("test", 2)):
         (tmp_path / split).mkdir()
         for index in range(n):
@@ -120,7 +120,7 @@ def test_suffixes_and_separators(tmp_path: Path):
     (folder / "sub").mkdir()
     Image.fromarray(picture(1, channels=3)).save(folder / "sub" / "x.jpeg")
     Image.fromarray(picture(2, channels=3)).save(folder / "y.jpg")
-    (folder / "r_2").mkdir()  # a folder is not the picture
+    (folder / "r_2").mkdir()  # a folder of that name is not the picture
 
     def change(document: Any) -> None:
         document["frames"][0]["file_path"] = "sub\\x"
@@ -238,7 +238,7 @@ def test_pictures_of_different_sizes(tmp_path: Path):
     assert [image.shape[:2] for image in scene.train.images] == [(6, 8), (6, 8), (5, 16)]
     first, last = scene.train.cameras[0], scene.train.cameras[2]
     assert (last.width, last.height) == (16, 5)
-    # The file gives an angle of view and no size: each picture's own width has it.
+    # The file gives an angle of view and no size: it is the angle of each picture's own width.
     assert last.fx == pytest.approx(2 * first.fx) and last.fy == pytest.approx(last.fx)
 
 
@@ -259,7 +259,7 @@ LENS = {"k1": -0.12, "k2": 0.05, "k3": -0.01, "k4": 0.004, "p1": 0.004, "p2": -0
 
 
 def distorted_view(camera: Camera, lens: dict[str, float], shade: Any) -> np.ndarray:
-    """What a lens shows of `shade(x, y)`, the plane at depth 1: the lens model is inverted by fixed point."""
+    """Return `shade(x, y)`, the plane at depth 1, as seen by a lens, whose model is inverted by iteration."""
     u = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx + np.zeros((camera.height, 1))
     v = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy + np.zeros((1, camera.width))
     x, y = u.copy(), v.copy()
@@ -272,7 +272,7 @@ def distorted_view(camera: Camera, lens: dict[str, float], shade: Any) -> np.nda
 
 
 def smooth(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A plane of smooth colours in the form of a picture."""
+    """Return a plane of smooth colours as a picture."""
     channels = [np.sin(9 * x + 1), np.sin(7 * y), np.sin(6 * x - 8 * y), np.ones_like(x)]
     return (np.stack(channels, axis=-1) * 120 + 128).round().astype(np.uint8)
 
@@ -283,7 +283,7 @@ def test_a_lens_is_made_straight():
     bent, straight = (distorted_view(camera, lens, smooth).astype(int) for lens in (LENS, no_lens))
     assert np.abs(bent - straight)[8:-8, 8:-8].max() > 20
     result = undistort(bent.astype(np.uint8), camera, **LENS)
-    # Linear interpolation of a sine of at most 0.14 radians a pixel: 120 * 0.14² / 8, and two roundings.
+    # Linear interpolation of a sine, at most 0.14 radians a pixel: 120 * 0.14² / 8, and two roundings.
     assert np.abs(result.astype(int) - straight)[8:-8, 8:-8].max() <= 2
 
 
@@ -321,7 +321,7 @@ def test_lenses_of_a_folder_are_undone(tmp_path: Path):
     scene = load_scene(folder)
     straight = distorted_view(cameras[0], dict.fromkeys(LENS, 0.0), smooth).astype(int)
     assert np.abs(scene.train.images[1].astype(int) - straight)[8:-8, 8:-8, :3].max() <= 2
-    np.testing.assert_array_equal(scene.train.images[2], bent)  # the frame's own lens: none
+    np.testing.assert_array_equal(scene.train.images[2], bent)  # this frame has a lens without distortion
     assert not scene.has_alpha
 
 

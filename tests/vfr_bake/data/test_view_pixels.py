@@ -1,4 +1,4 @@
-"""Which pixels a model keeps for a bake to learn from."""
+"""Pixels that a model keeps for a bake to learn from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels are kept from training: how many, where, and always the same ones."""
+"""Pixels that are kept from training: how many, where, and always the same ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vfr_bake.data.witnesses import (
 
 
 def numbered_views(n_views: int, width: int, height: int) -> PosedImages:
-    """Pictures whose pixels tell their view and their number in it."""
+    """Return views whose pixels' colours are their numbers, and whose alpha is the view's number."""
     cameras = [
         replace(camera, width=width, height=height, cx=width / 2, cy=height / 2)
         for camera in demo_cameras(8, n_views)
@@ -66,7 +66,7 @@ def test_colours_are_those_of_the_pixels_and_no_pixel_comes_twice() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(400, 300), (300, 400), (90, 91)])
 def test_patches_are_squares_that_do_not_meet_and_lie_anywhere(width: int, height: int) -> None:
-    """Each tenth of the rows and of the columns has about a tenth of them, the outermost fewer."""
+    """Patches are apart; each tenth of rows and columns has about a tenth of them, the outermost fewer."""
     random = np.random.default_rng(3)
     n = 5 * PATCH**2 + 100
     rows_hit, columns_hit = np.zeros(10), np.zeros(10)
@@ -76,7 +76,7 @@ def test_patches_are_squares_that_do_not_meet_and_lie_anywhere(width: int, heigh
         rows, columns = np.divmod(numbers, width)
         rows_hit += np.bincount(rows * 10 // height, minlength=10) / len(numbers) / 200
         columns_hit += np.bincount(columns * 10 // width, minlength=10) / len(numbers) / 200
-        # A pixel inside of a patch has its four neighbours in it.
+        # A pixel inside a patch has its four neighbours in the patch.
         there = np.isin(numbers + 1, numbers) & np.isin(numbers - 1, numbers)
         there &= np.isin(numbers + width, numbers) & np.isin(numbers - width, numbers)
         size = math.isqrt(len(numbers) // 5)

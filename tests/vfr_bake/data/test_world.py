@@ -1,4 +1,4 @@
-"""Which way is up, and how long a unit is."""
+"""Estimates of which way is up, and of how long a unit is."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def degrees(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def ring(seed: int, roll: float, n_sideways: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [24, 4, 4] on three quarters of a turn, rolled by `roll` degrees (standard deviation), in a world
-    that is turned at random; and its up."""
+    """Return poses [24, 4, 4] on three quarters of a turn in a randomly turned world, and this world's up.
+    Cameras roll by `roll` degrees (standard deviation); `n_sideways` of them are turned by 90 degrees."""
     random = np.random.default_rng(seed)
     world = np.linalg.qr(random.normal(size=(3, 3)))[0]
     world *= np.sign(np.linalg.det(world))
@@ -40,7 +40,7 @@ def ring(seed: int, roll: float, n_sideways: int = 0) -> tuple[np.ndarray, np.nd
 def test_up_from_cameras_that_are_held_nearly_level(seed: int) -> None:
     poses, up = ring(seed, roll=2)
     assert degrees(find_up(poses, np.zeros((0, 3))), up) < 2
-    poses, up = ring(seed, roll=2, n_sideways=5)  # as a phone that was not told
+    poses, up = ring(seed, roll=2, n_sideways=5)  # as of a phone that did not notice
     assert degrees(find_up(poses, np.zeros((0, 3))), up) < 4
 
 

@@ -1,4 +1,4 @@
-"""The head's compiled pass against the same formulas in float64, forward and backward, on hard inputs too."""
+"""The head's compiled pass compared with its formulas in float64, forward and backward, on hard inputs."""
 
 from __future__ import annotations
 
@@ -120,7 +120,8 @@ def test_activations_in_bfloat16_are_those_of_float64_rounded() -> None:
     assert exact.grad is not None
     ours, slopes = x.clone(), torch.empty(2, x.shape[1]).bfloat16()
     gelu(as_array(ours), bias, as_array(slopes[1:]))
-    # Half of the last of eight binary digits, beside what float32 is allowed.
+    # Rounding to bfloat16's eight binary digits changes half of the last one at most, beside the error that
+    # float32 is allowed.
     for found, wanted in ((ours[0], values.detach()), (slopes[1], exact.grad)):
         BFLOAT16_GELU.check(found.double(), wanted, of=wanted.abs() + 1e-6 * 2**8)
     grad = torch.full_like(x, 3.0)
@@ -146,7 +147,7 @@ def test_products_with_the_basis_match_float64(kind: torch.dtype) -> None:
     grad_bias = torch.empty(7)
     times_basis(as_array(x), bias.numpy(), basis.numpy())
     times_basis_backward(as_array(grad), basis.numpy(), rows.numpy(), grad_bias.numpy())
-    # Half of the last of eight binary digits (of 24, twice).
+    # At most half of the last of bfloat16's eight binary digits, or of float32's 24 in two roundings.
     row, digits = (BFLOAT16_BASIS, 2**-8) if kind == torch.bfloat16 else (BASIS, 2**-22)
     for found, wanted in ((x, expected), (grad, expected_grad)):
         row.check(found.double(), wanted, of=wanted.abs() + 1e-6 / digits)
@@ -163,7 +164,7 @@ def test_relu_backward_matches_autograd(dtype: type) -> None:
     hidden, grad_out = random.normal(size=(7, 5)).astype(dtype), random.normal(size=7).astype(dtype)
     hidden[0], grad_out[1] = 0, 0
     bias, weights = random.normal(size=(2, 5)).astype(dtype)
-    bias[2] = 0  # exactly at the corner in row 0: no gradient, as torch has it
+    bias[2] = 0  # in row 0 exactly at the kink of the ReLU: no gradient, as in torch
     h, b, w = (torch.from_numpy(a.astype(np.float64)).requires_grad_() for a in (hidden, bias, weights))
     (torch.relu(h + b) @ w @ torch.from_numpy(grad_out.astype(np.float64))).backward()
     grad_weights, grad_bias = np.empty((2, 5), dtype)
@@ -176,7 +177,7 @@ def test_relu_backward_matches_autograd(dtype: type) -> None:
 def gradients(
     head: Head, features: torch.Tensor, dirs: torch.Tensor, wanted: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Colours, gradient of the features and of all parameters, for a gradient `wanted` of the colours."""
+    """Return the colours, and the gradients of features and parameters, for a gradient `wanted` of them."""
     features = features.clone().requires_grad_()
     head.zero_grad()
     colours = head(features, dirs)
@@ -212,7 +213,7 @@ def test_fused_head_matches_float64(n_rays: int, n_layers: int) -> None:
 
 @pytest.fixture
 def without_onednn() -> Iterator[None]:
-    """Torch's own products of bfloat16, which are the same on every machine."""
+    """Use torch's own products of bfloat16, which give the same result on every machine."""
     before = torch.backends.mkldnn.set_flags(False)[0]
     yield
     torch.backends.mkldnn.set_flags(before)
@@ -237,7 +238,7 @@ def test_fused_head_in_bfloat16_is_near_float64() -> None:
         BFLOAT16_HEAD.check((our - their).norm(), of=their.norm())
         FLOAT32_HEAD.check((single - their).norm(), of=their.norm())
     assert (ours[0] != in_float32[0]).any() and not ours[1][1::3].any()
-    with torch.no_grad():  # pictures are shown by the weights as they are
+    with torch.no_grad():  # rendered pictures use the float32 weights
         torch.testing.assert_close(head(features, dirs), in_float32[0], rtol=0, atol=0)
 
 
@@ -253,7 +254,7 @@ def test_products_in_bfloat16_have_few_sizes(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(torch, "mm", mm)
     found = []
-    for n_rays in (33, 47, 64):  # more than 32, in products with and without the rays that are left out
+    for n_rays in (33, 47, 64):  # all pad to 64 rows, as do the rows that remain when rays are left out
         wanted = torch.ones(n_rays, 3)
         wanted[34::3] = 0
         gradients(head, torch.randn(n_rays, 4), torch.ones(n_rays, 3), wanted)

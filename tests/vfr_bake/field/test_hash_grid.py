@@ -1,4 +1,4 @@
-"""The hash grid against a float64 loop written from the equation, its torch twin, and finite differences."""
+"""The hash grid compared with a float64 loop of the equation, its torch twin, and finite differences."""
 
 from __future__ import annotations
 

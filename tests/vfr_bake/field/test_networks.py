@@ -1,4 +1,4 @@
-"""Density, head and pilot: what the paper says about them, and their ends."""
+"""Density network, head and pilot: the properties that the paper states, and extreme inputs."""
 
 from __future__ import annotations
 

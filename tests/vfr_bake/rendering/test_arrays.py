@@ -1,5 +1,5 @@
-"""The kernels of training and rendering, run as the Python that they are written in: numpy looks at every
-index, which compiled code does not."""
+"""The kernels of training and rendering, run as plain Python, where numpy checks every index, which compiled
+code does not do."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_kernels_stay_within_their_arrays_and_are_what_they_say(tmp_path: Path) 
     compiled = run(tmp_path / "compiled.npz")
     assert set(plain) == set(compiled) and len(plain) > 15
     for name, values in plain.items():
-        # In float32 flat parts of a proposal magnify rounding a thousandfold in each round.
+        # Where a proposal's distribution is flat, each round magnifies float32 rounding a thousandfold.
         rtol, atol = (0.05, 5e-3) if name.startswith("unbounded") else (1e-3, 2e-4)
         np.testing.assert_allclose(compiled[name], values, rtol=rtol, atol=atol, err_msg=name)
         assert values.any(), name

@@ -1,4 +1,4 @@
-"""Compositing against a float64 loop, its torch twin and finite differences, on hard inputs too."""
+"""Compositing compared with a float64 loop, its torch twin and finite differences, on hard inputs too."""
 
 from __future__ import annotations
 
@@ -89,11 +89,11 @@ def test_gradients_match_autograd_on_hard_inputs(dtype: torch.dtype) -> None:
 
 
 REACHES = [1e-9, 0.1, 0.3, 1.0]
-"""The intervals are in [0, 1]."""
+"""Reaches of the distortion loss; the intervals of the samples lie in [0, 1]."""
 
 
 def naive_distortion(weights: np.ndarray, mids: np.ndarray, widths: np.ndarray, reach: float) -> float:
-    """Mip-NeRF 360, equation 15, pair by pair, none of which counts as farther apart than `reach`."""
+    """Evaluate equation 15 of mip-NeRF 360 pair by pair, with each distance at most `reach`."""
     every = range(len(mids))
     pairs = sum(weights[i] * weights[j] * min(abs(mids[i] - mids[j]), reach) for i in every for j in every)
     return pairs + float((weights**2 * widths).sum()) / 3
@@ -128,7 +128,7 @@ def test_distortion_gradient_matches_finite_differences(reach: float) -> None:
 
 
 def test_two_surfaces_are_drawn_together_within_reach_alone() -> None:
-    """What is farther away than that may be anywhere."""
+    """The distortion loss draws surfaces together only within `reach`; beyond, distances do not matter."""
     widths, starts, counts = torch.full((2,), 1e-3), torch.tensor([0]), torch.tensor([2])
     weights = torch.tensor([0.35, 0.65])
     near, at, behind, far = (
@@ -150,7 +150,7 @@ def test_distortion_gradient_reaches_rays_out_of_order() -> None:
 @pytest.mark.parametrize("width", [0, 16])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_field_is_composited_as_its_parts_are(width: int, known: bool) -> None:
-    """In one function, against float64's density network and compositing one after the other."""
+    """One function for density network and compositing equals the two in float64, one after the other."""
     torch.manual_seed(1)
     density, exact = DensityNetwork(6, width), DensityNetwork(6, width).double()
     for parameter in density.parameters():
@@ -159,7 +159,7 @@ def test_a_field_is_composited_as_its_parts_are(width: int, known: bool) -> None
     counts = torch.tensor([3, 0, 1, 20])
     starts = torch.cumsum(counts, 0) - counts
     features = 2 * torch.randn(24, 6)
-    features[0], features[1], features[2] = 0, 60, -60  # saturated, and gone
+    features[0], features[1], features[2] = 0, 60, -60  # a saturated density, and one that is gone
     deltas = torch.full((24,), STEP)
     found = []
     for network, dtype in ((density, torch.float32), (exact, torch.float64)):

@@ -1,4 +1,4 @@
-"""The occupancy grid of a GPU finds, forgets and hands over what the CPU's does."""
+"""The occupancy grid on a GPU finds and forgets as the CPU's does, and continues from its state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vfr_bake.rendering.occupancy import DeviceOccupancyGrid
 
 
 class Ball:
-    """Stands for a field: dense inside a ball of the unit cube."""
+    """Stand-in for a field: dense inside a ball in the unit cube."""
 
     def __init__(self, centre: float) -> None:
         self.centre = centre
@@ -43,7 +43,7 @@ def test_what_moved_away_fades_and_what_came_is_found(device: torch.device) -> N
     generator = torch.Generator().manual_seed(0)
     for _ in range(200):
         grid.update(ball)  # type: ignore[arg-type]
-        points = torch.rand(2000, 3, generator=generator).to(device)  # of rays: they meet occupied cells only
+        points = torch.rand(2000, 3, generator=generator).to(device)  # rays sample occupied cells only
         points = points[grid.occupied[tuple((points * 24).long().T)]]
         grid.observe(points, ball.lookup(points)[1])
     assert not occupied(grid)[inside_cells(0.3)].any()
@@ -53,7 +53,7 @@ def test_what_moved_away_fades_and_what_came_is_found(device: torch.device) -> N
 def test_what_rays_meet_counts_as_looked_at(device: torch.device) -> None:
     grid = grid_on(device)
     grid.update(Ball(0.4))  # type: ignore[arg-type]
-    # Two rays meet one cell, the denser counts; the far corner of the cube belongs to the last cell.
+    # Two samples lie in one cell: the denser one counts. The cube's far corner belongs to the last cell.
     points = torch.tensor([[0.95, 0.05, 0.5], [0.951, 0.05, 0.5], [1.0, 1.0, 1.0]], device=device)
     grid.observe(points, torch.tensor([200.0, 30.0, 200.0], device=device))
     assert grid.densities[22, 1, 12] == 200 and grid.densities[23, 23, 23] == 200

@@ -1,4 +1,4 @@
-"""The compiled march against its lattice-by-lattice twin, and what it promises about budgets and order."""
+"""The compiled march compared with its slow twin, and its promises about budgets and order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The occupancy grid: it finds what is dense, forgets what went, and never goes blind."""
+"""The occupancy grid: it finds what is dense, forgets what is gone, and never loses sight of all matter."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 
 
 class Ball:
-    """Stands for a field: dense inside a ball of the unit cube."""
+    """Stand-in for a field: dense inside a ball in the unit cube."""
 
     def __init__(self, centre: float) -> None:
         self.centre = centre
@@ -19,7 +19,7 @@ class Ball:
 
 
 def inside_cells(centre: float, n: int = 24) -> np.ndarray:
-    """[n, n, n] bool: cells whose centre is well inside the ball."""
+    """Return the cells whose centre is well inside the ball, [n, n, n] bool."""
     x = (np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1) + 0.5) / n
     return np.linalg.norm(x - np.array([centre, 0.5, 0.5]), axis=-1) < 0.2 - 1 / n
 
@@ -42,7 +42,7 @@ def test_what_moved_away_fades_and_what_came_is_found() -> None:
     ball = Ball(0.7)
     for _ in range(200):
         grid.update(ball)  # type: ignore[arg-type]
-        points = random.random((2000, 3)).astype(np.float32)  # of rays: they meet occupied cells only
+        points = random.random((2000, 3)).astype(np.float32)  # rays sample occupied cells only
         points = points[grid.occupied[tuple((points * 24).astype(int).T)]]
         grid.observe(points, np.exp(ball.log_densities(points)))
     assert not grid.occupied[inside_cells(0.3)].any()
@@ -52,7 +52,7 @@ def test_what_moved_away_fades_and_what_came_is_found() -> None:
 def test_what_rays_meet_counts_as_looked_at() -> None:
     grid = OccupancyGrid(24, step=0.01, seed=0)
     grid.update(Ball(0.4))  # type: ignore[arg-type]
-    # Two rays meet one cell, the denser counts; the far corner of the cube belongs to the last cell.
+    # Two samples lie in one cell: the denser one counts. The cube's far corner belongs to the last cell.
     points = np.float32([[0.95, 0.05, 0.5], [0.951, 0.05, 0.5], [1.0, 1.0, 1.0]])
     grid.observe(points, np.float32([200.0, 30.0, 200.0]))
     assert grid.densities[22, 1, 12] == 200 and grid.densities[23, 23, 23] == 200

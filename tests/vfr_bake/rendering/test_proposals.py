@@ -1,4 +1,4 @@
-"""Proposal sampling: contraction, spacing, resampling and the interlevel loss against readable float64."""
+"""Contraction, spacing, resampling and interlevel loss of proposals, compared with readable float64."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SPACING = Row(
 
 
 def contract(point: np.ndarray) -> np.ndarray:
-    """Mip-NeRF 360, equation 10, in float64."""
+    """Evaluate equation 10 of mip-NeRF 360 in float64."""
     norm = np.linalg.norm(point)
     return point if norm <= 1 else (2 - 1 / norm) * point / norm
 
@@ -57,7 +57,7 @@ def test_spacing_and_distance_are_inverse() -> None:
 
 
 def naive_resample(edges: np.ndarray, weights: np.ndarray, m: int, jitter: float) -> np.ndarray:
-    """Borders of m intervals around the inverse of the distribution function."""
+    """Return the borders of m intervals around values of the inverse distribution function."""
     mass = weights + kernels.PADDING
     cdf = np.concatenate([[0], np.cumsum(mass)]) / mass.sum()
     centres = np.interp((np.arange(m) + jitter) / m, cdf, edges)
@@ -98,7 +98,7 @@ def test_resampling_inverts_the_distribution(name: str, jitter: float) -> None:
 def naive_interlevel(
     edges: np.ndarray, weights: np.ndarray, p_edges: np.ndarray, p_weights: np.ndarray
 ) -> float:
-    """Mip-NeRF 360, equation 13, interval by interval."""
+    """Evaluate equation 13 of mip-NeRF 360, interval by interval."""
     total = 0.0
     for i, w in enumerate(weights):
         overlaps = (p_edges[:-1] < edges[i + 1]) & (p_edges[1:] > edges[i])
@@ -161,7 +161,8 @@ def test_samples_lie_where_they_say() -> None:
 
 @pytest.mark.parametrize("scale", [0.0, 2.0, 30.0])
 def test_rounds_are_the_equations_in_float64(scale: float) -> None:
-    """What rounds find for their edges; with a scale of 30 densities reach the largest and are opaque."""
+    """The points, depths and weights of each round, at the edges that the round drew, are those of float64.
+    With a scale of 30, densities reach the largest and rays become opaque."""
     field, sampler, rays_o, rays_d = make()
     for grid in sampler.grids:
         torch.nn.init.uniform_(grid.table, -scale, scale)
@@ -180,7 +181,7 @@ def test_rounds_are_the_equations_in_float64(scale: float) -> None:
         seen = before < OPAQUE_DEPTH * 0.99
         assert seen.any(axis=1).all() and (scale < 30 or not seen.all())
         np.testing.assert_allclose(found.points.transpose(0, 2, 1)[seen], points[seen], rtol=0, atol=1e-6)
-        # Logits are sums of up to ten numbers of `scale`, in places known to 1e-6 of up to 512 cells.
+        # A logit sums up to ten numbers of size `scale`, at places known to 1e-6 in up to 512 cells.
         close = {"rtol": 1e-4 + 1e-3 * scale, "atol": 1e-7}
         np.testing.assert_allclose(found.depths[seen], depths[seen], **close)
         ours = np.cumsum(found.depths.astype(np.float64), axis=1) - found.depths
@@ -191,13 +192,13 @@ def test_rounds_are_the_equations_in_float64(scale: float) -> None:
 
 
 def test_thin_and_opaque_depths_keep_their_digits() -> None:
-    """Where a proposal gives every interval the same density, from next to nothing to the largest."""
+    """Weights keep their precision if all intervals have one density, from almost 0 to the largest."""
     field, sampler, rays_o, rays_d = make()
     for logit in (-1e4, -80.0, -60.0, -20.0, -5.0, -1.0, 0.0, 3.0, LARGEST_LOGIT, 1e4):
         with torch.no_grad():
             for grid in sampler.grids:
                 grid.table.zero_()
-                grid.table[: 17**3] = logit  # of the coarsest level alone
+                grid.table[: 17**3] = logit  # the rows of the coarsest level only
         _, _, rounds = sampler.sample_rounds(field, rays_o, rays_d, torch.rand(40, 3))
         for found in rounds:
             lengths = np.diff(np.vectorize(kernels.distance)(found.edges.astype(np.float64)), axis=1)
@@ -209,7 +210,7 @@ def test_thin_and_opaque_depths_keep_their_digits() -> None:
 
 
 def test_rays_may_lie_axis_by_axis() -> None:
-    """As those of a camera do."""
+    """Rays may be stored axis by axis (in Fortran order), as those of a camera are."""
     field, sampler, rays_o, rays_d = make()
     expected = sampler.sample_all(field, rays_o.numpy(), rays_d.numpy())
     samples = sampler.sample_all(field, *(np.asfortranarray(rays.numpy()) for rays in (rays_o, rays_d)))

@@ -1,4 +1,4 @@
-"""Compositing and distortion in torch against the float64 loop, the twin and the numba kernels."""
+"""Compositing and distortion in torch compared with the float64 loop, the twin and the numba kernels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_its_gradients_are_the_kernels_on_hard_inputs(dtype: torch.dtype, device
 
 
 def test_thin_samples_are_not_lost_behind_another_rays_dense_ones(device: torch.device) -> None:
-    """A sum over all samples, less what came before the ray, would find nothing here."""
+    """Thin samples count even behind another ray's dense ones: a sum over all rays would lose them."""
     n = 10_000
     sigmas = torch.cat([torch.full((100,), 3e6), torch.full((n,), 1e-9)]).to(device)
     starts, counts = torch.tensor([0, 100], device=device), torch.tensor([100, n], device=device)

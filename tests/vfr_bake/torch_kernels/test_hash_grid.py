@@ -1,4 +1,4 @@
-"""The hash grid in torch against the float64 loop, the numba kernels, and itself with graphs taken."""
+"""The hash grid in torch compared with the float64 loop and the numba kernels, also as a graph."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_it_matches_the_equation(dtype: torch.dtype, tolerance: float, device: t
 
 
 def test_rows_of_large_hashed_levels_are_those_of_the_kernel(device: torch.device) -> None:
-    """Vertices so far out that the kernel's products wrap around in 32 bits."""
+    """Rows of large hashed levels are the kernel's, also where its products wrap around in 32 bits."""
     torch.manual_seed(0)
     layout = GridLayout(2, 512, 8192, 12)
     table = torch.rand(layout.n_entries, 2, dtype=torch.float64)
@@ -76,7 +76,7 @@ def test_no_point_at_all(device: torch.device) -> None:
 
 
 def test_one_graph_serves_all_numbers_of_points(device: torch.device) -> None:
-    """What is compiled on a GPU has no break and is not compiled anew for another number of points."""
+    """One graph, without a break, serves every number of points, so that a GPU compiles only once."""
     grid = small_grid(torch.float32).to(device)
     levels = grid.layout.levels(grid.table)
     graphs = []

@@ -1,4 +1,4 @@
-"""The march in torch against its lattice-by-lattice twin and the numba kernel, and its promises."""
+"""The march in torch compared with its slow twin and the numba kernel, and its promises."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def on(device: torch.device, logit: float) -> VfrField:
 def march(
     logit: float, occupied: np.ndarray, budget: int, device: torch.device, n: int | None = None
 ) -> tuple[RaySamples, torch.Tensor]:
-    """March the first `n` test rays; all tensors that are returned are on the CPU."""
+    """March the first `n` test rays; all returned tensors are on the CPU."""
     rays_o, rays_d = (a[:n].to(device) for a in rays())
     cells = torch.from_numpy(occupied).to(device)
     samples, sigmas = sampling.march_on_device(

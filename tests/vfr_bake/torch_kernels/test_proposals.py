@@ -1,4 +1,4 @@
-"""Proposal sampling in torch against the numba kernels and the formulas in float64."""
+"""Proposal sampling in torch compared with the numba kernels and the formulas in float64."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_interlevel_loss_and_its_gradient(device: torch.device) -> None:
 
 
 def guides(device: torch.device) -> tuple[ProposalGuide, DeviceProposalGuide]:
-    """Both paths' with the same tables."""
+    """Return the guides of the numba kernels and of torch, with the same tables."""
     _, sampler, _, _ = make()
     config = TrainConfig()
     pace = config.for_device("cpu", True)
@@ -104,8 +104,8 @@ def guides(device: torch.device) -> tuple[ProposalGuide, DeviceProposalGuide]:
 
 @pytest.mark.parametrize("step", [0, 10, 1000])
 def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) -> None:
-    """Each stage from what the kernels' own one before it has found: flat parts of a distribution magnify
-    rounding a thousandfold in each round."""
+    """Each stage in torch equals the kernels' in float64. It starts from the result of the kernels' previous
+    stage, because each round magnifies rounding a thousandfold where a distribution is flat."""
     field, _, *rays = make()
     torch.manual_seed(3)
     jitter = torch.rand(40, 3)
@@ -137,8 +137,8 @@ def test_every_stage_is_the_kernels_in_float64(step: int, device: torch.device) 
 
 
 def same_borders(ours: np.ndarray, expected: torch.Tensor) -> None:
-    """In float32 a sum of 64 masses of up to 1 is known to 4e-6, which is 4e-3 of an interval that has no
-    more than the padding of 1e-3: few borders lie in such."""
+    """Assert equal borders up to float32 rounding: a sum of 64 masses of up to 1 is known to 4e-6, which is
+    4e-3 of an interval that has no more mass than the padding of 1e-3. Few borders lie in such intervals."""
     off = np.abs(ours - expected.cpu().numpy())
     assert off.max() < 1e-3 and np.quantile(off, 0.99) < 3e-5
 
@@ -169,7 +169,8 @@ def test_proposals_learn_ever_more_rarely_and_samples_get_half_as_many(device: t
 @pytest.mark.parametrize("step", [0, 5])
 @pytest.mark.parametrize("bias", [0.0, 20.0])
 def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, device: torch.device) -> None:
-    """Samples, regulariser and the tables' gradients; with a bias of 20 every first sample is opaque."""
+    """Both guides give the same samples, regulariser and gradients of tables. With a bias of 20, every first
+    sample is opaque."""
     field, _, rays_o, rays_d = make()
     with torch.no_grad():
         field.density.out.bias.fill_(bias)
@@ -192,7 +193,7 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
     torch.testing.assert_close(losses[1].cpu(), losses[0], rtol=1e-4, atol=1e-7)
     assert len(gradients[0]) == len(gradients[1]) == 2
     for ours, expected in zip(*reversed(gradients), strict=True):
-        # Whether an interval counts as overlapping one that it just touches is for rounding to say.
+        # Rounding decides whether an interval counts as overlapping one that it only touches.
         close = (ours - expected).abs() <= 1e-3 * expected.abs() + 2e-4 * expected.abs().max()
         assert expected.abs().max() > 0 and int((~close).sum()) <= 1e-4 * len(close)
         assert (ours - expected).norm() < 0.02 * expected.norm()
@@ -200,7 +201,7 @@ def test_both_guides_find_the_same_and_learn_the_same(step: int, bias: float, de
 
 def same_samples(ours: RaySamples, expected: RaySamples) -> None:
     assert torch.equal(ours.counts.cpu(), expected.counts) and torch.equal(ours.starts.cpu(), expected.starts)
-    # Borders are drawn from sums of 64 weights in another order; far out a rounding of s is magnified in t.
+    # Borders are drawn from sums of 64 weights in another order; far out, rounding of s grows in t.
     torch.testing.assert_close(ours.t_mid.cpu(), expected.t_mid, rtol=2e-3, atol=1e-5)
     torch.testing.assert_close(ours.deltas.cpu(), expected.deltas, rtol=5e-2, atol=1e-5)
     # A border lies where sums of weights reach a share; in an interval with hardly more than the padding of

@@ -1,4 +1,4 @@
-"""The samples of the next step are taken while a step is learned from, in the field before it."""
+"""The next step's samples are drawn while a step is learned from, in the field as it was before that step."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ KINDS: tuple[SceneKind, ...] = ("object", "unbounded")
 
 @pytest.fixture
 def two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Two threads to share out, however many cores there are."""
-    numba.get_num_threads()  # starts its threads, with which OpenMP gives torch as many
+    """Provide two threads to split, however many cores there are."""
+    numba.get_num_threads()  # starts numba's threads, and OpenMP then gives torch as many
     n_torch = torch.get_num_threads()
     monkeypatch.setattr(ahead, "get_num_threads", lambda: 2)
     torch.set_num_threads(2)
@@ -34,7 +34,7 @@ def two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def trainer(kind: SceneKind, pilot_steps: int) -> Trainer:
-    """A trainer of the built-in object, or of a scene without end."""
+    """Return a trainer of the built-in scene, as an object or as an unbounded scene."""
     config = TrainConfig(
         device="cpu", steps=30, minutes=60.0, pilot_steps=pilot_steps, batch_samples=2048, batch_rays=64,
         occupancy_resolution=32, field=FIELD,
@@ -44,7 +44,7 @@ def trainer(kind: SceneKind, pilot_steps: int) -> Trainer:
 
 
 def test_batches_of_an_unbounded_scene_grow_with_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """64 rays, half of them in the pilot's steps; after 8 steps every second is 16 rays larger."""
+    """A batch has 64 rays, half of that in the pilot's steps, and 16 more every second step from step 8."""
     monkeypatch.setitem(GROWTH, True, Growth(after=8, most=3.0))
     drawn = [report.n_rays for report in trainer("unbounded", 4).run()]
     assert drawn[:4] == [32] * 4 and drawn[4:10] == [64] * 6, "all rays of a scene without end are served"
@@ -52,7 +52,7 @@ def test_batches_of_an_unbounded_scene_grow_with_the_steps(monkeypatch: pytest.M
 
 
 def test_batches_of_an_object_grow_with_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """2,048 samples, half of them in the pilot's steps, which are filled up to the last ray."""
+    """A batch has at most 2,048 samples, half of that in the pilot's steps, and grows from step 8 on."""
     monkeypatch.setitem(GROWTH, False, Growth(after=8, most=2.0))
     reports = list(trainer("object", 4).run())
     most = [1024] * 4 + [2048] * 6 + [2560] * 2 + [3072] * 2 + [3584] * 2 + [4096] * 14
@@ -108,7 +108,8 @@ def test_samples_are_those_of_the_field_a_step_before(kind: str, threaded: bool,
             with torch.no_grad():
                 assert (grid(samples.points) - samples.features).abs().max() > 1e-5
                 grid.table.copy_(table)
-                # To rounding: kernels that march and one that looks up may contract products in other ways.
+                # Equal up to rounding: the kernel that marches and the one that looks up may fuse products
+                # and sums differently.
                 torch.testing.assert_close(grid(samples.points), samples.features, rtol=0, atol=1e-6)
                 grid.table.copy_(now)
             n_ahead += 1

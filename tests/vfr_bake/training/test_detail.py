@@ -1,4 +1,4 @@
-"""Chances by detail: a naive loop, plain pictures, what is transparent, and pictures of one pixel."""
+"""Lots of pixels by detail, compared with a naive loop; plain, transparent and one-pixel pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vfr_bake.training.detail import MEAN_LOTS, MIX, POWER, WINDOW, detail_lots
 
 
 def naive_lots(rgba: np.ndarray) -> np.ndarray:
-    """[height, width] float64, not rounded."""
+    """Return the lots [height, width] float64, not rounded, by loops over pixels."""
     height, width = rgba.shape[:2]
     colours = rgba.astype(float) / 255
     colours[..., :3] *= colours[..., 3:]
@@ -38,7 +38,7 @@ def test_lots_are_those_of_a_naive_loop(size: tuple[int, int]) -> None:
     rgba[: size[0] // 2] = rgba[0, 0]  # a plain part
     rgba[-1, :2, 3] = 0
     rgba[0, -1] = 255
-    # Rounded to whole lots, in float32.
+    # The lots are rounded to whole numbers, and computed in float32.
     np.testing.assert_allclose(detail_lots(rgba), np.clip(naive_lots(rgba), 1, 255), atol=0.501, rtol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Training through torch, as on a GPU: on a CPU it ends where numba ends; settings follow from the device."""
+"""Training with torch's kernels, as on a GPU, learns what numba's do; settings depend on the device."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def psnr(trainer: Trainer, scene: Scene) -> float:
 @pytest.mark.parametrize("kind", ["object", "unbounded"])
 def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None:
     scene = small_scene(kind)
-    # Room for the samples of all rays: of those that do not fit, the two backends leave out different ones.
-    # And the same learning rate, whose default is another on a GPU.
+    # Batches have room for the samples of all rays, because of those that do not fit, the two backends leave
+    # out different ones. The learning rate is the same, although its default is another on a GPU.
     settings: dict[str, Any] = {"pilot_steps": 40, "batch_samples": 16384, "batch_rays": 48}
     settings["network_rate"] = 0.004
     settings |= {"steps": 150} if kind == "object" else {"steps": 120}
@@ -56,7 +56,7 @@ def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None
 
 @pytest.mark.parametrize("kind", ["object", "unbounded"])
 def test_what_a_step_makes_is_made_beside_the_field(kind: str) -> None:
-    """A tensor that were made on torch's default device, whatever it is, could not be used on a GPU."""
+    """A step makes its tensors on the field's device; torch's default device may be another one."""
     settings = {"pilot_steps": 1, "batch_rays": 32, "batch_samples": 1024, "steps": 3}
     trainer = Trainer(small_scene(kind), config(**settings), backend="torch")
     with torch.device("meta"):
@@ -86,7 +86,7 @@ def test_a_run_that_was_interrupted_goes_on(kind: str, device: torch.device, tmp
     # A GPU adds up in no fixed order.
     tolerance = 0 if device.type == "cpu" else 1e-2
     np.testing.assert_allclose([report.loss for report in again.run()], losses[12:], rtol=tolerance)
-    content = torch.load(tmp_path / "c", weights_only=True)  # without map_location: where they were saved
+    content = torch.load(tmp_path / "c", weights_only=True)  # without map_location: as saved
     assert {tensor.device.type for tensor in tensors(content)} == {"cpu"}
 
 
@@ -135,11 +135,11 @@ def test_a_gpu_is_taken_if_there_is_one_and_missed_if_asked_for(monkeypatch: pyt
     assert choose_device("cpu") == torch.device("cpu")
 
 
-# On Python 3.13.0, of all versions, torch warns of a dictionary that it cannot watch, which costs time alone.
+# On Python 3.13.0 only, torch warns of a dictionary that it cannot watch. That costs time and nothing else.
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0:RuntimeWarning")
 @pytest.mark.parametrize("unbounded_field", [False, True])
 def test_the_networks_are_one_graph_each(unbounded_field: bool, device: torch.device) -> None:
-    """As they are compiled on a GPU: without a break, and with equal gradients."""
+    """Each network compiles to one graph without a break, as on a GPU, with equal outputs and gradients."""
     options = FieldOptions(n_levels=4, max_resolution=64, log2_table_size=12, head_width=16)
     field = VfrField(options.resolved(unbounded_field)).to(device)
     torch._dynamo.reset()

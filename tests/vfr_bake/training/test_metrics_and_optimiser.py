@@ -1,4 +1,4 @@
-"""PSNR, pictures over backgrounds, Adam on the table and the schedule."""
+"""PSNR, pictures over backgrounds, Adam on the table and on other tensors, and the schedule."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def test_alpha_blends_over_the_background() -> None:
 
 
 def test_adam_is_torchs_and_goes_on_where_it_was() -> None:
-    """Also where a tensor has no gradient in some steps, as the pilot's has none once it is done."""
+    """Adam equals torch's and continues from its state, even if a tensor has no gradient in some steps, as
+    the pilot's tensors do once it is done."""
     torch.manual_seed(0)
     start = [torch.randn(7, 5), torch.randn(5), torch.randn(3)]
     ours, theirs = ([tensor.clone().requires_grad_() for tensor in start] for _ in range(2))
@@ -64,7 +65,7 @@ def test_adam_is_torchs_and_goes_on_where_it_was() -> None:
 
 
 def test_a_start_does_not_import_torchs_compiler() -> None:
-    """It takes three seconds."""
+    """A step of the optimiser does not import torch's compiler, which would take three seconds."""
     program = (
         "import sys, torch; from vfr_bake.training.optimiser import Adam; x = torch.ones(2); "
         "x.grad = torch.ones(2); Adam([x]).step(0.1); assert 'torch._dynamo' not in sys.modules"
@@ -96,8 +97,8 @@ def test_scatter_and_step_in_one_are_the_two_one_after_the_other() -> None:
     ours, theirs = HashGrid(config), HashGrid(config)
     theirs.load_state_dict(ours.state_dict())
     fused, plain = FusedGridAdam(ours), GridAdam(theirs.table)
-    for n_points in (300, 1, 0, 3000):  # the last outgrows the first one's scratch
-        # Many points at one place: their gradients add up in one row, and sometimes to zero.
+    for n_points in (300, 1, 0, 3000):  # the last one needs more scratch memory than the first
+        # Many points lie at one place: their gradients add up in one row, and sometimes to zero.
         points = torch.cat([torch.rand(n_points, 3), torch.full((n_points // 3, 3), 0.37)])
         gradient = torch.randn(len(points), config.n_channels)
         gradient[::7] = 0

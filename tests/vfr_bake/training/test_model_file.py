@@ -1,4 +1,4 @@
-"""`model.pt`: what goes in comes out, and nothing but a model gets in."""
+"""`model.pt`: a saved model is loaded unchanged, and anything but a model is refused."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def sampler(**values: object) -> dict:
 
 
 def witnesses(**values: object) -> dict:
-    """Those of the model in tensors, some replaced; a list stands for 32-bit integers, or floats."""
+    """Return the model's witnesses as tensors, some replaced; a list stands for 32-bit integers or floats."""
     whole = {"counts": [2, 3], "pixels": [0, 47, 0, 1, 55], "whole": [1]} | values
     tensors = {name: torch.tensor(value) for name, value in whole.items() if isinstance(value, list)}
     tensors = {name: value.int() if value.dtype == torch.int64 else value for name, value in tensors.items()}
@@ -92,7 +92,7 @@ def test_a_model_of_before_there_were_witnesses_still_loads(saved: Path) -> None
 
 
 def test_training_pixels_come_back(model: Model, saved: Path) -> None:
-    """And are missing in a model of before there were any."""
+    """Training pixels are loaded as they were saved; a model from before there were any has none."""
     assert load_model(saved).training_pixels is None
     assert len(load_model(saved).training_pixel_rays()[2]) == 0
     pixels = model.witnesses
@@ -125,7 +125,7 @@ def test_as_many_witnesses_as_there_may_be_take_less_than_500_kb(model: Model, t
 
 
 def test_rays_of_witnesses_are_those_of_their_pixels(model: Model) -> None:
-    """And the cameras that were learned from are those of the views that are not whole."""
+    """Rays of witnesses are those of their pixels; cameras that were learned from are not of whole views."""
     rays = [camera.transformed(np.linalg.inv(model.world_from_model)).rays() for camera in model.cameras]
     views, pixels = [0, 0, 1, 1, 1], [0, 47, 0, 1, 55]
     for k, found in enumerate(model.witness_rays()):
@@ -135,7 +135,8 @@ def test_rays_of_witnesses_are_those_of_their_pixels(model: Model) -> None:
 
 
 def test_what_lies_behind_surroundings_is_their_mean_colour(model: Model) -> None:
-    """Every ray of an unbounded field meets something; here a fog, each of whose directions has a colour."""
+    """The background of an unbounded scene is its mean colour, as every ray meets something: here fog, with
+    another colour in each direction."""
     field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
     with torch.no_grad():
         field.grid.table.fill_(1.0)
@@ -239,7 +240,7 @@ def test_where_a_scene_begins_is_checked(saved: Path, model: Model, near: float)
 
 
 def test_samplers_of_scenes_come_back(saved: Path, model: Model) -> None:
-    """Proposals with the levels of today and of before version 2.4."""
+    """Samplers of scenes are loaded, with the proposals' levels of today and those before version 2.4."""
     field = VfrField(replace(CONFIG, unbounded=True, density_width=0))
     torch.nn.init.uniform_(field.grid.table, -1, 1)
     rays_o, rays_d = np.zeros((3, 3), np.float32), np.eye(3, dtype=np.float32)

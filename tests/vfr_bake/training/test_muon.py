@@ -1,4 +1,4 @@
-"""Muon against the singular value decomposition, and how far it moves what it optimises."""
+"""Muon compared with the singular value decomposition, and how far it moves parameters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def test_singular_vectors_stay_and_singular_values_become_about_one(
     u, s, vt = torch.linalg.svd(matrices.double(), full_matrices=False)
     found = u.mT @ orthogonal(matrices).double() @ vt.mT
     values = found.diagonal(dim1=1, dim2=2)
-    large = s > 0.02 * s.norm(dim=1, keepdim=True)  # smaller ones are not there yet after five iterations
+    large = s > 0.02 * s.norm(dim=1, keepdim=True)  # smaller ones have not got there after five iterations
     assert 0.6 < float(values[large].min()) and float(values.max()) < 1.25 and float(values.min()) > -1e-4
     off = found - torch.diag_embed(values)
     assert float(off.abs().max()) < 1e-4
 
 
 def test_one_direction_and_none() -> None:
-    """A matrix of rank one is made of one direction, to its length; 0 and what it moves stay."""
+    """A matrix of rank one keeps its direction and gets a norm of about 1; a matrix of zeros stays 0."""
     one = torch.outer(torch.linspace(-1, 1, 12), torch.ones(10))[None]
     found = orthogonal(torch.cat([one, 0 * one]))
     assert float(torch.linalg.matrix_norm(found[0])) == pytest.approx(0.95, abs=0.3)
@@ -50,8 +50,8 @@ def test_every_entry_moves_by_about_the_rate() -> None:
 
 
 def test_it_learns_directions_of_small_gradients() -> None:
-    """A linear map of inputs that are 300 times as large in some directions as in others: where Adam is left
-    with most of the error after 200 steps, Muon has next to none."""
+    """Muon learns directions of small gradients. For a linear map of inputs 300 times as large in some
+    directions as in others, Adam keeps most of the error after 200 steps, and Muon almost none."""
 
     def error(make: type[Muon] | None) -> float:
         torch.manual_seed(0)

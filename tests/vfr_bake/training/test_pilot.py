@@ -1,8 +1,9 @@
 """Section 3.3 of the paper: some scenes do not converge with a large head unless a pilot network finds their
 geometry first.
 
-The paper met it on `ship`. Here it is the built-in scene photographed in front of a white wall, without
-alpha: the wall is white whatever the opacity is, so that nothing but the head's colours says where matter is.
+The paper observed this with `ship`. Here it is the built-in scene photographed in front of a white wall,
+without alpha: the wall is white whatever the opacity is, so that nothing but the head's colours says where
+matter is.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SMALL_GRID = {"n_levels": 8, "max_resolution": 64, "log2_table_size": 14, "densi
 
 
 def before_a_wall(views: PosedImages) -> PosedImages:
-    """The same pictures as a camera would give them: opaque, white behind."""
+    """Return the same pictures as a camera would take them in front of a white wall: opaque."""
     images = []
     for image in views.images:
         rgb, alpha = image[..., :3].astype(np.float64), image[..., 3:] / 255
@@ -38,7 +39,7 @@ def before_a_wall(views: PosedImages) -> PosedImages:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """Sums in one order: which seeds fail hangs on the last bit."""
+    """Run on one thread, so that sums have one order: the seeds that fail depend on the last bit."""
     n_torch, n_numba = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
     numba.set_num_threads(1)
@@ -48,14 +49,14 @@ def one_thread() -> Iterator[None]:
 
 
 def psnr(scene: Scene, pilot_steps: int, seed: int) -> float:
-    """On held-out views, after 300 steps with 10 layers of 256 and the paper's rate for all."""
+    """Return the PSNR on held-out views, after 300 steps with 10 layers of 256 and the paper's rate."""
     config = TrainConfig(
         device="cpu", steps=300, minutes=60.0, pilot_steps=pilot_steps, batch_samples=4096, seed=seed,
         network_rate=1e-2, occupancy_resolution=32,
         field=FieldOptions(**SMALL_GRID, head_width=256, n_directional_layers=8),
     )  # fmt: skip
     trainer = Trainer(scene, config)
-    trainer.field.head.products = torch.float32  # on any machine: which seeds fail hangs on it
+    trainer.field.head.products = torch.float32  # on any machine: the seeds that fail depend on it
     for _ in trainer.run():
         pass
     scores = evaluate(trained_model(trainer, scene, {}), scene.test)
@@ -68,8 +69,8 @@ def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:
     blank = np.mean(
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
-    # About every second seed fails; the field stays nearly empty then, and the picture white. With the pilot
-    # all reach some 10 dB more: the head begins when its rate, which is high for so many layers, is falling.
+    # About every second seed fails: the field stays nearly empty, and the picture white. With the pilot all
+    # seeds reach some 10 dB more, because the head begins when its rate, high for so many layers, is falling.
     failed = next((seed for seed in (2, 0, 3, 1, 4, 5, 6, 7, 8, 9) if psnr(scene, 0, seed) < blank + 3), None)
     assert failed is not None
     assert psnr(scene, 200, failed) > blank + 6

@@ -1,4 +1,4 @@
-"""Two processes with a share of the batch each learn what one with the whole batch learns."""
+"""Two processes, each with a share of the batch, learn what one process with the whole batch learns."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ KINDS = ("object", "unbounded")
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, list[float]]]:
-    """The losses of each kind, of one process and of two, which train all kinds one after the other: to start
-    a process takes longer than to train."""
+    """The losses of each kind, for one process and for two. A process trains all kinds one after the other,
+    because starting a process takes longer than training."""
     folder = tmp_path_factory.mktemp("processes")
     program, one, two = (folder / name for name in ("program.py", "one.json", "two.json"))
     program.write_text(PROGRAM)
@@ -68,6 +68,6 @@ def test_two_processes_have_the_loss_curve_of_one(kind: str, curves: list[dict[s
     # Sums of gradients in another order: float32 rounding, which training amplifies step by step.
     np.testing.assert_allclose(losses[1][:10], losses[0][:10], rtol=1e-4)
     np.testing.assert_allclose(losses[1][:40], losses[0][:40], rtol=0.05)
-    # Backgrounds are random, so that a step's loss says little; over 40 steps it hides what is learned.
+    # Backgrounds are random, so that a step's loss says little: over 40 steps it hides the progress.
     for curve in losses:
         assert np.mean(curve[60:]) < np.mean(curve[:20])

@@ -1,5 +1,5 @@
-"""Random pixels: the right rays, the right colours, every pixel but a witness as often as any other,
-or as its detail asks for."""
+"""Random pixels: their rays and colours are right, witnesses are never drawn, and every other pixel is drawn
+as often as any other, or as often as its detail asks for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vfr_bake.training.rays import RUN, DevicePixelSampler, Lottery, PixelSample
 
 
 def mixed_views() -> PosedImages:
-    """Three pictures of different sizes; no two pixels have one colour."""
+    """Return three pictures of different sizes, in which no two pixels have the same colour."""
     sizes = [(4, 3), (7, 5), (2, 6)]
     cameras = [
         replace(camera, width=width, height=height, cx=width / 2 + 0.3, fy=9.0 + index)
@@ -67,7 +67,7 @@ def number_of(batch: RayBatch) -> np.ndarray:
 
 
 def check_draws(batch: RayBatch, lots: np.ndarray) -> None:
-    """Every pixel has been drawn as often as its `lots` [n] say."""
+    """Assert that every pixel has been drawn as often as its `lots` [n] say."""
     counts = np.bincount(number_of(batch), minlength=len(lots))
     expected = len(batch.rgba) * lots / lots.sum()
     # Five standard deviations of the counts, which are Poisson distributed.
@@ -116,7 +116,7 @@ def test_pictures_without_a_pixel_to_draw() -> None:
 
 
 def some_witnesses() -> Witnesses:
-    """The second picture is whole; of the others the first and the last pixel, and neighbours."""
+    """Return witnesses: the second picture is whole; others have first and last pixels, and neighbours."""
     kept = {0: [0, 1, 2, 7, 11], 1: [3, 30], 2: [0, 5, 6, 11]}
     return Witnesses(
         np.array([len(pixels) for pixels in kept.values()], np.int32),

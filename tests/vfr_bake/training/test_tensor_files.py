@@ -1,4 +1,4 @@
-"""Files of tensors that would take more memory than they have bytes, or make what is no tensor."""
+"""Tensor files that would take far more memory than their size, or that would make other objects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def repacked(path: Path, method: int) -> None:
 
 
 def test_numbers_that_were_packed(tmp_path: Path) -> None:
-    """torch would inflate them: a thousand times the size of the file."""
+    """Compressed entries are refused: torch would inflate them, to a thousand times the size of the file."""
     path = tmp_path / "model.pt"
     write_tensors(path, {"a": torch.zeros(10_000_000)})
     repacked(path, zipfile.ZIP_STORED)
@@ -43,7 +43,7 @@ def test_one_number_in_ten_thousand_million_places(tmp_path: Path) -> None:
 
 
 def test_values_that_refer_to_each_other(tmp_path: Path) -> None:
-    """Thirty lists, each twice in the next: a thousand million ways to the first."""
+    """Thirty lists, each twice in the next, can be read: a thousand million ways lead to the first."""
     inner: list = [torch.zeros(2)]
     for _ in range(30):
         inner = [inner, inner]
@@ -53,7 +53,8 @@ def test_values_that_refer_to_each_other(tmp_path: Path) -> None:
 
 
 def test_what_is_no_tensor(tmp_path: Path) -> None:
-    """Ten gigabytes of zeros out of thirty bytes, which torch's own list of what is safe lets pass."""
+    """Objects other than tensors are refused, such as thirty bytes that make ten gigabytes of zeros: torch's
+    own list of safe types lets these pass."""
 
     class Zeros:
         def __reduce__(self) -> tuple:

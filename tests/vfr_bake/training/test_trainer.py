@@ -81,7 +81,8 @@ def test_the_head_multiplies_as_the_processor_does_best(
 def test_densities_of_captures_do_not_steepen_without_end(
     scene: Scene, unbounded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A decay holds the density network's matrices; a thousand times as much shows in a few steps."""
+    """A decay holds back the density network's matrices in captures alone. A thousand times the usual decay
+    is used, because its effect shows in a few steps."""
     sizes = []
     for decay in (0.0, 1000 * DENSITY_DECAY):
         monkeypatch.setattr("vfr_bake.training.trainer.DENSITY_DECAY", decay)
@@ -94,11 +95,11 @@ def test_densities_of_captures_do_not_steepen_without_end(
 
 
 def test_the_minutes_end_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that moves on by a second whenever it is looked at."""
+    """The minutes end a training, by a clock that moves on by a second whenever it is read."""
     clock = itertools.count()
     monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: next(clock)))
     reports = list(Trainer(scene, config(steps=10**6, minutes=0.5, batch_samples=1024)).run())
-    # A look at the beginning, and two at each step: before it and after it. 30 seconds are over at the 15th.
+    # The clock is read at the beginning, and before and after each step: step 15 ends after 30 seconds.
     assert [report.seconds for report in reports] == list(range(2, 31, 2))
     assert [report.progress for report in reports] == [second / 30 for second in range(1, 30, 2)]
 
@@ -124,15 +125,15 @@ def test_pictures_without_alpha_train_over_their_own_background(scene: Scene) ->
     batch = trainer._draw(500)
     assert (batch.rgba[:, 3] == 1).all() and (batch.background == 1).all()
     assert all(report.loss == report.loss for report in trainer.run()) and trainer.next_step == 5
-    for other in (scene, replace(photographs, unbounded=True)):  # there a thin fog would be as good as a wall
+    for other in (scene, replace(photographs, unbounded=True)):  # else a thin fog would be as good as a wall
         background = Trainer(other, config(steps=5))._draw(500).background
         assert 0 <= background.min() < 0.05 and 0.95 < background.max() < 1
         assert (background.std(dim=1) > 0.01).float().mean() > 0.9, "each ray has a colour of its own"
 
 
 def unbounded(scene_size: int = 32) -> Scene:
-    """The built-in scene in contracted space, whose alpha is learned from: it tells more in a few steps than
-    surroundings do."""
+    """Return the built-in scene in contracted space. Its alpha is learned from, which teaches more in a few
+    steps than surroundings do."""
     scene = build_scene(demo_capture(size=scene_size, n_train=12, n_test=2), "unbounded")
     return replace(scene, has_alpha=True, masked=False)
 
@@ -156,7 +157,7 @@ def test_only_in_scenes_what_is_near_learns_slowly(
 
 
 def on_disk(scene: Scene, path: Path) -> Scene:
-    """The scene with its training pictures on the disk, in ten chunks, each drawn from for a few steps."""
+    """Return the scene with its training pictures on the disk, in ten chunks, each used for a few steps."""
     images = scene.train.images
     layout = Layout.of((image.shape[1], image.shape[0]) for image in images)
     assert len(layout.chunks) == 11
@@ -170,7 +171,7 @@ def on_disk(scene: Scene, path: Path) -> Scene:
 def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bit by bit: everything that the next step depends on is in the checkpoint."""
+    """A resumed run ends, to the last bit, where the whole run ends: the checkpoint holds all it needs."""
     monkeypatch.setattr(stored, "PIXELS_OF_A_PIECE", 100)
     scene = unbounded() if kind == "unbounded" else demo_scene(size=32, n_train=12, n_test=2)
     if kind == "on disk":
@@ -194,7 +195,7 @@ def test_a_run_that_was_interrupted_ends_where_the_whole_one_ends(
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 @pytest.mark.parametrize("kind", ["object", "unbounded", "downscale", "opaque"])
 def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every picture's pixels carry their number, and what the steps were given is looked through."""
+    """No step learns from a witness: pixels' colours are their numbers, and drawn ones are checked."""
     capture = demo_capture(size=48, n_train=20, n_test=2)
     unbounded_kind: SceneKind = "unbounded" if kind == "unbounded" else "object"
     if kind == "downscale":
@@ -224,7 +225,7 @@ def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch:
     for _ in trainer.run():
         pass
     found = np.concatenate(drawn)
-    # One more batch where the next step's is drawn during the last.
+    # One batch more is drawn if the next step's batch is drawn during the last step.
     assert len(drawn) in (12, 13) and len(found) > 300
     witnesses = trainer.witnesses
     kept = witnesses.views() * side * side + witnesses.pixels
@@ -235,7 +236,8 @@ def test_no_step_learns_from_a_witness(kind: str, backend: Backend, monkeypatch:
 def test_a_run_goes_on_with_the_witnesses_that_it_began_with(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even where another version would choose others: what was learned from cannot be a witness any more."""
+    """A resumed run keeps its first witnesses, even if this version would choose others: pixels that were
+    learned from cannot be witnesses any more."""
     trainer = Trainer(scene, config(steps=3))
     save_checkpoint(tmp_path / "c", trainer)
     monkeypatch.setattr("vfr_bake.data.witnesses.SEED", 21)
@@ -250,7 +252,7 @@ def test_a_run_goes_on_with_the_witnesses_that_it_began_with(
 
 
 def test_pixels_for_a_bake_are_those_that_training_learns_from(scene: Scene) -> None:
-    """None of a witness, of what moves, or of what is masked."""
+    """Pixels kept for a bake are learned from: no witnesses, nothing that moves, nothing masked."""
     trainer = Trainer(scene, config(steps=3))
     learned, every = trainer.witnesses.learned(), trainer.training_pixels()
     assert (every.counts[learned] > 0).all() and not every.counts[trainer.witnesses.whole].any()
@@ -289,7 +291,7 @@ def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) ->
 
 
 def test_colours_can_be_composited_instead(scene: Scene) -> None:
-    """Equation 2, the paper's baseline, learns the same scene; its head has no pilot before it."""
+    """Composited colours (equation 2, the paper's baseline) learn the same scene, without a pilot."""
     colour = config(steps=150, field=FieldOptions(**vars(FIELD) | {"compositing": "colour"}))
     trainer = Trainer(scene, colour)
     before = [parameter.detach().clone() for parameter in trainer.pilot.parameters()]
@@ -341,7 +343,7 @@ def test_rays_are_left_out_by_chance_and_sums_stay_the_same_in_the_mean() -> Non
     expected = (squares.sqrt() / least).clamp(max=1)
     torch.testing.assert_close(kept, expected, rtol=0, atol=0.02)  # five standard deviations of 20,000 draws
     assert kept[0] == 1 and kept[-1] == 0
-    # The rarest of these is kept some 440 times, so that its mean is 1 to a twentieth of itself.
+    # The rarest of these rays is kept some 440 times, so that its mean is known to a twentieth of itself.
     torch.testing.assert_close(weights.mean(dim=0)[:4], torch.ones(4), rtol=0, atol=0.25)
 
 

@@ -1,4 +1,4 @@
-"""A decoder of the coder's sections that is written to be read."""
+"""A slow decoder of the entropy coder's sections, written to be easy to read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from player.asset.coder.lanes import Neighbours
 
 
 class Oracle:
-    """A section, read one symbol at a time with Python's integers, by the text of `docs/format.md`."""
+    """Decoder of one section, symbol by symbol with Python's integers, written from `docs/format.md`."""
 
     def __init__(self, data: bytes, neighbours: Neighbours, n_channels: int, n_classes: int) -> None:
         self.n, self.rows = neighbours.n, neighbours.rows.tolist()

@@ -1,4 +1,4 @@
-"""The entropy coder: a decoder of plain integers, twins that agree on everything, and broken bytes."""
+"""Tests of the entropy coder: a decoder of plain integers, the numpy and numba twins, and broken bytes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def twin(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Mod
 
 
 def use(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Encode and decode with this twin alone."""
+    """Make the coder use the twin `name` ("numpy" or "numba") alone, and return the twin's module."""
     from player.asset.coder import compiled
 
     assert compiling.available()
@@ -95,7 +95,10 @@ def oracle(data: bytes, neighbours: Neighbours, classes: list[np.ndarray], n_cla
 def case(
     n: int, n_channels: int, scale: float, seed: int = 0, n_classes: int = 3
 ) -> tuple[np.ndarray, Neighbours, list[np.ndarray], int]:
-    """Symbols that lean on their neighbours; every tenth neighbour is not there, some come later."""
+    """Return symbols that resemble their neighbours, and what `encode` takes beside them.
+
+    Every tenth neighbour is missing, and some come later.
+    """
     random = np.random.default_rng(seed)
     rows = np.arange(n)[None] - np.array([[1], [7], [40]])
     rows = np.where(random.random((3, n)) < 0.05, random.integers(0, max(n, 1), (3, n)), rows)
@@ -175,7 +178,7 @@ def test_bytes_are_as_few_as_the_contexts_allow() -> None:
     share = np.bincount(symbols[:, 0] + 255) / len(symbols)
     order_0 = -(share[share > 0] * np.log2(share[share > 0])).sum() * len(symbols) / 8
     SIZE.check(len(data), of=order_0)
-    # a section of one symbol alone costs its tables and four bytes a lane
+    # a section of only one symbol costs its tables and four bytes per lane
     zeros = encode(np.zeros_like(symbols), neighbours, classes, n_classes)
     assert len(zeros) < 4 * (200_000 >> 12) + 80
 
@@ -191,8 +194,8 @@ def test_contexts_by_their_sums() -> None:
 def test_tables_cost_what_they_say() -> None:
     random = np.random.default_rng(0)
     seen = random.poisson(3 * np.exp(-np.abs(np.arange(-END, END + 1)) / 2), (2, 3, N_CONTEXTS, N_SYMBOLS))
-    seen[:, 1] = 0  # contexts that never come
-    seen[0, 0, 5, 0] = 10**6  # and one that comes for nothing else
+    seen[:, 1] = 0  # contexts that never occur
+    seen[0, 0, 5, 0] = 10**6  # and one whose symbols are nearly all the same
     tables, n_bits = fit_tables(seen)
     assert TOTAL == 4096
     TABLES.check(tables.counts.sum(axis=1), TOTAL)
@@ -241,7 +244,7 @@ STATES = 12 + N_PACKED
 
 
 def outcome(data: bytes, name: str) -> str | bytes:
-    """The symbols, or the message of the error."""
+    """Return what the twin `name` decodes: the symbols' bytes, or the message of the error."""
     with pytest.MonkeyPatch.context() as patch:
         use(name, patch)
         try:
@@ -252,7 +255,7 @@ def outcome(data: bytes, name: str) -> str | bytes:
 
 
 def refused(data: bytes) -> str:
-    """What both twins say about broken bytes."""
+    """Return the message with which both twins refuse broken bytes."""
     found, other = (outcome(data, name) for name in TWINS)
     assert found == other and isinstance(found, str)
     return found
@@ -315,7 +318,7 @@ def test_broken_bytes(name: str) -> None:
 )
 @settings(max_examples=200, deadline=None)
 def test_changed_bytes(cut: int, changes: list[tuple[int, int]], more: bytes) -> None:
-    """Whatever is changed: the twins say the same, and damage to what rANS decodes is seen."""
+    """Both twins agree about any changed bytes. If a changed header passes, the symbols are right."""
     data = bytearray(WHOLE)
     for at, by in changes:
         data[at] ^= by

@@ -1,6 +1,6 @@
 """The page in Firefox, driven by WebDriver BiDi (https://w3c.github.io/webdriver-bidi), which Firefox speaks
-over a web socket: Playwright drives a Firefox of its own alone. It gets a screen of its own (Xvfb), because
-without one Firefox has no WebGL on the processor."""
+over a web socket; Playwright can only drive its own build of Firefox. Firefox gets a virtual screen (Xvfb),
+because without a screen it has no WebGL on the processor."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from player.cameras.camera import Camera
 from tests.player.page.render_page import view_of
 
 SECONDS = 300.0
-"""Patience with a busy machine, which compiles the shaders for its processor."""
+"""Longest wait, in seconds: a busy machine takes long to compile the shaders for its processor."""
 PREFERENCES = {"webgl.force-enabled": "true", "network.captive-portal-service.enabled": "false"}
 QUIET = ("data:", "blob:", "resource:", "chrome:", "about:")
-"""Addresses that are answered within the browser."""
+"""Beginnings of addresses that are answered within the browser."""
 
 PICTURE = """async (view) => {
   const { rgba } = await vfr.render(view);
@@ -63,7 +63,7 @@ class FirefoxPage:
                 self.asked += [url] if not url.startswith(QUIET) else []
 
     def evaluate(self, expression: str) -> Any:
-        """The value of a JavaScript `expression`, or of what it promises: a string, a number or a bool."""
+        """Return the value of a JavaScript `expression` or of its promise: a string, a number or a bool."""
         answer = self._command(
             "script.evaluate", expression=expression, target={"context": self._context}, awaitPromise=True
         )
@@ -71,12 +71,12 @@ class FirefoxPage:
         return answer["result"]["value"]
 
     def picture(self, camera: Camera, **settings: Any) -> np.ndarray:
-        """[h, w, 4] uint8, straight alpha, from the page's hook for programs."""
+        """Render a picture by the page's API for programs: [h, w, 4] uint8, straight alpha."""
         text = self.evaluate(f"({PICTURE})({json.dumps(view_of(camera) | settings)})")
         return np.frombuffer(text.encode("latin-1"), np.uint8).reshape(camera.height, camera.width, 4)
 
     def screenshot(self) -> bytes:
-        """PNG."""
+        """Return a screenshot of the page as PNG."""
         return base64.b64decode(
             self._command("browsingContext.captureScreenshot", context=self._context)["data"]
         )
@@ -84,7 +84,7 @@ class FirefoxPage:
 
 @contextmanager
 def firefox_page(path: Path, folder: Path) -> Iterator[FirefoxPage]:
-    """The page at `path` in a Firefox that keeps its profile in `folder`."""
+    """Open the page at `path` in a Firefox that keeps its profile in `folder`."""
     for program in ("firefox-esr", "Xvfb"):
         if shutil.which(program) is None:
             pytest.fail(f"{program} is missing: make other-programs")
@@ -106,12 +106,12 @@ def firefox_page(path: Path, folder: Path) -> Iterator[FirefoxPage]:
 
 
 def _address(folder: Path) -> str:
-    """Where the Firefox of a profile listens, which it writes down when it does."""
+    """Return the address at which Firefox listens, once Firefox has written it into its profile."""
     end = time.monotonic() + SECONDS
     while time.monotonic() < end:
         try:
             server = json.loads((folder / "WebDriverBiDiServer.json").read_text())
-        except (FileNotFoundError, json.JSONDecodeError):  # not yet, or half of it
+        except (FileNotFoundError, json.JSONDecodeError):  # not written yet, or half written
             time.sleep(0.1)
         else:
             return f"ws://{server['ws_host']}:{server['ws_port']}/session"

@@ -1,4 +1,4 @@
-"""The page in a second browser, whose shaders another compiler reads, against the numpy player's pictures."""
+"""Tests of the page in a second browser, with another shader compiler, against the numpy player."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells that hardly anything sees: the weights that decide, and what is left."""
+"""Cells that hardly anything sees: the weights that decide which they are, and what is left without them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from vfr_bake.kernels.latent_rows import PARTS
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 def views(n: int) -> list[Camera]:
-    """Cameras around the box."""
+    """Return cameras around the box."""
     return demo_cameras(24, n)
 
 
@@ -47,7 +47,7 @@ def test_block_weights_are_those_of_the_march_summed(contracted: bool) -> None:
             x, y, z = (int(c) % 8 // 2 for c in cell)
             expected[int(entry) >> 3, x, y, z] += weight
     assert expected.sum() > 100
-    # A sample on the border of two blocks may round to the other one.
+    # Rounding may put a sample on the border of two blocks into the other one.
     assert np.abs(found - expected).sum() < 1e-3 * expected.sum()
     fewer = block_weights(grid, cameras, 100, quiet)
     assert 0.5 < fewer.sum() / 100 / (expected.sum() / (3 * 24 * 24)) < 2
@@ -65,7 +65,7 @@ def test_what_weighs_least_is_left_out_first() -> None:
 
 
 def test_fog_that_nobody_saw_is_left_out() -> None:
-    """Within a shell that no ray passes there is fog."""
+    """Fog within a shell that no ray passes is left out, and the pictures stay the same."""
     middle = (np.indices((16, 16, 16)) + 0.5) / 16 - 0.5
     radius = np.linalg.norm(middle, axis=0)
     layout = layout_of(radius < 0.4, 64, 48)

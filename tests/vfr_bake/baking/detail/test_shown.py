@@ -1,4 +1,4 @@
-"""Coarser levels where they say the same: what a brick's error is, and what is stored then."""
+"""Coarser levels in place of bricks that they can stand for: the error of each brick, and what is stored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def some_layout(seed: int, features: int = 40, contracted: bool = False) -> Layo
 
 
 def faint(layout: Layout, seed: int) -> np.ndarray:
-    """Density codes of which no ray becomes opaque."""
+    """Return density codes so low that no ray becomes opaque."""
     return np.random.default_rng(seed).uniform(60, 160, len(layout.densities)).astype(np.uint8)[:, None]
 
 
@@ -85,7 +85,7 @@ def test_the_error_of_a_density_brick_is_that_of_its_segments(contracted: bool) 
     found = density_errors(levels, rays)
 
     def segments(level: int) -> tuple[dict, dict]:
-        """Optical depth of each ray in each brick, and the light that reaches it, sample by sample."""
+        """Return each ray's optical depth in each brick, and the light that reaches the brick, by samples."""
         of_level = levels.at(level)
         path, samples, *_ = sample_rays(of_level, rays.rays_o, rays.rays_d)
         bricks = (of_level.cells(path.at(samples.ray, samples.s)) >> 3).T
@@ -112,18 +112,18 @@ def test_the_error_of_a_density_brick_is_that_of_its_segments(contracted: bool) 
             expected[key[1]] += (light * change) ** 2
         of_brick = [expected[tuple(c)] for c in pyramid.levels[0].coords.tolist()]
         assert sum(of_brick) > 1e-4
-        # A sample on the border of two bricks may round to the other one.
+        # Rounding may put a sample on the border of two bricks into the other one.
         assert np.abs(found[level] - of_brick).sum() < 0.01 * sum(of_brick)
 
 
 def stored_of(wanted: Wanted, grid: Grid, step: int) -> PyramidValues:
-    """What is stored where bits cost next to nothing."""
+    """Return what is stored if bits cost next to nothing."""
     every = [np.ones(vertices.n, np.float32) for vertices in wanted.pyramid.vertices]
     return Choices(grid, wanted, every, np.ones(1), step).at(1e-9).stored
 
 
 def test_where_nothing_changes_the_coarser_levels_are_shown_without_a_seam() -> None:
-    """A ramp through the whole box: its means are the ramp, at the rim too."""
+    """A ramp through the whole box is shown without a seam: its means are the ramp, at the rim too."""
     layout, slope = layout_of(np.ones((4, 4, 4), bool), 64, 64), np.array([1, 0, -1])
     ramp = (layout.features.index @ slope)[:, None].astype(np.int8)
     pyramid = pyramid_beneath(layout.features.pyramid)

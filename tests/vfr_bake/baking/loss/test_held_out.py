@@ -1,4 +1,4 @@
-"""What a bake measures itself on: witnesses where the model has some, and else its own pictures."""
+"""The pixels on which a bake measures its loss: witnesses if the model has some, else its own pictures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOTHING = np.zeros((0, 3), np.float32)
 
 
 def quiet(*_: object) -> None:
-    """No progress."""
+    """Take the place of a progress callback and do nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_rays_are_marched_in_parts_as_at_once(model: Model, monkeypatch: pytest.
 def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
     model: Model, baked: tuple[Path, BakeResult]
 ) -> None:
-    """The player's pictures of every training view and the model's, both against the photographs' pixels."""
+    """The loss is that of whole pictures of model and asset, at the witnesses' pixels of every view."""
     folder, result = baked
     witnesses, asset = model.witnesses, Asset.open(folder)
     assert witnesses is not None and len(witnesses.whole) == 1
@@ -76,7 +76,7 @@ def test_the_loss_is_what_whole_pictures_of_model_and_asset_say(
     lost = 10 * np.log10(np.divide(errors["asset"], errors["model"]))
     loss = lost @ [PATCH_WEIGHT, 1 - PATCH_WEIGHT]
     assert abs(loss) > 0.05, "so few channels change the pictures"
-    # A frame's rays are rounded otherwise, which moves single samples.
+    # The rays of a whole frame are rounded differently, which moves single samples.
     assert result.loss.db == pytest.approx(loss, abs=0.01)
 
 
@@ -103,7 +103,7 @@ def test_a_model_without_witnesses_is_baked_by_its_own_pictures(model: Model, tm
 
 
 def test_the_cameras_of_whole_views_are_not_looked_through(model: Model) -> None:
-    """Else the bake would know the views that it is measured on."""
+    """Cameras of whole views are not used by the bake, which would else know the views it is measured on."""
     assert model.witnesses is not None
     (whole,) = model.witnesses.whole.tolist()
     names = [camera.name for camera in model.cameras]
@@ -123,7 +123,8 @@ def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
 
 
 def test_what_a_small_change_loses_is_known_better_than_the_witnesses_alone_measure_it(model: Model) -> None:
-    """Noise that knows nothing of the photographs: its mean square adds to the errors that are there."""
+    """The loss of a small change that does not depend on the photographs, here noise, is known better than
+    witnesses measure it: its mean square adds to the model's errors."""
     held_out = HeldOut(model, 1)
     own = held_out.own
     noise, measured, found, added = np.random.default_rng(0), [], [], []
@@ -139,7 +140,8 @@ def test_what_a_small_change_loses_is_known_better_than_the_witnesses_alone_meas
 
 
 def test_a_change_that_knows_the_photographs_is_measured(model: Model) -> None:
-    """Half of the opacity loses decibels, beside which what independent errors would lose is little known."""
+    """A change that depends on the photographs, such as half of the opacity, is measured at the witnesses: it
+    loses decibels, of which the estimate for independent errors says little."""
     held_out = HeldOut(model, 1)
     features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
     own, dimmed = (held_out.compare(features, share * opacity) for share in (1.0, 0.5))

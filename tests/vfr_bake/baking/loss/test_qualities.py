@@ -1,4 +1,4 @@
-"""What `high` and `fast` pictures leave out: as much as each asset allows."""
+"""Pictures of the qualities `high` and `fast`, which leave out as much work as each asset allows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def asset(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Asset:
 
 @pytest.fixture
 def any_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures so small are mostly edges: nearly all pixels may be marched here."""
+    """Let nearly all pixels be marched, because pictures so small are mostly edges."""
     monkeypatch.setattr(qualities, "MARCH", 0)
 
 
@@ -49,7 +49,7 @@ def pictures(asset: Asset, cameras: list[Camera], quality: Quality) -> list[np.n
 
 
 def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[View]:
-    """Views whose photographs are the asset's exact pictures with noise."""
+    """Return views whose photographs are the asset's exact pictures with noise."""
     random, pixels = np.random.default_rng(0), np.arange(96 * 80)
     return [
         View(camera, pixels, exact + random.normal(0, noise, exact.shape))
@@ -58,13 +58,13 @@ def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[View]:
 
 
 def fewest(asset: Asset) -> int:
-    """Half of the fetches of an exact picture, or the next larger number that is tried."""
+    """Return half of the fetches of an exact picture, or the next larger number that is tried."""
     own = asset.manifest.n_fetches
     return min(n for n in (*LOOKUPS, own) if 2 * n >= own)
 
 
 def lost(asset: Asset, views: list[View], quality: Quality) -> np.ndarray:
-    """[n_views] what pictures of a quality lose in dB, by a loop."""
+    """Return what pictures of a quality lose, [n_views] in dB, by a loop."""
     cameras = [view.camera for view in views]
     found = []
     for view, exact, other in zip(

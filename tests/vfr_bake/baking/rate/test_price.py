@@ -1,4 +1,4 @@
-"""The search for the price of a bit, on prices whose losses and bytes are known."""
+"""The search for the price of a bit, for prices whose losses and bytes are known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vfr_bake.baking.rate.price import AIM, CLOSE, FIRST_PRICE, LOWEST_PRICE, NE
 
 
 class KnownPrices:
-    """Stands for `Prices`: the arrays are the price itself, and the bytes fall with its square root."""
+    """Stand-in for `Prices`: arrays are the price itself, and the bytes fall with the price's square root."""
 
     def __init__(self) -> None:
         self.tried: list[float] = []
@@ -21,7 +21,7 @@ class KnownPrices:
 
 
 def search(rounding_db: float = 0.0, model_error: float = 1 / FIRST_PRICE) -> tuple[Any, KnownPrices]:
-    """A search whose first price is 1, and whose pictures lose `rounding_db` and 0.1 dB more at a price of 1."""
+    """Return a search that begins at price 1; pictures lose `rounding_db`, and 0.1 dB more at price 1."""
     prices = KnownPrices()
 
     def loss_db(price: Any) -> float:
@@ -41,7 +41,7 @@ def test_the_price_loses_little_less_than_it_may_and_its_values_are_not_chosen_a
 
 
 def test_what_rounding_loses_alone_does_not_count_for_a_preset() -> None:
-    """Rounding loses three times what the preset allows: prices may add as much as it allows to that."""
+    """Rounding loses three times what the preset allows; prices may add what it allows to that loss."""
     found, _ = search(rounding_db=0.3)
     price = found.for_preset(0.1)
     lowest = LOWEST_PRICE / FIRST_PRICE

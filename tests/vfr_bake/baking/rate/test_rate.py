@@ -1,4 +1,4 @@
-"""What is stored for a price of bits: how much each value matters, and which symbols are worth it."""
+"""Values that are stored at a price of bits: how much each matters, and which symbols are worth it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vfr_bake.training.model_file import Model
 
 
 def sphere() -> Pyramid:
-    """The cells near a sphere, on three levels."""
+    """Return the cells near a sphere, on three levels."""
     cells = np.stack(np.meshgrid(*[np.arange(48)] * 3, indexing="ij"), axis=-1)
     live = np.abs(np.linalg.norm(cells - 23.5, axis=-1) - 18) < 1.5
     bricks = live.reshape(6, 8, 6, 8, 6, 8).transpose(0, 2, 4, 1, 3, 5).reshape(216, 512)
@@ -38,14 +38,15 @@ def sphere() -> Pyramid:
 
 
 def wavy(pyramid: Pyramid, n_channels: int) -> np.ndarray:
-    """Smooth values with noise [n, n_channels] float32 on the finest level."""
+    """Return smooth values with noise, [n, n_channels] float32, on the finest level."""
     random, places = np.random.default_rng(1), pyramid.vertices[0].index / 10
     waves = [20 * np.sin(places @ random.normal(size=3)) / (1 + c) for c in range(n_channels)]
     return (np.stack(waves, axis=-1) + random.normal(0, 2, (len(places), n_channels))).astype(np.float32)
 
 
 def expected(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -> np.ndarray:
-    """The importance [n] float64 of the finest level with that of what lies around."""
+    """Return the importance [n] float64 of the finest level, with the shares of importance around each vertex
+    and of its mean added."""
     fine, coarse = pyramid.vertices[:2]
     around = [coarse.rows((fine.index + np.array(offset)) >> 1) for offset in product((0, 1), repeat=3)]
     total, n = np.zeros(coarse.n), np.zeros(coarse.n)
@@ -57,7 +58,7 @@ def expected(grid: Grid, pyramid: Pyramid, importance: np.ndarray) -> np.ndarray
 
 
 def test_squares_are_of_what_a_vertex_does_to_a_whole_ray() -> None:
-    # Against a float64 loop; a vertex that a ray meets twice, rays without fetches, and shares of 0.
+    # Compared with a float64 loop. A ray meets a vertex twice, some rays have no fetches, some shares are 0.
     random = np.random.default_rng(0)
     starts = np.array([0, 3, 3, 10, 11])
     rows = random.integers(0, 9, (11, 8)).astype(np.int32)
@@ -85,7 +86,7 @@ def test_coarser_vertices_get_the_shares_by_which_they_predict() -> None:
     for offset in product((0, 1), repeat=3):
         np.add.at(wanted, coarse.rows((fine.index + np.array(offset)) >> 1), values / 8)
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
-    # And back: the mean of the eight around.
+    # And back: a fine vertex gets the mean of the eight around it.
     coarser, found = random.random(coarse.n).astype(np.float32), np.empty(fine.n, np.float32)
     from_coarser(fine.bricks.masks, *places_between(fine, coarse), coarser, found)
     around = [coarse.rows((fine.index + np.array(offset)) >> 1) for offset in product((0, 1), repeat=3)]
@@ -94,7 +95,7 @@ def test_coarser_vertices_get_the_shares_by_which_they_predict() -> None:
 
 @pytest.mark.parametrize("step", [1, 6])
 def test_symbols_are_chosen_one_after_the_other(step: int) -> None:
-    """Against a plain loop: the best of 0, the nearest symbol, and the next towards 0."""
+    """Each symbol is the best of 0, the nearest symbol, and the next one towards 0, as in a plain loop."""
     random, n = np.random.default_rng(2), 400
     wanted = random.normal(0, 20, n).astype(np.float32)
     wanted[:3] = (400, -400, 127)
@@ -138,7 +139,7 @@ def test_bits_are_those_of_what_was_seen() -> None:
         2, abs=0.01
     )
     assert (bits > 0).all() and np.isfinite(bits).all() and np.isfinite(bits_of(np.zeros_like(seen))).all()
-    # Where nothing was seen, symbols cost what they do elsewhere; the last ones a byte more.
+    # In a context in which nothing was seen, symbols cost what they do elsewhere; the last, a byte more.
     np.testing.assert_allclose(bits[8, 62:66], bits[9, 62:66])
     assert abs(bits[8, 63] - bits[7, 63]) < 0.1 and bits[8, 126] > bits[8, 125] + 8
 
@@ -157,7 +158,7 @@ def test_a_higher_price_takes_fewer_bytes_and_no_less_distortion(grid: Grid, ste
     for price in 0.01 * 10.0 ** np.arange(6):
         found = choices.at(price)
         values = found.stored.values
-        # The values follow from symbols, and take about as many bytes as it says.
+        # The values follow from the symbols, and take about as many bytes as stated.
         steps, limits = (step,) * len(values), LIMITS[grid]
         symbols = symbols_of(pyramid.vertices, values, steps, limits)
         for level, again in enumerate(values_of(pyramid.vertices, symbols, steps, limits)):
@@ -169,14 +170,14 @@ def test_a_higher_price_takes_fewer_bytes_and_no_less_distortion(grid: Grid, ste
         assert found.distortion == pytest.approx(distortion, rel=1e-3)
         if before is None and step == 1:
             assert np.abs(values[0] - wanted).max() < 3
-        if before is not None:  # one choice changes what the next ones cost: a percent of chance
+        if before is not None:  # a choice changes what the next ones cost: a percent of chance
             assert found.n_bytes < before.n_bytes and found.distortion > 0.99 * before.distortion
         before = found
     assert not symbols[0].any()
 
 
 def levels_of(pyramid: Pyramid, finest: np.ndarray) -> Wanted:
-    """A pyramid that shows its finest level."""
+    """Return a pyramid whose coarser levels are the means of its finest level."""
     return Wanted(pyramid, mean_values(pyramid, finest, np.ones(len(finest))))
 
 
@@ -200,7 +201,7 @@ def test_what_nobody_sees_is_almost_free() -> None:
 
 
 def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
-    """Against differences of the colours that are played, in float64, for the vertices that matter most."""
+    """Importance agrees with float64 differences of the played colours, for the vertices that matter most."""
     config = BakeConfig(resolution=40, feature_resolution=32, n_channels=6, check_views=1)
     work = bake._Bake(model, config, lambda *_: None)
     layout, _ = work._cells()
@@ -217,7 +218,7 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
         rgb = head(composed, rays.teacher.rays_d).astype(np.float64) - model.background
         return rgb * opacity[:, None]
 
-    # Closer together at the top, where importance falls fastest: it has to differ by more than its own error.
+    # Ranks are denser at the top, where importance falls fastest; it has to differ by more than its error.
     ranks = np.union1d(np.geomspace(1, 400, 14).astype(int), np.arange(40, 400, 40))
     some, codes = np.argsort(found.features)[-ranks], whole_codes(stored.features)
     changes, base = [], colours(latent(codes))
@@ -228,7 +229,7 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
             moved[row, channel] += 1
             total += float(((colours(latent(moved)) - base) ** 2).mean())
         changes.append(total)
-    # Signs are random: a vertex that some hundred rays meet is known within a fifth, all together better.
+    # Signs are random: a vertex that some hundred rays meet is known to a fifth, all together better.
     assert found.features[some].sum() == pytest.approx(np.sum(changes), rel=0.2)
     assert np.corrcoef(np.log(found.features[some]), np.log(changes))[0, 1] > 0.7
 
@@ -249,7 +250,7 @@ def test_a_price_is_found_from_either_side(first: float, power: float) -> None:
 
 
 def test_a_price_is_found_where_shares_are_no_power_of_it() -> None:
-    """Nothing is lost up to some price, and too much from there on."""
+    """A price is found even if the loss jumps, from nothing up to some price to too much beyond it."""
     found = highest_price(lambda price: 0.0 if price < 0.3 else np.inf, 1.0)
     assert found < 0.3 <= NEAR * found
     assert highest_price(lambda _: -1.0, 1.0) == pytest.approx(FURTHEST ** (MOST_PRICES - 1))

@@ -1,4 +1,4 @@
-"""The check: what it says of sets that are good, blurred, apart, uneven; its page and its data."""
+"""`vfr-train --check`: its verdicts on good, blurred, unconnected and uneven sets; its page and its data."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.store.working import WorkingSize
 
 MINUTES = 60.0
-"""Seconds that the check may take: so many that a slow machine looks at everything."""
+"""Seconds that the check may take: enough for a slow machine to look at everything."""
 
 
 def wall(seed: int) -> Image.Image:
-    """A long wall full of blots of all sizes, which a window moves along."""
+    """Return a picture of a long wall full of blots of all sizes, along which a window can move."""
     random = np.random.default_rng(seed)
     layers = np.zeros((400, 2000))
     for size in (4, 8, 16, 40):
@@ -38,7 +38,7 @@ def wall(seed: int) -> Image.Image:
 
 
 def walk(folder: Path, n: int = 12, seed: int = 0, step: int = 60, prefix: str = "p") -> Path:
-    """`n` pictures of 480 x 400 pixels, each a step along the wall."""
+    """Write `n` pictures of 480 x 400 pixels, each one step further along the wall."""
     folder.mkdir(exist_ok=True)
     picture = wall(seed)
     for number in range(n):
@@ -96,7 +96,7 @@ def test_exposure_that_changes(tmp_path: Path) -> None:
         values = np.asarray(Image.open(path)).astype(float)
         Image.fromarray((values * 0.6).astype(np.uint8)).save(path)
     check = checked(folder)
-    assert 1.0 < check.figures["exposure_spread"] < 2.5  # 0.6 of the levels: 1.6 powers of two of the light
+    assert 1.0 < check.figures["exposure_spread"] < 2.5  # 0.6 of the levels: 1.6 powers of two in light
     assert any("lock the exposure" in line for line in check.advice)
 
 
@@ -114,7 +114,7 @@ def cut_short(path: Path) -> None:
 
 
 def test_pictures_that_are_cut_short_are_bad_and_named(tmp_path: Path) -> None:
-    """Their headers tell their size, and training would stop at them."""
+    """Pictures that are cut short, although their headers can be read, are bad: training would stop there."""
     folder = walk(tmp_path / "walk", 24)
     cut_short(folder / "p03.jpg")
     check = checked(folder)

@@ -1,4 +1,4 @@
-"""Turning on the spot: points that a rotation moves, against those that a step moves."""
+"""Turning on the spot: how points move under a rotation alone, and under a step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vfr_bake.data.store.working import WorkingSize
 
 
 def turn(degrees: float) -> np.ndarray:
-    """[3, 3] rotation about the vertical, nodding a little."""
+    """Return a rotation [3, 3] about the vertical, with a little nodding."""
     a, b = np.radians([degrees, degrees / 5])
     level = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     return np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]) @ level
@@ -24,8 +24,8 @@ def turn(degrees: float) -> np.ndarray:
 def seen(
     points: np.ndarray, rotation: np.ndarray, step: np.ndarray, focal: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`points` [n, 3] in two pictures, with noise of half a pixel of 480; the second camera is turned and has
-    moved."""
+    """Return `points` [n, 3] as seen in two pictures, with noise of half a pixel in 480. The second camera is
+    turned by `rotation` and moved by `step`."""
     random = np.random.default_rng(seed)
     pictures = []
     for some in (points, (points - step) @ rotation.T):
@@ -34,7 +34,7 @@ def seen(
 
 
 def cloud(seed: int, n: int = 150) -> np.ndarray:
-    """Points of a room, 2 to 8 away."""
+    """Return points of a room, at depths of 2 to 8."""
     random = np.random.default_rng(seed)
     z = random.uniform(2, 8, n)
     return np.stack([*(random.uniform(-0.4, 0.4, (2, n)) * z), z], axis=-1)
@@ -62,13 +62,13 @@ def test_what_tells_nothing() -> None:
     few = MIN_MATCHES - 1
     assert share_turned([]) is None and share_turned([(a[:0], b[:0])]) is None
     assert share_turned([(a[:few], b[:few])]) is None
-    assert share_turned([(a, a)]) is None  # a tripod
+    assert share_turned([(a, a)]) is None  # as from a tripod
     assert np.isfinite(off(a, np.zeros_like(a), 1.0))
     assert off(np.zeros((40, 2)), np.zeros((40, 2)), 1.0) == pytest.approx(0, abs=1e-6)
 
 
 def test_the_check_warns_of_pictures_from_one_spot(tmp_path: Path) -> None:
-    """A wall seen through a lens that turns by 5 degrees from picture to picture."""
+    """The check warns of pictures from one spot: a wall seen by a camera that turns 5 degrees each time."""
     picture = np.asarray(wall(3))
     focal, size = 480.0, (480, 400)
     lens = np.array([[focal, 0, 240], [0, focal, 200], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""A ZIP of pictures: unpacked once, and never beyond its folder, its disk or its size."""
+"""A ZIP of pictures is unpacked once, and never takes more than its folder, its disk and its size allow."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_zip_as_phones_share_it(tmp_path: Path) -> None:
         "\u56fe\u7247/a.png",
     ]
     assert needs_cameras(folder) and not (tmp_path / "__MACOSX").exists()
-    archive.write_bytes(b"")  # what is there is taken as it is
+    archive.write_bytes(b"")  # what has been unpacked is used as it is
     assert unpacked(archive) == folder
 
 
@@ -66,7 +66,7 @@ def test_a_zip_of_a_data_set(small_data: Path, tmp_path: Path) -> None:
 
 
 def test_names_of_what_stays_packed_do_not_matter(tmp_path: Path) -> None:
-    """macOS keeps a folder's picture in a file whose name ends in a carriage return."""
+    """Names of entries that stay packed do not matter, such as that of macOS' icon, with a return in it."""
     files = dict.fromkeys(["IMG_1.png", "Icon\r", "notes 12:30.txt", "__MACOSX/a 12:30.png"], picture())
     folder = unpack(pack(tmp_path / "a.zip", files), quiet)
     assert [path.name for path in folder.iterdir()] == ["IMG_1.png"]
@@ -131,7 +131,7 @@ def test_what_is_refused(make: Callable[[Path], object], expected: str, tmp_path
 
 
 def test_a_zip_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused by what its directory says; nothing of it is unpacked."""
+    """A ZIP that would unpack to too much is refused by its directory, and nothing is unpacked."""
     monkeypatch.setattr(archives, "SPARED", 1 << 20)
     archive = pack(tmp_path / "a.zip", {"a.png": bytes(4 << 20)}, zipfile.ZIP_DEFLATED)
     with pytest.raises(DataError, match=r"expected at most 0\.0 GB of pictures"):

@@ -44,7 +44,7 @@ def test_a_whole_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As Linux lets people have it, and other systems do not."""
+    """A file name that is not UTF-8, as Linux allows and other systems do not, is refused."""
     monkeypatch.setattr(Path, "is_file", lambda path: True)
     monkeypatch.setattr(os, "walk", lambda place: [(str(place), [], ["\udcff.png"])])
     with pytest.raises(DataError, match="expected a name in UTF-8"):

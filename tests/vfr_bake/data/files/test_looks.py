@@ -1,5 +1,5 @@
-"""What is seen of a photograph before its camera is known: the same whether EXIF turns it, and however much
-of it is decoded."""
+"""Features, size and sharpness of a photograph whose camera is still unknown: they are the same if EXIF turns
+the picture, and if a part of its pixels is decoded only."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from player.progress import Progress
 from tests.vfr_bake.data.files.test_orientation import save_turned
 from vfr_bake.data.features import find_features, match
 from vfr_bake.data.files.looks import look_at
 from vfr_bake.data.kept_matches import KeptMatches
-from vfr_bake.data.threads import Progress
 
 
 def blots(width: int, height: int, size: int = 8) -> np.ndarray:
-    """[height, width, 3] uint8, full of features."""
+    """Return a picture [height, width, 3] uint8 that is full of features."""
     random = np.random.default_rng(0)
     coarse = random.integers(0, 256, (height // size + 1, width // size + 1, 3), np.uint8)
     return np.asarray(Image.fromarray(coarse).resize((width, height), Image.Resampling.BICUBIC))
@@ -25,7 +25,7 @@ def blots(width: int, height: int, size: int = 8) -> np.ndarray:
 
 @pytest.mark.parametrize("number", [3, 6, 8])
 def test_a_picture_that_exif_turns_is_its_upright_twin(number: int, tmp_path: Path) -> None:
-    """To the bit, so that cameras and everything after them are the same."""
+    """A picture turned by EXIF gives the same features, to the bit, as one that is stored upright."""
     upright = blots(160, 120)
     save_turned(upright, tmp_path / "turned.png", number)
     Image.fromarray(upright).save(tmp_path / "upright.png")
@@ -41,7 +41,7 @@ def test_a_picture_that_exif_turns_is_its_upright_twin(number: int, tmp_path: Pa
 def test_features_of_a_large_photograph_are_where_all_its_pixels_have_them(
     size: tuple[int, int], tmp_path: Path
 ) -> None:
-    """A JPEG file is decoded at half its size, rounded up."""
+    """Features of a JPEG decoded at half its size, rounded up, lie where those of the whole picture do."""
     path = tmp_path / "large.jpg"
     Image.fromarray(blots(*size, size=40)).save(path, quality=95)
     (seen,) = look_at([(path, None)], KeptMatches(tmp_path / "kept"), None)

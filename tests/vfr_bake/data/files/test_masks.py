@@ -1,4 +1,4 @@
-"""Masks: found by name, of the right size, and what they hide is neither drawn nor scored."""
+"""Masks are found by name and have the right size; what they hide is neither drawn nor scored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vfr_bake.training.trainer import Trainer
 
 
 def masked_folder(folder: Path, share: float = 0.5) -> Path:
-    """24 opaque views, of each of which the left part is masked, and red."""
+    """Write 24 opaque views, whose left parts are red and masked."""
     train, _ = demo_views(32, 24, 1)
     (folder / "images").mkdir()
     (folder / "masks").mkdir()
@@ -57,7 +57,7 @@ def test_what_is_masked_is_not_drawn(tmp_path: Path) -> None:
 
 
 def test_a_masked_scene_is_none_with_an_object(tmp_path: Path) -> None:
-    """Masks say nothing of the background: without them the pictures are as opaque as they were."""
+    """Masks do not make a scene an object: the unmasked parts of the pictures are as opaque as before."""
     scene = load_scene(masked_folder(tmp_path))
     assert scene.masked and not scene.has_alpha
 
@@ -90,7 +90,7 @@ def test_a_mask_of_the_stored_pixels_of_a_turned_picture(tmp_path: Path) -> None
     exif[0x0112] = 6
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png", exif=exif)
     stored = np.full((30, 40), 255, np.uint8)
-    stored[:10] = 0  # which is on the right once it is turned clockwise
+    stored[:10] = 0  # on the right when turned clockwise
     upright = np.ascontiguousarray(np.rot90(stored, -1))
     for pixels in (stored, upright):
         Image.fromarray(pixels).save(tmp_path / "mask.png")

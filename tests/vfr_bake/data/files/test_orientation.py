@@ -1,5 +1,5 @@
-"""Pictures of every format, turned by every orientation: upright where cameras are estimated, as stored where
-they come with the data."""
+"""Pictures of every format with every orientation: read upright if cameras are estimated, and as stored if
+the data have cameras that fit the stored pixels."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ TO_STORED = {
 
 
 def corners() -> np.ndarray:
-    """[48, 32, 3]: a quarter of each colour, so that no turn of it is another."""
+    """Return a picture [48, 32, 3] with a colour in each quarter, so that all its turns differ."""
     pixels = np.zeros((48, 32, 3), np.uint8)
     pixels[:24, :16], pixels[:24, 16:], pixels[24:, :16] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
     return pixels
 
 
 def save_turned(upright: np.ndarray, path: Path, number: int, **options: object) -> np.ndarray:
-    """Save a picture as a camera does that was held so; returns the pixels as stored."""
+    """Save a picture as a camera in this orientation does, and return the pixels as stored."""
     image, turn = Image.fromarray(upright), TO_STORED[number]
     stored = image if turn is None else image.transpose(turn)
     exif = Image.Exif()
@@ -71,7 +71,7 @@ def test_every_format_is_turned_once(kind: str, number: int, tmp_path: Path) -> 
 def test_no_pixel_of_a_png_is_decoded_for_its_exif(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """EXIF may lie before the pixels or behind them."""
+    """EXIF before or behind the pixels of a PNG is read without decoding a pixel."""
 
     def never(*_: object) -> None:
         raise AssertionError("decoded")
@@ -121,9 +121,10 @@ def test_a_heic_of_too_many_pixels_is_not_decoded(tmp_path: Path, monkeypatch: p
 
 
 def data_set(folder: Path, kind: str, with_size: str) -> tuple[Path, list[np.ndarray]]:
-    """Four views of the demo scene, 48 pixels high and 32 wide as stored, which EXIF turns by a quarter.
+    """Write four views of the demo scene, 48 pixels high and 32 wide as stored, which EXIF turns by a
+    quarter.
 
-    `with_size`: the cameras name the size of the pixels as stored, of the upright picture, or none.
+    `with_size`: the cameras name the size of the pixels as stored, the size of the upright picture, or none.
     """
     train, _ = demo_views(48, 4, 1)
     cameras, stored = [], []
@@ -151,7 +152,7 @@ def data_set(folder: Path, kind: str, with_size: str) -> tuple[Path, list[np.nda
 @pytest.mark.parametrize("kind", ["png", "jpg", "tiff", "heic"])
 def test_given_cameras_belong_to_the_pixels_that_they_fit(kind: str, with_size: str, tmp_path: Path) -> None:
     if (kind, with_size) == ("heic", "none"):
-        with_size = "upright"  # whoever reads a HEIC reads it upright
+        with_size = "upright"  # every reader reads a HEIC upright
     folder, expected = data_set(tmp_path, kind, with_size)
     scene = load_scene(folder)
     for camera, image, pixels in zip(scene.train.cameras, scene.train.images, expected, strict=True):

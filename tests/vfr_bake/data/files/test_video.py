@@ -1,4 +1,4 @@
-"""Frames of a video: which are chosen, and videos that cannot be read."""
+"""Frames of a video: which of them are chosen, and videos that cannot be read."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vfr_bake.data.poses import estimate_cameras, is_video
 
 
 def write_video(path: Path, shifts: list[float], blurred: set[int] = frozenset()) -> Path:
-    """One frame for each of `shifts`, by which the picture has moved, pixels."""
+    """Write a video with a frame for each of `shifts`, the pixels by which the picture has moved."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (160, 120))
     for index, shift in enumerate(shifts):
         frame = np.roll(textured(6, 320, 120), round(shift), axis=1)[:, :160].copy()
         if index in blurred:
             frame = cv2.GaussianBlur(frame, (9, 9), 3)
-        frame[:8] = 4 * index  # tells which it is
+        frame[:8] = 4 * index  # tells which frame it is
         writer.write(frame)
     writer.release()
     return path
@@ -30,7 +30,7 @@ def write_video(path: Path, shifts: list[float], blurred: set[int] = frozenset()
 
 @pytest.fixture
 def short_video(tmp_path: Path) -> Path:
-    """Twelve frames, each 3 of 160 pixels on, every second one blurred."""
+    """A video of twelve frames, each moved by 3 of 160 pixels, every second one blurred."""
     return write_video(tmp_path / "walk.avi", [3 * index for index in range(12)], set(range(1, 12, 2)))
 
 
@@ -44,7 +44,7 @@ def test_the_sharpest_frame_of_every_step(short_video: Path):
     assert folder == short_video.with_name("walk_frames") and calls[-1] == (12, 12)
     numbers = frame_numbers(folder / "images")
     assert not any(number % 2 for number in numbers) and 5 <= len(numbers) <= 6
-    short_video.unlink()  # what is there is taken as it is
+    short_video.unlink()  # frames that are there are used as they are
     assert video.extract_frames(short_video, quiet_frames) == folder
 
 
@@ -53,7 +53,7 @@ def quiet_frames(done: int, of: int) -> None:
 
 
 def test_frames_are_chosen_by_how_far_the_camera_moves(tmp_path: Path):
-    """It stands still for 20 frames, and then moves on for 20."""
+    """More frames are chosen where the camera moves: it stands still for 20 frames and moves for 20."""
     path = write_video(tmp_path / "a.avi", [0.0] * 20 + [5.0 * index for index in range(1, 21)])
     numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
     assert sum(number < 20 for number in numbers) <= 1 and len(numbers) > 12
@@ -66,7 +66,7 @@ def test_a_long_video_gives_no_more_frames(tmp_path: Path, monkeypatch: pytest.M
     path = write_video(tmp_path / "a.avi", [6.0 * index for index in range(50)])
     numbers = frame_numbers(video.extract_frames(path, lambda done, of: None) / "images")
     assert 3 <= len(numbers) <= 6 and numbers == sorted(numbers)
-    assert np.diff(numbers).min() >= 4 and numbers[-1] > 35  # spread over all of it
+    assert np.diff(numbers).min() >= 4 and numbers[-1] > 35  # spread over the whole video
 
 
 def test_a_video_becomes_a_folder_of_pictures(short_video: Path, monkeypatch: pytest.MonkeyPatch):

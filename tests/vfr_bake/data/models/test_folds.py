@@ -1,4 +1,4 @@
-"""Cameras of a subject that looks the same from two sides."""
+"""Estimated cameras that are folded, because the subject looks the same from two sides."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from vfr_bake.data.poses import estimate_cameras
 
 
 def save_halved(n: int, folder: Path) -> None:
-    """The first `n` pictures of the can, at half their size."""
+    """Save the first `n` pictures of the can at half their size."""
     for path in sorted((real_pictures("can") / "images").iterdir())[:n]:
         with Image.open(path) as file:
             file.reduce(2).save(folder / path.name, quality=95)
 
 
 def test_a_label_on_both_sides_does_not_fold_the_walk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """All pictures of the can, one and a half times around it: matched alone, its two sides are taken for
-    one, as they are in the cameras that come with the pictures."""
+    """The walk around the can, one and a half times in 71 pictures, is not folded. Matches alone take its two
+    sides for one, as in the cameras that come with the pictures."""
     save_halved(71, tmp_path)
     torn: list[int] = []
 
@@ -39,7 +39,7 @@ def test_a_label_on_both_sides_does_not_fold_the_walk(tmp_path: Path, monkeypatc
     assert report.n_registered == report.n_pictures == 71 and report.mean_error < 1
     places, rotations = centres(tmp_path / "sparse" / "0")
     steps = np.linalg.norm(np.diff([places[name] for name in sorted(places)], axis=0), axis=1)
-    assert steps.max() < 3 * np.median(steps)  # folded, 8 to 16 times
+    assert steps.max() < 3 * np.median(steps)  # 8 to 16 times if folded
     up = -np.mean([rotation[1] for rotation in rotations.values()], axis=0)
     ahead = np.array([rotations[name][2] for name in sorted(rotations)])
     ahead -= np.outer(ahead @ up, up) / (up @ up)
@@ -49,7 +49,7 @@ def test_a_label_on_both_sides_does_not_fold_the_walk(tmp_path: Path, monkeypatc
 
 
 def test_given_cameras_that_are_folded_are_told_from_those_that_are_not():
-    """Can's were estimated without this; fox's camera leaps ten steps once, without a turn."""
+    """Folds are found in can's given cameras, but not in fox's, where the camera once leaps ten steps."""
     scene = load_scene(real_pictures("can"), downscale=2)
     torn = [("0013.jpg", "0014.jpg"), ("0034.jpg", "0035.jpg"), ("0052.jpg", "0053.jpg")]
     assert folds.torn_views(scene.train) == torn

@@ -1,4 +1,4 @@
-"""Models of parts of one scene become one again, and what does not fit stays apart."""
+"""Models of parts of one scene are joined again, and models that do not fit stay apart."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def truth(database: Path) -> Any:
-    """Sixteen pictures of three hundred points, six pictures a point."""
+    """A model of sixteen pictures and three hundred points, each seen in six pictures."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig = 1, N_PICTURES
     options.num_points3D, options.track_length = 300, 6
@@ -32,7 +32,7 @@ def truth(database: Path) -> Any:
 
 
 def part(truth: Any, pictures: Sequence[int], scale: float = 1.0) -> Any:
-    """A model of some of the pictures, in a frame of its own."""
+    """Return a model of some of the pictures, in a frame of its own."""
     model = truth.__deepcopy__({})
     frames = sorted(truth.frames)
     for number in set(range(N_PICTURES)) - set(pictures):
@@ -47,7 +47,7 @@ def places(model: Any) -> dict[str, np.ndarray]:
 
 
 def test_models_that_share_pictures_become_one(truth: Any, database: Path, tmp_path: Path) -> None:
-    """The third fits the joined two, and neither of them alone."""
+    """Three models become one, although the third fits neither of the others until those are joined."""
     parts = [
         part(truth, range(4, 10), 2.5),
         part(truth, range(8)),
@@ -71,7 +71,7 @@ def test_models_that_share_too_little_stay_apart(truth: Any, database: Path, tmp
 
 
 def test_a_model_that_contradicts_the_other_stays_apart(truth: Any, database: Path, tmp_path: Path) -> None:
-    """The pictures that both have lie elsewhere in the second."""
+    """A second model stays apart if it has the shared pictures in other places."""
     wrong = part(truth, range(4, 14))
     for frame in list(wrong.frames.values())[:12:2]:
         if frame.has_pose:

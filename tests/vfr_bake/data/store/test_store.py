@@ -1,4 +1,4 @@
-"""Pictures on the disk: every pixel once, the right one, found again, and gone when it should be."""
+"""Pictures on the disk: every pixel is stored once, in its place, found again, and deleted in time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZES = [(40, 30), (30, 40), (41, 7), (1, 1), (40, 30)]
 
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several chunks of small pictures, too."""
+    """Make pieces so small that even small pictures have several chunks."""
     monkeypatch.setattr(stored, "PIXELS_OF_A_PIECE", 150)
 
 
@@ -114,7 +114,7 @@ def test_random_pixels_are_those_of_the_pictures_and_no_witnesses(
         whole = np.isin(np.arange(n_views), witnesses.whole)
         of_views = counts.reshape(n_views, -1).sum(axis=1)
         assert (of_views[whole] == 0).all()
-        # 8,700 a view expected of 200,000 draws: five standard deviations, and half a turn of the chunks.
+        # 8,700 draws a view are expected of 200,000: five standard deviations, and half a turn of the chunks.
         assert np.ptp(of_views[~whole]) < 0.15 * 8700
         again = kind(views, torch.Generator(place).manual_seed(1), witnesses)
         again.restore(sampler.position)
@@ -136,7 +136,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The cache's folder; nothing is held in memory."""
+    """The cache's folder, with settings that hold no pictures in memory."""
     monkeypatch.setattr(cache, "cache_folder", lambda: tmp_path / "cache" / "pictures")
     monkeypatch.setattr(reading, "held_bytes", lambda: 0)
     return tmp_path / "cache" / "pictures"
@@ -178,7 +178,7 @@ def test_pictures_are_decoded_once_and_again_when_one_changed(
     Image.fromarray(np.full((48, 48, 3), 9, np.uint8)).save(folder / "r_5.jpg")
     changed, _ = load(folder, model, kept=True)
     assert any((image[..., :3] == 9).all() for image in changed.images) and n_sets(root) == 2
-    # A set that is cut short is made again.
+    # A stored set that is cut short is made again.
     picture = changed.images[3]
     for each in root.iterdir():
         (each / "pixels.bin").unlink()
@@ -266,7 +266,7 @@ def test_a_disk_that_is_full_in_the_middle(
 def test_pictures_that_are_being_written_are_not_cleared_up(
     folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever comes to the cache meanwhile removes what nobody holds."""
+    """Files that are being written survive another process that clears the cache of what nobody holds."""
 
     def write(*arguments: Any) -> None:
         clear_up(root)
@@ -301,7 +301,7 @@ def test_pictures_that_were_made_smaller_are_found_again(
     monkeypatch.setattr(cache, "free_bytes", lambda place: free["bytes"])
     views, _ = load(folder, model, kept=True, may_shrink=True)
     assert views.images[0].shape == (16, 16, 4)
-    free["bytes"] = 0  # the set that is there has taken the room
+    free["bytes"] = 0  # the stored set takes all the room
     views, said = load(folder, model, kept=True, may_shrink=True)
     assert views.images[0].shape == (16, 16, 4) and "reduced to 16x16 as they were kept in" in said[0]
     for n_bytes, side in ((10 * 24 * 24 * 3, 24), (10 * 32 * 32 * 3, 32)):  # more room, more detail
@@ -319,7 +319,7 @@ def test_room_is_wanted_for_as_many_channels_as_are_stored(
     monkeypatch.setattr(cache, "free_bytes", lambda place: 10 * 32 * 32 * 3)
     load(folder)
     for path in folder.glob("*.jpg"):
-        path.rename(path.with_suffix(".heic"))  # what it is follows from its content
+        path.rename(path.with_suffix(".heic"))  # the format follows from the content
     load(folder)
     (folder / "masks").mkdir()
     Image.new("L", (48, 48)).save(folder / "masks" / "r_3.png")

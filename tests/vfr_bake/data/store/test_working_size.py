@@ -1,4 +1,4 @@
-"""The working size: what a smaller pixel shows, and that its camera says where it looks."""
+"""The working size: a smaller pixel shows what its camera looks at."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def camera_of(width: int, height: int) -> Camera:
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """Red tells where a ray goes to the right, green where it goes down: 100 levels a unit of slope."""
+    """Return a picture of the slopes of its rays, to the right in red and downwards in green: 128 plus 100
+    levels a unit of slope."""
     camera = camera_of(width, height)
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
@@ -30,7 +31,7 @@ def ramp(width: int, height: int) -> np.ndarray:
 
 
 def off(camera: Camera, image: np.ndarray) -> float:
-    """The largest difference, in slopes of rays, between where pixels look and what they show."""
+    """Return the largest difference, in slopes of rays, between where pixels look and what they show."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     red, green = (image[..., k].astype(float) for k in (0, 1))
@@ -42,25 +43,25 @@ def test_a_smaller_pixel_looks_where_the_pixels_under_it_did(size: tuple[int, in
     camera, image = resized(camera_of(400, 300), ramp(400, 300), *size)
     assert (camera.width, camera.height) == size == image.shape[1::-1]
     if size[1] > 1:
-        assert off(camera, image) < 0.011  # rounded twice, to half a level of 100 a unit
+        assert off(camera, image) < 0.011  # two roundings to half a level, of 100 a unit
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 @pytest.mark.parametrize("side", [50, 99, 150, 399, 401, 2000])
 def test_files_are_read_at_the_working_size(tmp_path: Path, suffix: str, side: int) -> None:
-    """401 x 301 pixels have no whole half: a decoder rounds up, and the camera must not."""
+    """Files of 401 x 301 pixels, which have no whole half: decoders round up, and the camera must not."""
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(ramp(401, 301)).convert("RGB").save(path, quality=98, subsampling=0)
     camera, image = WorkingSize(side).read(DescribedView(path, camera_of(401, 301), {}))
     assert max(camera.width, camera.height) == min(side, 401)
-    inner = image[:-1, :-1]  # the last may repeat the edge
+    inner = image[:-1, :-1]  # the last row and column may repeat the edge
     cut = Camera("b", np.eye(4), camera.width - 1, camera.height - 1, *[
         getattr(camera, name) for name in ("fx", "fy", "cx", "cy")])  # fmt: skip
     assert off(cut, inner) < 0.035
 
 
 def test_a_lens_is_undone_at_any_size(tmp_path: Path) -> None:
-    """Where the lens bends rays, the straight picture shows the same through a smaller camera."""
+    """A lens is undone at any size: the straight picture shows the same through a smaller camera."""
     path = tmp_path / "a.png"
     Image.fromarray(ramp(400, 300)).save(path)
     view = DescribedView(path, camera_of(400, 300), {"k1": -0.1})

@@ -1,4 +1,4 @@
-"""The built-in scene as it might have been photographed: changing exposure, or a ball that moves."""
+"""The built-in scene as it might have been photographed, with changing exposure or with a ball that moves."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def settings(**changes: object) -> TrainConfig:
 
 
 def changed_exposure(views: PosedImages, seed: int, strength: float) -> tuple[PosedImages, np.ndarray]:
-    """The views with gains of another exposure and white balance each, and these gains [n_views, 3]."""
+    """Return the views, each with another exposure and white balance, and their gains [n_views, 3]."""
     random = np.random.default_rng(seed)
     n = len(views.images)
     gains = np.exp(strength * (random.normal(size=(n, 1)) + 0.3 * random.normal(size=(n, 3))))
     images = [image.copy() for image in views.images]
     for image, gain in zip(images, gains, strict=True):
-        # Darker first, for no colour should be clipped.
+        # Darken first, so that no colour is clipped.
         image[..., :3] = np.clip(0.7 * image[..., :3] * gain + 0.5, 0, 255).astype(np.uint8)
     return PosedImages(views.cameras, images), gains
 
 
 def with_a_ball(views: PosedImages, seed: int, radius: float = 0.15) -> PosedImages:
-    """The views with a red ball in front of the scene, at another place in each; `radius` in scene units."""
+    """Return the views with a red ball in each, at another place; `radius` in scene units."""
     random = np.random.default_rng(seed)
     images = [image.copy() for image in views.images]
     for camera, image in zip(views.cameras, images, strict=True):
@@ -51,7 +51,7 @@ def with_a_ball(views: PosedImages, seed: int, radius: float = 0.15) -> PosedIma
 
 
 def scene_of(exposure: float = 0.0, ball: bool = False, seed: int = 0, size: int = 64) -> Scene:
-    """The built-in scene, whose training views alone are altered; test views have the plain exposure."""
+    """Return the built-in scene with changed `exposure` in all views, and a `ball` in training views."""
     capture = demo_capture(size=size, n_train=40, n_test=4)
     train, test = capture.train, capture.test
     if exposure:
@@ -63,7 +63,7 @@ def scene_of(exposure: float = 0.0, ball: bool = False, seed: int = 0, size: int
 
 
 def trained(scene: Scene, **changes: object) -> Trainer:
-    """A trainer at the end of its steps."""
+    """Return a trainer that has run all its steps."""
     trainer = Trainer(scene, settings(**changes))
     for _ in trainer.run():
         pass
@@ -71,6 +71,6 @@ def trained(scene: Scene, **changes: object) -> Trainer:
 
 
 def quality(trainer: Trainer, scene: Scene) -> float:
-    """Mean PSNR of the test views in dB."""
+    """Return the mean PSNR of the test views in dB."""
     scores = evaluate(trained_model(trainer, scene, {}), scene.test)
     return float(np.mean([score.psnr for score in scores]))

@@ -1,4 +1,4 @@
-"""Training on pictures whose exposure changes and in which something moves, and on pictures without."""
+"""Training on pictures with changing exposure or something that moves, and on pictures without."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_changing_exposure_is_found_learned_and_kept(tmp_path: Path) -> None:
     scene = scene_of(exposure=0.15, seed=1)
     trainer = trained(scene)
     assert trainer.effects.exposure_on and "changes from picture to picture" in trainer.effects.described()[0]
-    # What was put in comes out, up to what all pictures have in common.
+    # The gains that were put in are found, up to a factor that all pictures share.
     learned = trainer.witnesses.learned()
     gains = changed_exposure(demo_views(8, 40, 1)[0], 1, 0.15)[1][learned]
     found = trainer.effects.correction.gains.numpy()

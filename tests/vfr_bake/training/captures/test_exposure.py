@@ -1,4 +1,4 @@
-"""Gains and offsets of pictures: least squares as numpy does it, and whether they pay on the other half."""
+"""Gains and offsets of pictures: least squares as in numpy, used only if they hold on the other half."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vfr_bake.training.captures.picture_colours import (
 
 
 def some_pixels(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colours times opacity, opacity, and what photographs show, off by a little noise."""
+    """Return colours times opacity, opacity, and what photographs show of these, with a little noise."""
     random = np.random.default_rng(seed)
     opacity = random.uniform(0, 1, n)
     colours = random.uniform(0, 1, (n, 3)) * opacity[:, None]
@@ -61,7 +61,7 @@ def test_a_picture_without_pixels_needs_no_correction() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_only_gains_that_hold_on_the_other_half_pay(seed: int) -> None:
-    """Noise of a hundred pixels a half does not pay; gains that differ by 10 % do."""
+    """Gains that differ by 10 % pay on the other half; noise of a hundred pixels in each half does not."""
     generator = torch.Generator().manual_seed(seed)
     colours = torch.rand(20, 2, 100, 3, generator=generator)
     noise = 0.05 * torch.randn(20, 2, 100, 3, generator=generator)
@@ -83,7 +83,7 @@ def test_the_mean_picture_is_neutral() -> None:
     neutral = found.neutral()
     torch.testing.assert_close(neutral.gains.mean(dim=0), torch.ones(3))
     torch.testing.assert_close(neutral.offsets.mean(dim=0), torch.zeros(3), atol=1e-6, rtol=0)
-    # It is the same of colours that the mean correction has corrected.
+    # Applied after the mean correction, the neutral correction gives the same colours as the fitted one.
     colours = torch.rand(9, 3, generator=generator)
     corrected = colours * found.gains.mean(dim=0) + found.offsets.mean(dim=0)
     torch.testing.assert_close(

@@ -17,7 +17,7 @@ from vfr_bake.training.captures.moving import (
 
 
 def sums_of(errors: np.ndarray) -> torch.Tensor:
-    """The sums of errors [n_cells, n, 3]."""
+    """Return sums [n_cells, 5] over errors [n_cells, n, 3]: number, errors by channel, squared errors."""
     n_cells, n, _ = errors.shape
     squared = (errors**2).sum(axis=(1, 2))[:, None]
     return torch.from_numpy(np.concatenate([np.full((n_cells, 1), n), errors.sum(axis=1), squared], axis=1))
@@ -25,7 +25,7 @@ def sums_of(errors: np.ndarray) -> torch.Tensor:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_detail_that_is_not_learned_does_not_stand_out(seed: int) -> None:
-    """Errors as large as those of a thing that moves, but of both signs."""
+    """Detail that is not learned does not stand out: its errors are large, but of both signs."""
     random = np.random.default_rng(seed)
     detail = random.normal(0, 0.3, (2000, 12, 3))
     found = mean_errors(sums_of(detail))

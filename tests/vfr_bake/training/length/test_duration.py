@@ -1,4 +1,4 @@
-"""When a training ends, and what is said of it at its start."""
+"""When a training ends, and the expectation that is printed when it starts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WITNESSES, N = WitnessLoss(CHOSEN, np.ones(3)), len(CHOSEN.pixels)
 
 
 def looks(duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 0.0) -> list[float]:
-    """Let the error fall by so many dB with each doubling of the time; the times [s] of `n` looks."""
+    """Let the error fall by so many dB with each doubling of the time; return the times [s] of `n` looks."""
     random = np.random.default_rng(0)
     times, now = [], 0.0
 
@@ -33,8 +33,8 @@ def looks(duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 
         return WITNESSES, errors * np.exp(noise * random.normal(size=N))
 
     for number in range(n):
-        now = FIRST_LOOK * GROWTH**number * (1 + 1e-9 * number)  # in spite of rounding
-        duration.look(1, now - 1e-3, measure)  # not yet
+        now = FIRST_LOOK * GROWTH**number * (1 + 1e-9 * number)  # not too early, even after rounding
+        duration.look(1, now - 1e-3, measure)  # too early for a look
         duration.look(1, now, measure)
     return times
 
@@ -80,7 +80,8 @@ def test_what_was_seen_is_kept_and_the_length_may_change() -> None:
 
 
 def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock of a second a look, with a field whose rates are too small to learn anything."""
+    """A training whose error is flat ends early. Its clock moves on by a second at each look, and the field's
+    learning rates are too small to learn anything."""
     clock = itertools.count()
     monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: next(clock)))
     monkeypatch.setattr("vfr_bake.training.length.duration.FIRST_LOOK", 6.0)
@@ -118,8 +119,8 @@ def test_what_is_expected_is_what_was_reached(
     unbounded: bool,
     reached: float,
 ) -> None:
-    """Two trainings of objects on two cores with AVX2, two of captures with AVX-512: their steps and PSNR on
-    test views were measured."""
+    """Steps and PSNR are about those expected. The measured ones, with PSNR on test views, are of two
+    trainings of objects on two cores with AVX2 and of two trainings of captures with AVX-512."""
     said = expectation(psnr, seconds, seconds_a_step, 1_000_000, minutes, unbounded)
     found = re.search(r"about ([\d,]+) steps .* (\d+) to (\d+) dB", said)
     assert found

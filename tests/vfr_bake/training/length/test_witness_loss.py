@@ -1,4 +1,4 @@
-"""What is lost at the witnesses, against sums in float64 written out, and against losses that are known."""
+"""The loss at the witnesses, compared with sums in float64 that are written out, and with known losses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def some_witnesses(counts: list[int], whole: list[int], seed: int = 0) -> Witnes
 
 
 def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """(loss, standard error) by loops over blocks: views, and parts of the only whole view."""
+    """Return (loss, standard error) by loops over blocks: views, and the parts of a single whole view."""
     blocks: dict[tuple, list[int]] = {}
     views = witnesses.views()
     for i, view in enumerate(views):
@@ -86,7 +86,7 @@ def test_loss_and_spread_are_those_written_out(counts: list[int], whole: list[in
 
 
 def test_errors_are_between_8_bit_pictures_over_the_background() -> None:
-    """Clipped and rounded as an evaluation does, against integers."""
+    """Errors are between 8-bit pictures, clipped and rounded as in an evaluation, here in integers."""
     witnesses = some_witnesses([50], [])
     background = np.array([0.213, 0.531, 0.917], np.float32)
     rgb = np.random.default_rng(2).uniform(-0.2, 1.2, (50, 3)).astype(np.float32)
@@ -115,7 +115,7 @@ def test_no_change_is_no_loss_and_a_better_picture_loses_less_than_nothing() -> 
 
 
 def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> None:
-    """Drawn anew a thousand times, views and all: errors of a view have a factor in common."""
+    """The spread is that of a thousand draws of witnesses, where errors of a view share a factor."""
     counts, whole = [30] * 40 + [400] * 4, [40, 41, 42, 43]
     measured = WitnessLoss(some_witnesses(counts, whole), WHITE)
     views = np.repeat(np.arange(44), counts)
@@ -127,7 +127,7 @@ def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> Non
         found = measured.loss(before, after)
         losses.append(found.db)
         spreads.append(found.spread)
-    # 1000 draws know a standard deviation to 2 %, and a jackknife of four views is off by some more.
+    # A standard deviation of 1000 draws is known to 2 %; a jackknife of four views adds some error.
     assert np.mean(spreads) == pytest.approx(np.std(losses), rel=0.12)
 
 

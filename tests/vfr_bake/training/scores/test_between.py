@@ -1,4 +1,4 @@
-"""What is said of views between the pictures, from witnesses of both kinds."""
+"""PSNR and warnings about views between the pictures, from witnesses of both kinds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_whole_pictures_are_told_apart_from_pixels_of_learned_ones(monkeypatch: 
 
 
 def test_pictures_without_any_error_have_a_finite_psnr() -> None:
-    """A scene of one colour may be shown exactly in 8 bits; what is expected of it and JSON take numbers."""
+    """The PSNR of exact pictures, such as those of one colour, is finite: JSON needs a number."""
     found = witness_psnr(np.zeros(4), np.array([False, True, True, False]))
     assert found == pytest.approx((120.0, 120.0, 120.0))
 

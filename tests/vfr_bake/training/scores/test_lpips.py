@@ -1,6 +1,7 @@
-"""LPIPS: what the package `lpips` computes of the same weights, and a clear message where a file is missing.
+"""LPIPS: the same result as the package `lpips` with the same weights, and a clear message if a file is
+missing.
 
-The real weights are large and not ours to keep: the tests put weights of a closed form in their place.
+The real weights are large and not ours to keep; the tests use weights in closed form instead.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ CHECKPOINT = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
 def waves(*shape: int) -> torch.Tensor:
-    """Values in [-1, 1] without a pattern, the same on every machine."""
+    """Return values in [-1, 1] without a pattern, the same on every machine."""
     return torch.from_numpy(np.sin(np.arange(np.prod(shape)) ** 1.5).astype(np.float32)).reshape(shape)
 
 
 def write_backbone(home: Path, network: str) -> Path:
-    state = {"classifier.6.bias": torch.zeros(1000)}  # the real files have more than is read
+    state = {"classifier.6.bias": torch.zeros(1000)}  # the real files hold more than is read
     for index, (n_out, n_in, size) in CONVOLUTIONS[network].items():
-        scale = (6 / (n_in * size * size)) ** 0.5  # carries the signal through
+        scale = (6 / (n_in * size * size)) ** 0.5  # keeps the signal's size from layer to layer
         state[f"features.{index}.weight"] = waves(n_out, n_in, size, size) * scale
         state[f"features.{index}.bias"] = 0.1 * waves(n_out)
     path = home / "hub" / "checkpoints" / CHECKPOINT[network]
@@ -44,7 +45,7 @@ def write_backbone(home: Path, network: str) -> Path:
 
 
 def write_package(folder: Path, network: str) -> Path:
-    """A package `lpips` as far as it is read; importing it would fail."""
+    """Write the part of the package `lpips` that is read; importing it would fail."""
     path = folder / "lpips" / "weights" / "v0.1" / f"{network}.pth"
     path.parent.mkdir(parents=True)
     (folder / "lpips" / "__init__.py").write_text("raise ImportError('its weights are read, not its code')")
@@ -76,13 +77,13 @@ def picture(height: int, width: int) -> np.ndarray:
 
 @pytest.mark.usefixtures("package")
 def test_it_is_what_the_package_computes(home: Path, network: str) -> None:
-    """Stored: what lpips 0.1.4 with torchvision 0.28.0 returns for these weights and pictures."""
+    """The distance is what lpips 0.1.4 with torchvision 0.28.0 returned for these weights and pictures."""
     write_backbone(home, network)
     distance = Lpips(network)
     a = picture(40, 48)
     expected = {"alex": (0.0249353, 1.7383846), "vgg": (0.0355390, 1.2802168)}[network]
     assert distance(a, a) == 0
-    assert distance(a, 0.9 * a) == pytest.approx(expected[0], rel=1e-4)  # sums of float32, in any order
+    assert distance(a, 0.9 * a) == pytest.approx(expected[0], rel=1e-4)  # sums in float32, in any order
     assert distance(a, 1 - a) == pytest.approx(expected[1], rel=1e-4)
     assert distance(a, 1 - a) == pytest.approx(distance(1 - a, a), rel=1e-6)
     assert distance(a, 1 - a) > distance(a, 0.9 * a) > distance(a, 0.99 * a) > 0

@@ -1,4 +1,4 @@
-"""SSIM against a naive loop, and the scores of views made of it; pictures side by side."""
+"""SSIM compared with a naive loop, the scores of views that are made of it, and pictures side by side."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from vfr_bake.training.scores.metrics import (
 )
 
 FLOAT32 = 1e-5
-"""SSIM's variances are differences of float32 near 1, beside 9e-4: 1e-7 / 9e-4 a window, less in the mean."""
+"""Tolerance for float32. SSIM's variances are differences of numbers near 1, beside a constant of 9e-4, so
+that a window is off by 1e-7 / 9e-4, and the mean by less."""
 
 
 def naive_ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al. 2004, equations 6 and 12 to 16, one window after the other in float64."""
+    """Evaluate equations 6 and 12 to 16 of Wang et al. 2004, one window after the other, in float64."""
     offsets = np.arange(11) - 5
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window /= window.sum()
