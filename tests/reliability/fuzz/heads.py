@@ -29,7 +29,6 @@ OPERATORS = (
         "MatMul",
         "Gemm",
         "Gelu",
-        "HardSwish",
         "Sigmoid",
         "Concat",
         "Slice",

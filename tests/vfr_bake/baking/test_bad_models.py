@@ -11,6 +11,7 @@ import torch
 
 from player.asset.asset import Asset
 from player.errors import ConfigError, TrainingError
+from player.progress import silent
 from player.render import render
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, TrainConfig
@@ -21,10 +22,6 @@ from vfr_bake.training.scores.metrics import psnr
 from vfr_bake.training.trainer import Trainer
 
 
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
-
-
 def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Path) -> None:
     empty = Trainer(demo.demo_scene(size=16, n_train=4, n_test=1), TrainConfig(device="cpu", steps=1))
     with torch.no_grad():
@@ -32,23 +29,23 @@ def test_an_empty_model_is_refused_and_leaves_nothing(model: Model, tmp_path: Pa
         empty.field.density.out.bias.fill_(-30)
     hollow = Model(empty.field, empty.sampler, np.eye(4), model.cameras, True, {}, {})
     with pytest.raises(TrainingError, match="got nothing: train longer"):
-        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), quiet)
+        bake(hollow, tmp_path / "asset", BakeConfig(resolution=32), silent)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -> None:
     settings = BakeConfig(resolution=32, weight_floor=0.9999, refine_steps=0, check_views=1)
     with pytest.raises(TrainingError, match=r"no cell weighs 0\.9999 .* lower --weight-floor"):
-        bake(model, tmp_path / "asset", settings, quiet)
+        bake(model, tmp_path / "asset", settings, silent)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.83 GB for 48 .* got 0\.8 "):
-        bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), quiet)
+        bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), silent)
     assert list(tmp_path.iterdir()) == []
     settings = BakeConfig(resolution=48, max_memory=0.824, refine_steps=0, check_views=1)
-    result = bake(model, tmp_path / "asset", settings, quiet)
+    result = bake(model, tmp_path / "asset", settings, silent)
     assert "do not fit into 0.824 GB" in result.figures["left_out"]["resolution"]
     assert 8 <= Asset.open(tmp_path / "asset").manifest.resolution < 48
 
@@ -58,7 +55,7 @@ def test_a_grid_becomes_coarser_where_the_bytes_do_not_hold_it(
 ) -> None:
     monkeypatch.setattr("vfr_bake.baking.limits.CELL_BYTES", 10.0)
     settings = BakeConfig(resolution=96, feature_resolution=96, max_mb=0.4, refine_steps=0, check_views=1)
-    result = bake(model, tmp_path / "asset", settings, quiet)
+    result = bake(model, tmp_path / "asset", settings, silent)
     assert result.n_bytes <= 400_000
     assert "do not fit into 0.4 MB" in result.figures["left_out"]["resolution"]
     asset = Asset.open(tmp_path / "asset", verify=True)
@@ -79,7 +76,7 @@ def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: M
         cameras.append(replace(camera, c2w=c2w))
     near = replace(model, cameras=cameras, witnesses=None)  # no photographs were taken from there
     settings = BakeConfig(preset="fidelity", mesh_resolution=16, refine_steps=0, check_views=8)
-    bake(near, tmp_path / "asset", settings, quiet)
+    bake(near, tmp_path / "asset", settings, silent)
     asset = Asset.open(tmp_path / "asset", verify=True)
     full = render_image(near.field, near.occupancy, near.model_cameras()[0], near.background)
     assert full.std() > 0.05, "they see something"

@@ -16,6 +16,7 @@ from player.asset.asset import Asset
 from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
+from player.progress import silent
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS
@@ -62,10 +63,6 @@ def _compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vfr_bake.baking.plan.is_compiled", lambda: True)
 
 
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
-
-
 def took(width: int, k: int) -> float:
     """Return the ms of a machine that takes 1 ms for each unit of head width, and 10 ms a lookup."""
     return (width or 256) + 10 * (k or 40)
@@ -97,18 +94,18 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
     model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(TrainingError, match=r"800 x 800 in at most 0\.001 ms, got"):
-        bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), quiet)
+        bake(model, tmp_path / "asset", BakeConfig(target_ms=0.001, **SMALL), silent)
     # The files are measured again, so that what takes longer than before refinement is refused as well.
     times = iter([1.0, 1.0, 9.0])
     monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda *_: next(times))
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
-        bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), quiet)
+        bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), silent)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "a", BakeConfig(**SMALL), quiet)
-    bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), quiet)
+    bake(model, tmp_path / "a", BakeConfig(**SMALL), silent)
+    bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), silent)
     a, b = (Asset.open(tmp_path / name).manifest for name in "ab")
     assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
 
@@ -161,7 +158,7 @@ def test_what_was_refined_is_gone_when_the_mesh_is_made(
     gc.collect()
     before = held()
     monkeypatch.setattr("vfr_bake.baking.bake.bake_mesh", mesh)
-    bake(model, tmp_path / "asset", BakeConfig(**SMALL), quiet)
+    bake(model, tmp_path / "asset", BakeConfig(**SMALL), silent)
     assert len(alive) <= len(before), alive
 
 
@@ -180,12 +177,12 @@ def test_a_grid_that_memory_limits_is_not_refused(
 
 
 def test_a_mesh_that_takes_too_much_memory_is_left_out(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "asset", BakeConfig(**SMALL), quiet)
+    bake(model, tmp_path / "asset", BakeConfig(**SMALL), silent)
     asset = Asset.open(tmp_path / "asset")
     assert len(asset.arrays.densities.pyramid.levels) > 1
-    baked = bake_mesh(asset, 16, 100_000, 1e-6, quiet)
+    baked = bake_mesh(asset, 16, 100_000, 1e-6, silent)
     assert not len(baked.mesh.faces) and "more than 1e-06 GB of memory" in (baked.left_out or "")
-    assert bake_mesh(asset, 16, 100_000, 1.0, quiet).left_out is None
+    assert bake_mesh(asset, 16, 100_000, 1.0, silent).left_out is None
 
 
 def test_without_refinement_the_head_stays_the_models_own() -> None:
@@ -266,7 +263,7 @@ def test_the_first_bake_is_expected_to_compile(model: Model, monkeypatch: pytest
 
 
 def test_what_a_bake_compiles_is_kept(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "asset", BakeConfig(**(SMALL | {"refine_steps": 1})), quiet)
+    bake(model, tmp_path / "asset", BakeConfig(**(SMALL | {"refine_steps": 1})), silent)
     assert is_compiled() and not is_kept("no such kernel", *SOURCES)
 
 
@@ -285,7 +282,7 @@ def test_the_mesh_is_at_most_a_tenth_of_the_asset(
 ) -> None:
     monkeypatch.setattr(baked_mesh, "FEWEST_BYTES", 5_000)
     settings = BakeConfig(resolution=96, mesh_resolution=0, refine_steps=0, check_views=1)
-    result = bake(model, tmp_path / "asset", settings, quiet)
+    result = bake(model, tmp_path / "asset", settings, silent)
     asset = Asset.open(tmp_path / "asset", verify=True)
     sizes = file_sizes(tmp_path / "asset")
     total = sum(sizes.values())
@@ -300,7 +297,7 @@ def test_a_grid_is_as_coarse_as_a_page_of_it_has_to_be(model: Model, monkeypatch
 
     def page_mb_of(allowed: float) -> float:
         monkeypatch.setitem(PRESETS, "balanced", replace(PRESETS["balanced"], page_mb=allowed))
-        work = _Bake(model, BakeConfig(check_views=1), quiet)
+        work = _Bake(model, BakeConfig(check_views=1), silent)
         layout, _ = work._cells()
         said = f"a page that takes {allowed:g} MB" in work.left_out.get("resolution", "")
         assert said == (allowed < 512)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from player.asset.asset import Asset
+from player.progress import silent
 from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import _Bake, bake
@@ -23,10 +24,6 @@ from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
 MAX_MB = 1.0
-
-
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
 
 
 def trained_scene(kind: str) -> Model:
@@ -50,7 +47,7 @@ def chosen(models: dict[str, Model], tmp_path_factory: pytest.TempPathFactory) -
     for kind, model in models.items():
         folder = tmp_path_factory.mktemp(kind) / "asset"
         settings = BakeConfig(refine_steps=40, mesh_resolution=24, check_views=2, max_mb=MAX_MB)
-        bake(model, folder, settings, quiet)
+        bake(model, folder, settings, silent)
         found[kind] = json.loads((folder / "report.json").read_text())
         found[kind]["manifest"] = Asset.open(folder, verify=True).manifest
     return found
@@ -92,7 +89,7 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
         BakeConfig(preset="fast"),
         PRESETS["fast"],
         Seen(),
-        lambda name: quiet,
+        lambda name: silent,
         1.0,  # type: ignore[arg-type]
     )
     assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
@@ -118,14 +115,14 @@ def test_longer_steps_keep_to_the_loss_that_was_asked_for(
         def lost(self, before: float, after: float) -> Loss:
             return Loss(after - before, 0.0)
 
-    detail = Detail(Seen(), None, 0, 0.1, quiet)  # type: ignore[arg-type]
+    detail = Detail(Seen(), None, 0, 0.1, silent)  # type: ignore[arg-type]
     assert detail.level_steps(Grid(np.ones(3)), max_loss_db) == steps  # type: ignore[arg-type]
 
 
 def test_the_fewest_channels_that_lose_little_are_found_by_halving(models: dict[str, Model]) -> None:
     """Halving finds the fewest channels that lose little, as a trial takes the head on all held-out rays."""
-    work = _Bake(models["matte"], BakeConfig(check_views=1), quiet)
-    teacher = render_teacher(work.model, work.model.model_cameras(), 2000, 0, quiet)
+    work = _Bake(models["matte"], BakeConfig(check_views=1), silent)
+    teacher = render_teacher(work.model, work.model.model_cameras(), 2000, 0, silent)
     for fewest in (1, 6, 15, 99):
         asked = []
 

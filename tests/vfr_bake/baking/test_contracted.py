@@ -16,6 +16,7 @@ from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
 from player.march.contraction import contract
+from player.progress import silent
 from player.render import render
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.baking.bake import _Bake, bake
@@ -37,10 +38,6 @@ SETTINGS = BakeConfig(
     n_channels=10, k=8, weight_floor=0.001,
 )  # fmt: skip
 OPAQUE = np.array([0, 0, 0, 255], np.uint8)
-
-
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
 
 
 def photographs(views: PosedImages) -> PosedImages:
@@ -74,7 +71,7 @@ def model() -> Model:
 @pytest.fixture(scope="module")
 def folder(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bake") / "asset"
-    bake(model, folder, SETTINGS, quiet)
+    bake(model, folder, SETTINGS, silent)
     return folder
 
 
@@ -113,9 +110,9 @@ def test_cells_of_every_ray_are_marked() -> None:
 
 
 def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
-    cells = weighty_cells(model, 64, 0.01, quiet)
+    cells = weighty_cells(model, 64, 0.01, silent)
     assert 0.0005 < cells.mean() < 0.2
-    few = weighty_cells(model, 64, 0.3, quiet)
+    few = weighty_cells(model, 64, 0.3, silent)
     assert few.sum() < cells.sum()
     camera = model.model_cameras()[0].c2w[:3, 3]
     x, y, z = ((contract(camera) + 2) * 8).astype(int)  # of the 32 blocks in 4 units
@@ -159,7 +156,7 @@ def test_the_asset_plays_what_the_model_shows(model: Model, folder: Path) -> Non
 
 def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
     """Depth is the model's own before refinement, which only looks at colours."""
-    bake(model, tmp_path / "asset", replace(SETTINGS, refine_steps=0), quiet)
+    bake(model, tmp_path / "asset", replace(SETTINGS, refine_steps=0), silent)
     asset, camera = Asset.open(tmp_path / "asset"), model.model_cameras()[2]
     frame = render(asset, model.cameras[2], n_fetches=0)
     found, wanted = frame.depth.reshape(-1) / asset.scale, depth_at_the_mean_angle(model, asset, camera)
@@ -174,7 +171,7 @@ def test_depth_is_the_models_own(model: Model, tmp_path: Path) -> None:
 @pytest.mark.parametrize("k", [0, 4])
 def test_a_training_ray_composes_what_the_player_composes(model: Model, k: int) -> None:
     """In the grid of one level that refinement learns from, a training ray composes what the player does."""
-    work = _Bake(model, SETTINGS, quiet)
+    work = _Bake(model, SETTINGS, silent)
     layout, n_rays = work._cells()
     stored, *_ = work._store(layout, n_rays)
     grid = layout.grid(stored.density, stored.features)

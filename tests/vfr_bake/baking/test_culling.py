@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from player.asset.asset import Asset
+from player.progress import silent
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.cells import (
     FLOORS,
@@ -30,13 +31,9 @@ from vfr_bake.training.model_file import Model
 
 def stored(model: Model, resolution: int, floor: float) -> np.ndarray:
     """Return the cells that a floor keeps, [resolution, resolution, resolution] bool."""
-    marks = marked_cells(model, resolution, (floor,), quiet)
+    marks = marked_cells(model, resolution, (floor,), silent)
     weighty = close_gaps(marks[..., 0].view(bool))
     return weighty | beside(weighty) & occupied_cells(model, resolution)
-
-
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
 
 
 def fog(model: Model, logit: float) -> Model:
@@ -68,8 +65,8 @@ def test_gaps_of_one_cell_are_closed_and_nothing_grows() -> None:
 def test_cells_beside_those_that_weigh_something_are_stored_where_matter_may_be(model: Model) -> None:
     """Cells beside those with weight are stored where matter may be, so that refinement leaves no holes."""
     held, floor = occupied_cells(model, 64), 0.1
-    weighty = close_gaps(marked_cells(model, 64, (floor,), quiet)[..., 0].view(bool))
-    visible = cull(model, 64, HeldOut(model, 1), floor, 0.0, quiet).visible
+    weighty = close_gaps(marked_cells(model, 64, (floor,), silent)[..., 0].view(bool))
+    visible = cull(model, 64, HeldOut(model, 1), floor, 0.0, silent).visible
     assert visible[weighty].all() and not (visible & ~weighty & ~held).any()
     for x, y, z in np.argwhere(held & ~visible)[::97]:
         around = [weighty[max(x - 1, 0) : x + 2, y, z], weighty[x, max(y - 1, 0) : y + 2, z]]
@@ -79,9 +76,9 @@ def test_cells_beside_those_that_weigh_something_are_stored_where_matter_may_be(
 
 def test_a_low_floor_marks_more(model: Model) -> None:
     floors = (0.2, 0.01, 0.001)
-    together = marked_cells(model, 64, floors, quiet)
+    together = marked_cells(model, 64, floors, silent)
     assert 0 < together[..., 0].sum() < together[..., 1].sum() < together[..., 2].sum()
-    alone = marked_cells(model, 64, floors[1:2], quiet)
+    alone = marked_cells(model, 64, floors[1:2], silent)
     assert np.array_equal(together[..., 1], alone[..., 0])
 
 
@@ -100,8 +97,8 @@ def test_without_culling_more_is_stored(model: Model, tmp_path: Path) -> None:
         "refine_steps": 0,
         "check_views": 1,
     }
-    culled = bake(model, tmp_path / "a", BakeConfig(weight_floor=0.02, **small), quiet)
-    everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), quiet)
+    culled = bake(model, tmp_path / "a", BakeConfig(weight_floor=0.02, **small), silent)
+    everything = bake(model, tmp_path / "b", BakeConfig(no_cull=True, **small), silent)
     assert volume(tmp_path / "b") > 1.15 * volume(tmp_path / "a")
     assert "cells" in culled.figures["left_out"] and "cells" not in everything.figures["left_out"]
 
@@ -113,7 +110,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
     model = replace(model, witnesses=None)
     held_out, floor = HeldOut(model, 1), 0.1
     monkeypatch.setattr("vfr_bake.rendering.sampling.LIMITS", LIMITS._replace(opaque_depth=np.float32(1e9)))
-    cells = cull(model, 96, held_out, floor, 0.0, quiet)
+    cells = cull(model, 96, held_out, floor, 0.0, silent)
     visible = stored(model, 96, floor)
     assert np.array_equal(cells.visible, visible)
 
@@ -146,11 +143,11 @@ def test_the_highest_floor_that_loses_little_is_taken(model: Model, monkeypatch:
     floors = (0.6, 0.3, 0.1, 0.01)  # any of FLOORS would lose next to nothing in so small a model
     monkeypatch.setattr("vfr_bake.baking.cells.FLOORS", floors)
     held_out = HeldOut(replace(model, witnesses=None), 1)
-    losses = {floor: cull(model, 64, held_out, floor, 0.0, quiet).lost[floor] for floor in floors}
+    losses = {floor: cull(model, 64, held_out, floor, 0.0, silent).lost[floor] for floor in floors}
     assert losses[0.6] > 0.1 > losses[0.01]
     for floor, loss in losses.items():
         allowed = loss + 0.001 * abs(loss) + 1e-9
-        chosen = cull(model, 64, held_out, None, allowed, quiet)
+        chosen = cull(model, 64, held_out, None, allowed, silent)
         assert losses[chosen.floor] <= allowed and chosen.floor >= floor
         assert f"{chosen.floor:g}" in chosen.report()
 
@@ -158,13 +155,13 @@ def test_the_highest_floor_that_loses_little_is_taken(model: Model, monkeypatch:
 def test_with_witnesses_a_floor_must_not_lose_more_even_by_chance(model: Model) -> None:
     """The first floor is taken whose loss is below the limit by more than its standard error."""
     held_out = HeldOut(model, 1)
-    everything = cull(model, 64, held_out, None, -9.0, quiet)
+    everything = cull(model, 64, held_out, None, -9.0, silent)
     assert everything.floor == 0 and list(everything.lost) == list(FLOORS), "no floor gains 9 dB"
     every = _shown(model, held_out, occupied_cells(model, 64))
     loss = held_out.lost(every, _shown(model, held_out, stored(model, 64, FLOORS[0])))
     assert loss.spread and everything.lost[FLOORS[0]] == loss.db
     for most_db, taken in ((loss.most + 1e-6, True), (loss.most - 1e-6, False)):
-        chosen = cull(model, 64, held_out, None, most_db, quiet)
+        chosen = cull(model, 64, held_out, None, most_db, silent)
         assert (chosen.floor == FLOORS[0]) == taken, "between the loss and one standard error above it"
 
 
@@ -177,7 +174,7 @@ def test_a_fog_is_stored_where_every_sample_weighs_little(model: Model, tmp_path
         "mesh_resolution": 16,
         "check_views": 1,
     }
-    result = bake(thin, tmp_path / "asset", BakeConfig(preset="fidelity", refine_steps=0, **small), quiet)
+    result = bake(thin, tmp_path / "asset", BakeConfig(preset="fidelity", refine_steps=0, **small), silent)
     assert result.figures["psnr_to_full_model"] > 35
     assert volume(tmp_path / "asset") > 0.99 * 32**3, "all but corners that no ray meets"
     assert result.figures["mesh_faces"] == 0, "an even fog has no surface"
@@ -187,6 +184,6 @@ def test_where_every_floor_loses_too_much_nothing_is_left_out(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vfr_bake.baking.cells.FLOORS", (0.9, 0.5))
-    cells = cull(model, 48, HeldOut(model, 1), None, 0.001, quiet)
+    cells = cull(model, 48, HeldOut(model, 1), None, 0.001, silent)
     assert cells.floor == 0 and cells.report().startswith("none") and cells.lost
     assert np.array_equal(cells.visible, occupied_cells(model, 48))

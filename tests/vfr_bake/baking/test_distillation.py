@@ -13,6 +13,7 @@ import pytest
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
 from player.errors import TrainingError
+from player.progress import silent
 from player.render import Renderer
 from tests.numerics.fog import FEATURE, fog
 from vfr_bake.baking.bake import bake
@@ -28,10 +29,6 @@ ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
 """Origins of rays along x: of rays that meet the box, and of rays that pass it."""
 DARKER = 0.2
 """Factor of the photographs' colours here, relative to those that the model has learned."""
-
-
-def quiet(done: int, of: int) -> None:
-    pass
 
 
 def darker(pixels: ViewPixels) -> np.ndarray:
@@ -134,7 +131,7 @@ def test_an_asset_shows_what_the_photographs_show(model: Model, tmp_path: Path) 
 def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) -> None:
     pixels = model.training_pixels
     assert pixels is not None
-    rays = photographed_rays(model, 10**9, quiet)
+    rays = photographed_rays(model, 10**9, silent)
     shown = pixels.rgba / 255
     views, rows = pixels.views(), pixels.of_views()
     for view in (0, int(views[-1])):
@@ -148,7 +145,7 @@ def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) 
         np.testing.assert_allclose(rays.opacity[of_view], (opacity + shown[of_view, 3]) / 2, atol=1e-5)
         photographed = shown[of_view, :3] * shown[of_view, 3:]
         np.testing.assert_allclose(rays.colours[of_view], (colours + photographed) / 2, atol=1e-4)
-    assert len(photographed_rays(model, 100, quiet).opacity) == 100
+    assert len(photographed_rays(model, 100, silent).opacity) == 100
 
 
 def test_photographs_of_another_exposure_show_what_the_field_has(model: Model) -> None:
@@ -159,11 +156,11 @@ def test_photographs_of_another_exposure_show_what_the_field_has(model: Model) -
         model.training_pixels, rgba=(model.training_pixels.rgba * [0.5, 0.5, 0.5, 1]).astype(np.uint8)
     )
     rays, expected = (
-        photographed_rays(replace(model, training_pixels=dim, exposure=exposure), 10**9, quiet),
-        photographed_rays(model, 10**9, quiet),
+        photographed_rays(replace(model, training_pixels=dim, exposure=exposure), 10**9, silent),
+        photographed_rays(model, 10**9, silent),
     )
     np.testing.assert_allclose(rays.colours, expected.colours, atol=2.01 / 255)
 
 
 def test_a_model_without_training_pixels_has_no_photographed_rays(model: Model) -> None:
-    assert len(photographed_rays(replace(model, training_pixels=None), 100, quiet).opacity) == 0
+    assert len(photographed_rays(replace(model, training_pixels=None), 100, silent).opacity) == 0

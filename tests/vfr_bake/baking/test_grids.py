@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from player.asset.bricks import unpack_vertices
+from player.progress import silent
 from vfr_bake.baking.cells import Resolutions, corners_of, occupied_cells, subdivided
 from vfr_bake.baking.grids import (
     _corners,
@@ -20,10 +21,6 @@ from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.training.model_file import Model
 
 COARSE = 40
-
-
-def quiet(done: int, of: int) -> None:
-    """Take the place of a progress callback and do nothing."""
 
 
 @pytest.mark.parametrize(("n", "resolution"), [(4, 4), (4, 8), (5, 8), (7, 25), (8, 7)])
@@ -44,7 +41,7 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
         assert len(vertices) == corners_of(cells).sum()
         assert corners_of(cells)[tuple(vertices.index.T)].all()
         assert (unpack_vertices(vertices.coords, vertices.masks) == vertices.index).all()
-    codes = evaluate_densities(model, layout, quiet)
+    codes = evaluate_densities(model, layout, silent)
     decoded = np.exp(layout.density_range[0] + np.diff(layout.density_range)[0] / 255 * codes) * step
     points = unit_points(layout.densities.index, resolution, contracted=False)
     wanted = np.exp(model.field.log_densities(points)) * step
@@ -55,7 +52,7 @@ def test_densities_are_those_of_the_field_in_the_order_of_the_rows(model: Model,
 def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
     layout = make_layout(occupied_cells(model, COARSE), model.occupancy.step, Resolutions(64, COARSE))
     matrix = np.random.default_rng(0).normal(size=(3, model.field.config.n_channels))
-    features = (latent_features(model, layout, matrix, quiet) + 0.5) / PARTS  # they are rounded down
+    features = (latent_features(model, layout, matrix, silent) + 0.5) / PARTS  # they are rounded down
     points = unit_points(layout.features.index, COARSE, contracted=False)
     np.testing.assert_allclose(features, model.field.features(points) @ matrix.T, rtol=0, atol=0.51 / PARTS)
     stored, random = set(map(tuple, layout.features.index.tolist())), np.random.default_rng(0)

@@ -8,16 +8,13 @@ import pytest
 from player.asset.bricks import stored_bits
 from player.cameras.camera import Camera
 from player.march.march import sample_rays
+from player.progress import silent
 from vfr_bake.baking.cells import Resolutions
 from vfr_bake.baking.detail.seen import block_weights, heavy_blocks, thinned
 from vfr_bake.baking.detail.shown import take_rows
 from vfr_bake.baking.grids import Layout, make_layout
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.kernels.latent_rows import PARTS
-
-
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
 
 
 def views(n: int) -> list[Camera]:
@@ -36,7 +33,7 @@ def test_block_weights_are_those_of_the_march_summed(contracted: bool) -> None:
     codes = random.uniform(0, 200, len(layout.densities)).astype(np.float32)
     grid = layout.grid(codes, np.zeros((len(layout.features), 1), np.int16))
     cameras = views(3)
-    found = block_weights(grid, cameras, 10**9, quiet)
+    found = block_weights(grid, cameras, 10**9, silent)
     expected = np.zeros(found.shape)
     for camera in cameras:
         path, samples, *_ = sample_rays(grid, *camera.rays())
@@ -49,7 +46,7 @@ def test_block_weights_are_those_of_the_march_summed(contracted: bool) -> None:
     assert expected.sum() > 100
     # Rounding may put a sample on the border of two blocks into the other one.
     assert np.abs(found - expected).sum() < 1e-3 * expected.sum()
-    fewer = block_weights(grid, cameras, 100, quiet)
+    fewer = block_weights(grid, cameras, 100, silent)
     assert 0.5 < fewer.sum() / 100 / (expected.sum() / (3 * 24 * 24)) < 2
 
 
@@ -75,7 +72,7 @@ def test_fog_that_nobody_saw_is_left_out() -> None:
         np.random.default_rng(2).integers(-9 * PARTS, 9 * PARTS, (len(layout.features), 2)).astype(np.int16)
     )
     grid = layout.grid(density, features)
-    weights = block_weights(grid, views(12), 10**6, quiet)
+    weights = block_weights(grid, views(12), 10**6, silent)
     left = thinned(layout, heavy_blocks(weights, 0.0))
     kept = np.linalg.norm(left.layout.densities.index / 64 - 0.5, axis=1)
     assert len(kept) < 0.8 * len(away)

@@ -11,6 +11,7 @@ import pytest
 
 from player.asset.asset import Asset
 from player.files.images import to_8_bit
+from player.progress import silent
 from player.render import render
 from tests.player.march.pyramid_scene import random_scene
 from vfr_bake.baking import held_out
@@ -29,14 +30,10 @@ SMALL = BakeConfig(
 NOTHING = np.zeros((0, 3), np.float32)
 
 
-def quiet(*_: object) -> None:
-    """Take the place of a progress callback and do nothing."""
-
-
 @pytest.fixture(scope="module")
 def baked(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BakeResult]:
     folder = tmp_path_factory.mktemp("baked") / "asset"
-    return folder, bake(model, folder, SMALL, quiet)
+    return folder, bake(model, folder, SMALL, silent)
 
 
 def test_rays_are_marched_in_parts_as_at_once(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +90,7 @@ def test_figures_and_report_have_the_loss_with_its_spread(baked: tuple[Path, Bak
 
 def test_a_model_without_witnesses_is_baked_by_its_own_pictures(model: Model, tmp_path: Path) -> None:
     own = replace(model, witnesses=None, figures={"training_psnr": 24.0, "test_psnr": 90.0})
-    result = bake(own, tmp_path / "asset", SMALL, quiet)
+    result = bake(own, tmp_path / "asset", SMALL, silent)
     said = json.loads((tmp_path / "asset" / "report.json").read_text())
     assert result.loss.spread is None and said["loss_db_spread"] is None
     error = 10 ** (-result.figures["psnr_to_full_model"] / 10)
