@@ -75,25 +75,25 @@ class ViewPixels:
         return self.chosen(np.arange(0, len(self.pixels), max(1, len(self.pixels) // n)))
 
 
-def choose_training_pixels(views: PosedImages, witnesses: ViewPixels, learned: np.ndarray) -> ViewPixels:
+def choose_training_pixels(
+    views: PosedImages, apart: Sequence[np.ndarray], learned: np.ndarray
+) -> ViewPixels:
     """Choose pixels of training `views`: about as many of each of the views in `learned`, spread evenly over
-    it. Those that are `witnesses` are left out.
+    it. Those that are set apart, `apart` [n_apart] int64 of each view, are left out.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 3, 1)
-    >>> none = ViewPixels(np.zeros(3, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
-    >>> chosen = choose_training_pixels(train, none, np.array([0, 2]))
+    >>> chosen = choose_training_pixels(train, [np.arange(9)] * 3, np.array([0, 2]))
     >>> chosen.counts[1] == 0, chosen.counts[0] > 64, len(chosen.rgba) == chosen.counts.sum()
     (np.True_, np.True_, np.True_)
     """
     random = np.random.default_rng(SEED)
     counts, pixels = np.zeros(len(views.cameras), np.int32), []
-    of_views = witnesses.of_views()
     for view in learned:
         near = None if views.opaque(view) else _near_something(views.images[view][..., 3])
         of = views.cameras[view].width * views.cameras[view].height if near is None else len(near)
         kept = spread(min(N_TRAINING_PIXELS // len(learned), of), of, random)
-        kept = np.setdiff1d(kept if near is None else near[kept], of_views[view])
+        kept = np.setdiff1d(kept if near is None else near[kept], apart[view])
         counts[view] = len(kept)
         pixels.append(kept)
     rgba = [views.pixels(view, some) for view, some in zip(learned, pixels, strict=True)]

@@ -3,9 +3,9 @@
 The test split is for reporting results, so nothing may be chosen by it. The loss of a bake is therefore
 measured on pixels of the training split that are set apart before training begins. There are two kinds:
 
-- *patches*: squares of pixels, about the same number of pixels in every view. They cover the whole scene. The
-  model knows the inside of a patch from other views alone, as it knows a test view. It shows single pixels
-  far better, because it learned from the pixels all around them
+- pixels of *patches*: squares, one in each of the other views, from which training draws no pixel. They cover
+  the whole scene. The model knows the inside of a patch from other views alone, as it knows a test view. It
+  shows single pixels far better, because it learned from the pixels all around them
   (docs/notes/2026-11-29-patches-of-witnesses.md).
 - pixels of a few *whole views*, from which training draws no pixel. To the model these views are like test
   views, but there are only a few of them.
@@ -14,21 +14,22 @@ measured on pixels of the training split that are set apart before training begi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from player.cameras.camera import Camera
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.view_pixels import ViewPixels, spread
 
 N_WITNESSES = 60_000
 """Number of witnesses at most; half of them are in whole views, if there are any."""
 MOST_OF_A_VIEW = 0.02
-"""Largest share of a view's pixels that are set apart as patches, because a small scene needs its pixels for
+"""Largest share of a view's pixels that is set apart as a patch, because a small scene needs its pixels for
 training."""
-PATCH = 16
-"""Approximate number of pixels along an edge of a patch. A view has about as many patches as fit into its
-share of the witnesses."""
+PATCH = 64
+"""Number of pixels along an edge of a patch, at most."""
 FEWEST_VIEWS, VIEWS_OF_A_WHOLE, MOST_WHOLE = 20, 25, 4
 """Whole views are set apart if there are at least FEWEST_VIEWS training views: about one in VIEWS_OF_A_WHOLE,
 and at most MOST_WHOLE."""
@@ -47,14 +48,29 @@ class Witnesses(ViewPixels):
         """Return the numbers of the views that training draws from, [n_learned] int64, ascending."""
         return np.setdiff1d(np.arange(len(self.counts)), self.whole)
 
+    def patches(self, cameras: Sequence[Camera]) -> list[np.ndarray]:
+        """Return the numbers [n] int64 of all pixels of each view's patch, the smallest rectangle that holds
+        the view's witnesses; of a whole view, and of one without witnesses, none. `cameras`: one for each
+        view.
+        """
+        found = [np.zeros(0, np.int64)] * len(self.counts)
+        of_views = self.of_views()
+        for view in self.learned().tolist():
+            if not len(of_views[view]):
+                continue
+            rows, columns = np.divmod(of_views[view].astype(np.int64), cameras[view].width)
+            numbers = np.arange(rows.min(), rows.max() + 1)[:, None] * cameras[view].width
+            found[view] = (numbers + np.arange(columns.min(), columns.max() + 1)).ravel()
+        return found
+
 
 def choose_witnesses(views: PosedImages) -> Witnesses:
     """Choose the witnesses of training `views`. The choice depends on the sizes of the pictures alone.
 
-    Every view that training draws from has about the same number of pixels in patches, and at most
-    MOST_OF_A_VIEW of its pixels. Pictures that are too small for that have none. The pixels of a whole view
-    are divided into as many equally long runs as it has witnesses, and one pixel is drawn at random from each
-    run.
+    Every view that training draws from has a patch at a random place, with at most MOST_OF_A_VIEW of its
+    pixels. Pictures that are too small for that have none. The pixels of a patch or of a whole view are
+    divided into as many equally long runs as it has witnesses, and one pixel is drawn at random from each
+    run. The first and the last pixel of a patch are always among them.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 20, 1)
@@ -69,11 +85,10 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     n_of_whole = N_WITNESSES // 2 if len(whole) else 0
     counts = np.zeros(n_views, np.int32)
     counts[whole] = np.minimum(_shares(n_of_whole, len(whole)), n_pixels[whole])
-    most = (MOST_OF_A_VIEW * n_pixels[learned]).astype(int)
-    counts[learned] = np.minimum(_shares(N_WITNESSES - n_of_whole, len(learned)), most)
+    counts[learned] = _shares(N_WITNESSES - n_of_whole, len(learned))
     random = np.random.default_rng(SEED)
     pixels = [
-        spread(n, of, random) if view in whole else patches(n, camera.width, camera.height, random)
+        spread(n, of, random) if view in whole else _in_a_patch(n, camera, random)
         for view, (n, of, camera) in enumerate(
             zip(counts.tolist(), n_pixels.tolist(), views.cameras, strict=True)
         )
@@ -83,22 +98,17 @@ def choose_witnesses(views: PosedImages) -> Witnesses:
     return Witnesses(counts, np.concatenate(pixels).astype(np.int32), np.concatenate(rgba), whole)
 
 
-def patches(n: int, width: int, height: int, random: np.random.Generator) -> np.ndarray:
-    """Return the numbers (row * width + column) of at most `n` pixels of a picture, [n_pixels] int64,
-    ascending. They form squares: the longer side is divided into as many equal parts as there are squares,
-    and each part has one at a random place.
-
-    >>> patches(18, 10, 4, np.random.default_rng(0)).tolist()
-    [5, 6, 7, 8, 15, 16, 17, 18, 25, 26, 27, 28, 35, 36, 37, 38]
-    """
-    n_patches = max(1, round(n / PATCH**2))
-    longer, shorter = max(width, height), min(width, height)
-    edges = np.arange(n_patches + 1) * longer // n_patches
-    size = min(math.isqrt(n // n_patches), shorter, int(np.diff(edges).min()))
-    along = random.integers(edges[:-1], edges[1:] - size + 1)[:, None] + np.arange(size)
-    across = random.integers(0, shorter - size + 1, n_patches)[:, None] + np.arange(size)
-    rows, columns = (along, across) if height >= width else (across, along)
-    return np.sort((rows[:, :, None] * width + columns[:, None, :]).ravel())
+def _in_a_patch(n: int, camera: Camera, random: np.random.Generator) -> np.ndarray:
+    """Return the numbers (row * width + column) of at most `n` pixels of a patch, [n_pixels] int64,
+    ascending. Its first and its last pixel are among them."""
+    width, height = camera.width, camera.height
+    size = min(PATCH, math.isqrt(int(MOST_OF_A_VIEW * width * height)), width, height)
+    row, column = random.integers(height - size + 1), random.integers(width - size + 1)
+    chosen = spread(min(n, size**2), size**2, random)
+    if len(chosen):
+        chosen[0], chosen[-1] = 0, size**2 - 1
+    rows, columns = np.divmod(chosen, max(size, 1))
+    return (row + rows) * width + column + columns
 
 
 def whole_views(n_views: int) -> np.ndarray:

@@ -182,7 +182,8 @@ class PixelSampler:
         learned = range(len(views.cameras)) if witnesses is None else witnesses.learned().tolist()
         self._joined = None if isinstance(views.images, StoredImages) else views.joined(learned)
         self._views, self._generator, self._masked = views.some(learned), generator, masked
-        self._patches = _patches(witnesses, len(self._views.cameras))
+        patches = [] if witnesses is None else witnesses.patches(views.cameras)
+        self._patches = _joined([patches[view] for view in learned] if patches else [])
         images = self._views.images
         self._n_chunks = images.n_chunks if isinstance(images, StoredImages) else 1
         self._by_detail = by_detail and not isinstance(images, StoredImages)
@@ -280,15 +281,10 @@ class DevicePixelSampler(PixelSampler):
         )
 
 
-def _patches(witnesses: Witnesses | None, n_learned: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays [n] int64 for the witnesses in patches: the view of each, counted among the views
-    that are learned from, and its row-major number in that view."""
-    if witnesses is None:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    among = np.full(len(witnesses.counts), -1)
-    among[witnesses.learned()] = np.arange(n_learned)
-    view = among[witnesses.views()]
-    return view[view >= 0], witnesses.pixels[view >= 0].astype(np.int64)
+def _joined(of_views: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the view and the number, [n] int64 each, of every pixel, from the numbers of each view."""
+    views = np.repeat(np.arange(len(of_views)), [len(numbers) for numbers in of_views])
+    return views, np.concatenate([np.zeros(0, np.int64), *of_views])
 
 
 def _indices(pixels: Pixels, view: np.ndarray, number: np.ndarray) -> np.ndarray:

@@ -186,7 +186,7 @@ class Trainer:
     def training_pixels(self) -> ViewPixels:
         """Choose pixels for a bake to learn from, among those that this training learns from."""
         learned = self.witnesses.learned()
-        found = choose_training_pixels(self._views, self.witnesses, learned)
+        found = choose_training_pixels(self._views, self.witnesses.patches(self._views.cameras), learned)
         if self._masked:
             found = found.opaque()
         views = found.views()

@@ -10,8 +10,11 @@ from scipy.ndimage import binary_dilation
 
 from tests.vfr_bake.data.test_witnesses import numbered_views
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.view_pixels import N_TRAINING_PIXELS, NEAR, ViewPixels, choose_training_pixels
+from vfr_bake.data.view_pixels import N_TRAINING_PIXELS, NEAR, choose_training_pixels
 from vfr_bake.data.witnesses import choose_witnesses
+
+NOTHING = [np.zeros(0, np.int64)] * 2
+"""No pixels of two views are set apart."""
 
 
 def opaque(views: PosedImages) -> PosedImages:
@@ -21,25 +24,24 @@ def opaque(views: PosedImages) -> PosedImages:
 def test_training_pixels_are_those_of_learned_views_but_for_witnesses() -> None:
     views = opaque(numbered_views(24, 600, 520))
     witnesses = choose_witnesses(views)
-    chosen = choose_training_pixels(views, witnesses, witnesses.learned())
+    chosen = choose_training_pixels(views, witnesses.patches(views.cameras), witnesses.learned())
     counts = chosen.counts[witnesses.learned()]
     assert not chosen.counts[witnesses.whole].any() and len(witnesses.whole)
     most = N_TRAINING_PIXELS // len(counts)
     assert (counts <= most).all() and (counts > 0.95 * most).all(), "alike many of every view"
-    kept, apart = (
-        set(zip(of.views().tolist(), of.pixels.tolist(), strict=True)) for of in (chosen, witnesses)
-    )
-    assert len(kept) == len(chosen.pixels) == chosen.counts.sum() <= N_TRAINING_PIXELS and not kept & apart
+    assert chosen.counts.sum() == len(chosen.pixels) <= N_TRAINING_PIXELS
+    for kept, patch in zip(chosen.of_views(), witnesses.patches(views.cameras), strict=True):
+        assert len(np.unique(kept)) == len(kept) and not len(np.intersect1d(kept, patch))
     rgba = chosen.rgba.astype(np.int64)
     assert np.array_equal(rgba[:, 0] + 256 * rgba[:, 1] + 65536 * rgba[:, 2], chosen.pixels)
-    again = choose_training_pixels(views, witnesses, witnesses.learned())
+    again = choose_training_pixels(views, witnesses.patches(views.cameras), witnesses.learned())
     assert np.array_equal(again.pixels, chosen.pixels)
 
 
 def test_a_small_scene_keeps_every_pixel_but_its_witnesses() -> None:
     views = opaque(numbered_views(3, 40, 30))
     witnesses = choose_witnesses(views)
-    chosen = choose_training_pixels(views, witnesses, witnesses.learned())
+    chosen = choose_training_pixels(views, witnesses.patches(views.cameras), witnesses.learned())
     assert len(chosen.pixels) + len(witnesses.pixels) == 3 * 40 * 30 and len(witnesses.pixels)
 
 
@@ -49,10 +51,9 @@ def test_of_a_transparent_view_only_what_is_near_something_is_kept(at: tuple[int
     alpha = np.zeros((30, 100), np.uint8)
     alpha[at] = 1
     views.images[1][..., 3] = alpha
-    none = ViewPixels(np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
     radius = round(100 * NEAR)
     around = binary_dilation(alpha, np.ones((2 * radius + 1, 2 * radius + 1)))
-    chosen = choose_training_pixels(views, none, np.array([1]))
+    chosen = choose_training_pixels(views, NOTHING, np.array([1]))
     assert np.array_equal(chosen.pixels, np.flatnonzero(around)) and chosen.counts.tolist() == [
         0,
         around.sum(),
@@ -62,5 +63,4 @@ def test_of_a_transparent_view_only_what_is_near_something_is_kept(at: tuple[int
 def test_a_view_of_nothing_keeps_nothing() -> None:
     views = opaque(numbered_views(2, 10, 10))
     views.images[0][..., 3] = 0
-    none = ViewPixels(np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros((0, 4), np.uint8))
-    assert choose_training_pixels(views, none, np.array([0, 1])).counts.tolist() == [0, 100]
+    assert choose_training_pixels(views, NOTHING, np.array([0, 1])).counts.tolist() == [0, 100]

@@ -116,12 +116,12 @@ def test_pictures_without_a_pixel_to_draw() -> None:
 
 
 def some_witnesses() -> Witnesses:
-    """Return witnesses: the second picture is whole; others have first and last pixels, and neighbours."""
-    kept = {0: [0, 1, 2, 7, 11], 1: [3, 30], 2: [0, 5, 6, 11]}
+    """Return witnesses: of a patch of 2 x 2 pixels, of a whole picture, and of a patch of 1 x 2 pixels."""
+    kept = {0: [2, 7], 1: [3, 30], 2: [5, 7]}
     return Witnesses(
         np.array([len(pixels) for pixels in kept.values()], np.int32),
         np.concatenate(list(kept.values())).astype(np.int32),
-        np.zeros((11, 4), np.uint8),
+        np.zeros((6, 4), np.uint8),
         np.array([1], np.int32),
     )
 
@@ -129,7 +129,7 @@ def some_witnesses() -> Witnesses:
 def test_no_witness_and_nothing_masked_is_ever_drawn(device: torch.device) -> None:
     views, witnesses = mixed_views(), some_witnesses()
     rays_d = np.concatenate([camera.rays()[1] for camera in views.cameras])
-    kept = [0, 1, 2, 7, 11, *range(12, 47), *(47 + n for n in (0, 5, 6, 11))]
+    kept = [2, 3, 6, 7, *range(12, 47), 47 + 5, 47 + 7]
     for image in views.images:
         image[..., 3] = 255
     hidden = [4, 5, 57]
